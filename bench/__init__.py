@@ -1,0 +1,1 @@
+"""A lab bench for smart-material actuators: instruments, protocols, identification and control."""

@@ -1,0 +1,1 @@
+"""Controllers and exact inverses: numbers in, numbers out."""

@@ -1,0 +1,551 @@
+"""The roles that an instrument can play on the bench, and what each promises.
+
+A protocol asks for roles, a rig file names the instruments that play them. A driver (real wire) and an
+emulated instrument implement the same role, and one contract test suite runs against both.
+
+Promises of every device
+------------------------
+- Quantities are in SI units; temperatures are in degrees Celsius, as the field has them.
+- The `measure` method takes the best reading that the instrument gives at rest, `glance` a quick one for
+  watching. Both raise `DeviceError` if the instrument reports a fault, and never return a stale or an
+  invalid number.
+- `safe` brings the device into its safe state, whatever its state is; calling it again changes nothing.
+  It tries everything that can make the device safer, and raises only after that.
+- `stop` ends a motion and holds, `close` releases the line; neither replaces `safe`.
+- Methods may be called from one thread at a time.
+
+Devices conform to `bluesky.protocols` by structure (`name`, `parent`, `read`, `describe`, `set`, `stop`),
+so a bluesky RunEngine can drive them; nothing of bluesky is imported here.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, TypedDict
+
+from pydantic import BaseModel, ConfigDict
+
+from bench.clock import Clock
+from bench.errors import DeviceError, LimitError
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which instrument this is, as the instrument itself says; kept with every run."""
+
+    maker: str
+    model: str
+    serial_number: str
+    firmware: str
+
+    def __str__(self) -> str:
+        """Return the identity on one line."""
+        return f"{self.maker} {self.model}, serial number {self.serial_number}, firmware {self.firmware}"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One measured quantity of a device or of the rig.
+
+    Attributes
+    ----------
+    name : str
+        Unique within the rig, such as `tec_temperature`.
+    unit : str
+        Unit of the values, such as `°C`, `A`, `1/m`; `1` for a plain number.
+    description : str
+        What it is, in a few words, for axes and column headers.
+    precision : int
+        Digits after the point that are worth showing.
+    """
+
+    name: str
+    unit: str
+    description: str
+    precision: int = 3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """A closed range of allowed values.
+
+    Raises
+    ------
+    ValueError
+        If the range is empty or a bound is not a number.
+    """
+
+    low: float
+    high: float
+    unit: str
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.high:
+            raise ValueError(f"limits: expected low ≤ high, got {self.low} and {self.high} {self.unit}")
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        """Return the range with its unit."""
+        return f"{self.low:g} to {self.high:g} {self.unit}"
+
+
+class Reading(TypedDict):
+    """One value as `bluesky.protocols.Reading` has it; the timestamp is seconds since 1970 UTC."""
+
+    value: float
+    timestamp: float
+
+
+class DataKey(TypedDict):
+    """What a value is, as event-model's `DataKey` has it."""
+
+    source: str
+    dtype: str
+    shape: list[int]
+    units: str
+    precision: int
+
+
+class Status:
+    """How far a commanded change has come; conforms to `bluesky.protocols.Status`.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device, for messages.
+    clock : Clock
+        The clock on which the change happens.
+    arrived : callable
+        Asks the device once, and returns True when the change is complete. May raise `DeviceError`.
+    timeout : float
+        Seconds after which the change has failed.
+    interval : float
+        Seconds between two questions while `wait` waits.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        clock: Clock,
+        arrived: Callable[[], bool],
+        *,
+        timeout: float = 60.0,
+        interval: float = 0.1,
+    ) -> None:
+        self._device = device
+        self._clock = clock
+        self._arrived = arrived
+        self._deadline = clock.now() + timeout
+        self._timeout = timeout
+        self._interval = interval
+        self._lock = threading.RLock()
+        self._callbacks: list[Callable[[Any], None]] = []
+        self._done = False
+        self._exception: Exception | None = None
+        self._watcher: threading.Thread | None = None
+
+    @classmethod
+    def completed(cls, device: str, clock: Clock) -> Status:
+        """Return a status that is complete already."""
+        status = cls(device, clock, lambda: True)
+        status.update()
+        return status
+
+    @property
+    def done(self) -> bool:
+        """Whether the change has ended, well or not."""
+        return self._done
+
+    @property
+    def success(self) -> bool:
+        """Whether the change has ended well."""
+        return self._done and self._exception is None
+
+    def exception(self, timeout: float | None = 0.0) -> BaseException | None:  # noqa: ARG002 - bluesky's form
+        """Return what went wrong, or None."""
+        return self._exception
+
+    def update(self) -> bool:
+        """Ask the device once; return `done`."""
+        with self._lock:
+            if self._done:
+                return True
+            try:
+                if self._arrived():
+                    self._finish(None)
+                elif self._clock.now() >= self._deadline:
+                    self._finish(DeviceError(self._device, f"did not arrive within {self._timeout:g} s"))
+            except DeviceError as error:
+                self._finish(error)
+            return self._done
+
+    def wait(self) -> None:
+        """Let time pass until the change is complete.
+
+        Raises
+        ------
+        DeviceError
+            If the change failed or took longer than its timeout.
+        """
+        while not self.update():
+            self._clock.sleep(self._interval)
+        if self._exception is not None:
+            raise self._exception
+
+    def add_callback(self, callback: Callable[[Any], None]) -> None:
+        """Have `callback(status)` called once at the end.
+
+        The bench itself asks by `update` or `wait`. Whoever waits by callback, as a bluesky RunEngine does,
+        gets a thread that asks for it.
+        """
+        with self._lock:
+            if not self._done:
+                self._callbacks.append(callback)
+                if self._watcher is None:
+                    self._watcher = threading.Thread(target=self._watch, name=self._device, daemon=True)
+                    self._watcher.start()
+                return
+        callback(self)
+
+    def _watch(self) -> None:
+        while not self.update():
+            self._clock.sleep(self._interval)
+
+    def _finish(self, exception: Exception | None) -> None:
+        self._exception = exception
+        self._done = True
+        callbacks, self._callbacks = self._callbacks, []
+        for callback in callbacks:
+            callback(self)
+
+
+class DriverSettings(BaseModel):
+    """What a rig file says of one device; every driver extends it with its own keys.
+
+    A driver class carries its extension as `Settings`, and opens its instrument by the class method
+    `connect(name, settings, clock)`, which checks that the right instrument answers, configures it and
+    moves nothing. An unknown key is an error.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Device(ABC):
+    """Anything on the bench that can be read.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig; its signals are named after it.
+    clock : Clock
+        The clock of the run.
+    """
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self._name = name
+        self._clock = clock
+
+    @property
+    def name(self) -> str:
+        """Name in the rig."""
+        return self._name
+
+    @property
+    def parent(self) -> None:
+        """Always None: devices of the bench are not nested (bluesky asks)."""
+        return
+
+    @property
+    @abstractmethod
+    def identity(self) -> Identity:
+        """Maker, model, serial number and firmware, as the instrument said when it was connected."""
+
+    @property
+    @abstractmethod
+    def signals(self) -> tuple[Signal, ...]:
+        """What `measure` and `glance` deliver, in this order."""
+
+    @abstractmethod
+    def measure(self) -> dict[str, float]:
+        """Measure every signal as well as the instrument can; values by signal name.
+
+        Raises
+        ------
+        DeviceError
+            If the instrument reports a fault, is out of its range, or does not answer.
+        """
+
+    def glance(self) -> dict[str, float]:
+        """Measure every signal quickly, for telemetry and interlocks; values by signal name."""
+        return self.measure()
+
+    def read(self) -> dict[str, Reading]:
+        """Measure every signal; values with time stamps, as bluesky has them."""
+        values = self.measure()
+        timestamp = self._clock.timestamp()
+        return {name: {"value": value, "timestamp": timestamp} for name, value in values.items()}
+
+    def describe(self) -> dict[str, DataKey]:
+        """Say what `read` delivers, as bluesky has it."""
+        source = f"{self.identity.model}:{self.identity.serial_number}"
+        return {
+            signal.name: {
+                "source": f"{source}:{signal.name}",
+                "dtype": "number",
+                "shape": [],
+                "units": signal.unit,
+                "precision": signal.precision,
+            }
+            for signal in self.signals
+        }
+
+    def stop(self, success: bool = True) -> None:  # noqa: B027 - bluesky's form; sensors do not move
+        """End a motion where it is and hold; does nothing to a device that only measures."""
+
+    @abstractmethod
+    def safe(self) -> None:
+        """Bring the device into its safe state; what that is, each role says.
+
+        Raises
+        ------
+        DeviceError
+            If the safe state could not be confirmed, after everything was tried.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the line; the device keeps the state that it is in."""
+
+
+class Actuator(Device):
+    """A device that takes a set-point."""
+
+    @property
+    @abstractmethod
+    def limits(self) -> Limits:
+        """The set-points that are allowed now."""
+
+    @property
+    @abstractmethod
+    def setpoint(self) -> float:
+        """The set-point that was last sent, in the unit of `limits`; nan before the first."""
+
+    @property
+    @abstractmethod
+    def setpoint_signal(self) -> Signal:
+        """What the set-point is, for axes and columns: its name is that of the device and `_setpoint`."""
+
+    @abstractmethod
+    def set(self, value: float) -> Status:
+        """Send a set-point, and switch the output on if it is off.
+
+        Parameters
+        ----------
+        value : float
+            In the unit of `limits`.
+
+        Returns
+        -------
+        Status
+            Completes when the device has arrived, as far as it can tell.
+
+        Raises
+        ------
+        LimitError
+            If the value is outside of `limits`; nothing is sent.
+        DeviceError
+            If the device refuses.
+        """
+
+    def check(self, value: float) -> None:
+        """Raise `LimitError` if `set` would not take `value`."""
+        if not (math.isfinite(value) and value in self.limits):
+            raise LimitError(self.name, f"set-point {value:g} {self.limits.unit} is outside of {self.limits}")
+
+
+class TECMode(Enum):
+    """What a TEC amplifier holds constant."""
+
+    CURRENT = "current"
+    TEMPERATURE = "temperature"
+
+
+class TECAmplifier(Actuator):
+    """Drives a thermoelectric cooler, as a current source or as a temperature controller.
+
+    In temperature mode the set-point is the object temperature in °C, and `set` completes when the
+    controller reports it stable. In current mode it is the current in A, positive heats, and `set`
+    completes at once.
+
+    The safe state is the output stage off: no current flows, the plate drifts to ambient.
+
+    Signals: `NAME_temperature` °C (object), `NAME_sink_temperature` °C, `NAME_current` A, `NAME_voltage` V.
+    """
+
+    @property
+    @abstractmethod
+    def mode(self) -> TECMode:
+        """What is held constant."""
+
+    @abstractmethod
+    def select_mode(self, mode: TECMode) -> None:
+        """Choose what is held constant; the output is switched off by the change."""
+
+    @property
+    @abstractmethod
+    def output_enabled(self) -> bool:
+        """Whether the output stage is on, as the device says now."""
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (
+            Signal(f"{self.name}_temperature", "°C", "object temperature", 3),
+            Signal(f"{self.name}_sink_temperature", "°C", "sink temperature", 2),
+            Signal(f"{self.name}_current", "A", "TEC current", 3),
+            Signal(f"{self.name}_voltage", "V", "TEC voltage", 3),
+        )
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """The set-point in the present mode."""
+        if self.mode is TECMode.TEMPERATURE:
+            return Signal(f"{self.name}_setpoint", "°C", "temperature set-point", 3)
+        return Signal(f"{self.name}_setpoint", "A", "current set-point", 4)
+
+
+class VoltageSupply(Actuator):
+    """A voltage source, switching or linear. The set-point is in V, as `output` defines it.
+
+    The safe state is 0 V with the output stage off where the device has one.
+
+    Signals: `NAME_voltage` V, `NAME_current` A.
+    """
+
+    @property
+    @abstractmethod
+    def output(self) -> str:
+        """Which voltage the set-point is: `average` or `rms` of a switched waveform, or `dc`."""
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (
+            Signal(f"{self.name}_voltage", "V", f"{self.output} output voltage", 3),
+            Signal(f"{self.name}_current", "A", "output current", 2),
+        )
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """The voltage asked for."""
+        return Signal(f"{self.name}_setpoint", "V", f"{self.output} voltage set-point", 3)
+
+
+class LoadCell(Device):
+    """Measures a force in N, positive in tension. It cannot harm anything: its safe state is any state.
+
+    `measure` raises `DeviceError` when the cell is under or over its range.
+
+    Signal: `NAME_force` N.
+    """
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (Signal(f"{self.name}_force", "N", "force", 3),)
+
+    @abstractmethod
+    def tare(self) -> None:
+        """Make the present force read zero from now on."""
+
+    @abstractmethod
+    def clear_tare(self) -> None:
+        """Read gross force again."""
+
+
+class PositionSensor(Device):
+    """Measures a position or a deflection in m. Its safe state is any state.
+
+    `measure` raises `DeviceError` when the input is outside of its range or of its calibration.
+
+    Signal: `NAME_position` m.
+    """
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (Signal(f"{self.name}_position", "m", "position", 9),)
+
+
+class TemperatureSensor(Device):
+    """Measures a temperature in °C. Its safe state is any state.
+
+    Signal: `NAME_temperature` °C.
+    """
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (Signal(f"{self.name}_temperature", "°C", "temperature", 3),)
+
+
+class Servo(Actuator):
+    """Holds an angle in rad, over several turns, counted from its homing position.
+
+    `set` completes when the servo stands at the goal; `stop` holds the present angle. The safe state is
+    torque off: the shaft turns freely.
+
+    Signals: `NAME_position` rad, `NAME_velocity` rad/s, `NAME_load` 1 (share of the stall torque, as the
+    servo infers it).
+    """
+
+    @property
+    @abstractmethod
+    def torque_enabled(self) -> bool:
+        """Whether the servo holds its position, as the device says now."""
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (
+            Signal(f"{self.name}_position", "rad", "angle", 4),
+            Signal(f"{self.name}_velocity", "rad/s", "angular velocity", 3),
+            Signal(f"{self.name}_load", "1", "inferred load", 3),
+        )
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """The angle asked for."""
+        return Signal(f"{self.name}_setpoint", "rad", "angle set-point", 4)
+
+
+ROLES: Mapping[str, type] = {
+    "TEC amplifier": TECAmplifier,
+    "voltage supply": VoltageSupply,
+    "load cell": LoadCell,
+    "position sensor": PositionSensor,
+    "temperature sensor": TemperatureSensor,
+    "servo": Servo,
+}
+"""The roles by the names that messages use."""
+
+
+def role_of(device_class: type[Device]) -> str:
+    """Return the name of the role that a device class plays.
+
+    Raises
+    ------
+    TypeError
+        If it plays none.
+    """
+    for name, role in ROLES.items():
+        if issubclass(device_class, role):
+            return name
+    raise TypeError(f"{device_class.__name__} plays none of the roles {', '.join(ROLES)}")

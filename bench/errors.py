@@ -1,0 +1,75 @@
+"""The exceptions of the bench, one small family.
+
+Each message says which device, file or parameter is meant, what was found, and what to do or what is
+allowed. The command line prints the message alone; a traceback is for defects of the bench itself.
+"""
+
+from __future__ import annotations
+
+
+class BenchError(Exception):
+    """Base of everything that the bench raises on purpose.
+
+    Attributes
+    ----------
+    exit_code : int
+        What the `bench` command exits with when this error ends it.
+    """
+
+    exit_code = 1
+
+
+class ConfigurationError(BenchError):
+    """A rig file, a parameter or a command is wrong; nothing has moved yet."""
+
+    exit_code = 2
+
+
+class DataError(BenchError):
+    """A file of measurements, a model file or a journal cannot be used as it is."""
+
+    exit_code = 3
+
+
+class DeviceError(BenchError):
+    """An instrument answered with an error, or in a way that its protocol does not allow.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device in the rig.
+    message : str
+        What happened and what to do about it.
+    """
+
+    exit_code = 4
+
+    def __init__(self, device: str, message: str) -> None:
+        super().__init__(f"{device}: {message}")
+        self.device = device
+
+
+class DeviceConnectionError(DeviceError):
+    """An instrument cannot be reached, or stopped answering."""
+
+
+class LimitError(DeviceError):
+    """A set-point lies outside of the limits of the device; it was not sent."""
+
+
+class InterlockError(BenchError):
+    """A watched signal left its allowed range and the run was ended in the safe state."""
+
+    exit_code = 5
+
+
+class SettleTimeoutError(BenchError):
+    """A signal did not become steady within the time that the step allows."""
+
+    exit_code = 6
+
+
+class AbortError(BenchError):
+    """The operator, or the operating system, ended the run; the safe state was reached."""
+
+    exit_code = 130

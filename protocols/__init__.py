@@ -1,0 +1,1 @@
+"""Operator scripts, one file a protocol."""

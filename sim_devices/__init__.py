@@ -1,0 +1,1 @@
+"""Emulated laboratories: plants, instruments, and the wire servers that answer for them."""
