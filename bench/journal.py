@@ -1,0 +1,364 @@
+"""The durable record of a run: one SQLite file, written before anything else is told.
+
+The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
+it is handed over; what `Journal` has returned from survives the death of the process and of the machine.
+Everything else (the .rrd, tables, figures) is derived from it and can be made again.
+
+Schema, version 1
+-----------------
+`meta(key, value)`
+    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `protocol`,
+    `parameters`, `seed`, `clock`, `epoch` (time of day at t = 0), `devices` (identity by name),
+    `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and whether it was clean),
+    `host` (with the room's time at the start), `plan`, `dashboard`, and at the end `status` (`completed`,
+    `aborted`, `failed`), `reason`, `finished` (laboratory s), `safe_state` (outcome by device).
+    A file without `status` is of a run that is going on or whose process died.
+`signals(position, name, unit, description, precision)`
+    One row a signal column of the two tables below.
+`steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …)`
+    One row a finished step; times are laboratory s; `setpoints` is JSON by device; then one REAL column a
+    signal, the reading.
+`telemetry(tick, t, step, "<signal>", …)`
+    One row a tick of a hold: quick readings.
+`events(event, t, level, kind, text)`
+    Phases, notes, pauses, interlocks, errors, safe state; level is `INFO`, `WARN` or `ERROR`.
+`models(name, t, model)`
+    Model files (JSON) that were identified from this run.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DataError
+
+SCHEMA = 1
+FILE_NAME = "journal.sqlite"
+
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE signals (position INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL, unit TEXT NOT NULL,
+    description TEXT NOT NULL, precision INTEGER NOT NULL);
+CREATE TABLE events (event INTEGER PRIMARY KEY, t REAL NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL,
+    text TEXT NOT NULL);
+CREATE TABLE models (name TEXT PRIMARY KEY, t REAL NOT NULL, model TEXT NOT NULL);
+"""
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One finished step.
+
+    Attributes
+    ----------
+    step : int
+        Number within the run, from 0.
+    started, finished : float
+        Laboratory time, s.
+    phase, label : str
+        Where in the protocol.
+    settled : bool
+        Whether the settling rule was met.
+    setpoints : mapping of str to float
+        What was sent, by device.
+    values : tuple of float
+        The reading, in the order of the journal's signals.
+    """
+
+    step: int
+    started: float
+    finished: float
+    phase: str
+    label: str
+    settled: bool
+    setpoints: Mapping[str, float]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing that happened.
+
+    Attributes
+    ----------
+    t : float
+        Laboratory time, s.
+    level : str
+        `INFO`, `WARN` or `ERROR`.
+    kind : str
+        `phase`, `note`, `pause`, `resume`, `interlock`, `error`, `safe-state`, `end`.
+    text : str
+        One sentence.
+    """
+
+    t: float
+    level: str
+    kind: str
+    text: str
+
+
+class Journal:
+    """Writes the record of one run.
+
+    Parameters
+    ----------
+    path : Path
+        File to create; its folder exists.
+    signals : sequence of Signal
+        What is measured, in the order in which values will be handed over.
+    meta : mapping
+        What is known at the start; values that JSON can hold.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file exists already: a record is never overwritten.
+    """
+
+    def __init__(self, path: Path, signals: Sequence[Signal], meta: Mapping[str, Any]) -> None:
+        if path.exists():
+            raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
+        self.path = path
+        self.signals = tuple(signals)
+        self._db = sqlite3.connect(path, isolation_level=None)
+        self._db.execute("PRAGMA journal_mode=WAL")
+        self._db.execute("PRAGMA synchronous=FULL")
+        columns = "".join(f", {_quoted(signal.name)} REAL" for signal in self.signals)
+        with self._transaction():
+            for statement in _TABLES.split(";"):
+                self._db.execute(statement)
+            self._db.execute(
+                "CREATE TABLE steps (step INTEGER PRIMARY KEY, started REAL NOT NULL, "
+                "finished REAL NOT NULL, phase TEXT NOT NULL, label TEXT NOT NULL, "
+                f"settled INTEGER NOT NULL, setpoints TEXT NOT NULL{columns})"
+            )
+            self._db.execute(
+                "CREATE TABLE telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, "
+                f"step INTEGER NOT NULL{columns})"
+            )
+            self._db.executemany(
+                "INSERT INTO signals VALUES (?, ?, ?, ?, ?)",
+                [(i, s.name, s.unit, s.description, s.precision) for i, s in enumerate(self.signals)],
+            )
+            for key, value in {"schema": SCHEMA, **meta}.items():
+                self._put_meta(key, value)
+        marks = ", ?" * len(self.signals)
+        self._insert_step = f"INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?, ?{marks})"  # noqa: S608 - marks only
+        self._insert_tick = f"INSERT INTO telemetry VALUES (NULL, ?, ?{marks})"  # noqa: S608 - marks only
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """Record one tick of a hold: laboratory time in s, step number, one value a signal."""
+        self._db.execute(self._insert_tick, (t, step, *values))
+
+    def step(self, record: StepRecord) -> None:
+        """Record a finished step."""
+        self._db.execute(
+            self._insert_step,
+            (
+                record.step,
+                record.started,
+                record.finished,
+                record.phase,
+                record.label,
+                int(record.settled),
+                json.dumps(dict(record.setpoints)),
+                *record.values,
+            ),
+        )
+
+    def event(self, event: Event) -> None:
+        """Record something that happened."""
+        self._db.execute(
+            "INSERT INTO events VALUES (NULL, ?, ?, ?, ?)", (event.t, event.level, event.kind, event.text)
+        )
+
+    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
+        """Record how the run ended: status, reason, laboratory time in s, safe state by device."""
+        with self._transaction():
+            self._put_meta("status", status)
+            self._put_meta("reason", reason)
+            self._put_meta("finished", finished)
+            self._put_meta("safe_state", dict(safe_state))
+
+    def close(self) -> None:
+        """Close the file; what was recorded stays."""
+        self._db.close()
+
+    def _put_meta(self, key: str, value: object) -> None:
+        self._db.execute(
+            "INSERT OR REPLACE INTO meta VALUES (?, ?)",
+            (key, json.dumps(value, ensure_ascii=False, default=str)),
+        )
+
+    def _transaction(self) -> _Transaction:
+        return _Transaction(self._db)
+
+
+class _Transaction:
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+
+    def __enter__(self) -> None:
+        self._db.execute("BEGIN IMMEDIATE")
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._db.execute("COMMIT" if kind is None else "ROLLBACK")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of equal length.
+
+    Attributes
+    ----------
+    columns : mapping of str to ndarray
+        Float columns by signal or column name, shape (rows,).
+    """
+
+    columns: Mapping[str, npt.NDArray[np.float64]]
+
+    def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
+        return self.columns[name]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+
+class Record:
+    """Reads the journal of a run, finished or not, without ever changing it.
+
+    Parameters
+    ----------
+    path : Path
+        The journal, or the folder of the run that holds it.
+
+    Raises
+    ------
+    DataError
+        If there is no journal there, it is damaged, or its schema is of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path / FILE_NAME if path.is_dir() else path
+        if not self.path.is_file():
+            raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
+        # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
+        self._db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
+        try:
+            self.meta: dict[str, Any] = {
+                key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM meta")
+            }
+            rows = self._db.execute(
+                "SELECT name, unit, description, precision FROM signals ORDER BY position"
+            )
+            self.signals = tuple(Signal(*row) for row in rows)
+        except (sqlite3.DatabaseError, json.JSONDecodeError) as error:
+            self._db.close()
+            raise DataError(f"{self.path} is not a readable journal: {error}") from error
+        if self.meta.get("schema") != SCHEMA:
+            self._db.close()
+            raise DataError(
+                f"{self.path} has schema version {self.meta.get('schema')}; this bench reads version {SCHEMA}"
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def status(self) -> str:
+        """`completed`, `aborted`, `failed`, or `unfinished` if the run goes on or its process died."""
+        return str(self.meta.get("status", "unfinished"))
+
+    def unit(self, signal: str) -> str:
+        """Return the unit of a signal; that of times is s."""
+        return next((s.unit for s in self.signals if s.name == signal), "s")
+
+    def steps(self) -> Table:
+        """Return the readings: columns `step`, `started`, `finished`, `settled`, and one a signal."""
+        return self._table("steps", ("step", "started", "finished", "settled"))
+
+    def step_records(self) -> Iterator[StepRecord]:
+        """Yield the finished steps one by one."""
+        for row in self._query("SELECT * FROM steps ORDER BY step"):
+            step, started, finished, phase, label, settled, setpoints, *values = row
+            yield StepRecord(
+                step,
+                started,
+                finished,
+                phase,
+                label,
+                bool(settled),
+                json.loads(setpoints),
+                tuple(map(_number, values)),
+            )
+
+    def telemetry(self) -> Table:
+        """Return the ticks: columns `t`, `step`, and one a signal."""
+        return self._table("telemetry", ("t", "step"))
+
+    def events(self) -> list[Event]:
+        """Return what happened, in its order."""
+        return [Event(*row) for row in self._query("SELECT t, level, kind, text FROM events ORDER BY event")]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def _table(self, table: str, leading: tuple[str, ...]) -> Table:
+        names = leading + tuple(signal.name for signal in self.signals)
+        columns = ", ".join(_quoted(name) for name in names)
+        rows = self._query(f"SELECT {columns} FROM {table} ORDER BY 1").fetchall()  # noqa: S608 - own names
+        data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+        return Table({name: data[:, i].copy() for i, name in enumerate(names)})
+
+    def _query(self, statement: str) -> sqlite3.Cursor:
+        try:
+            return self._db.execute(statement)
+        except sqlite3.DatabaseError as error:
+            raise DataError(f"{self.path} is damaged: {error}") from error
+
+
+def add_model(path: Path, name: str, t: float, model: Mapping[str, Any]) -> None:
+    """Keep a model with the run that it was identified from; one of the same name is replaced.
+
+    Parameters
+    ----------
+    path : Path
+        The journal, or the folder of the run.
+    name : str
+        Name of the model.
+    t : float
+        Laboratory time in s that its data reach to.
+    model : mapping
+        The model file's content.
+    """
+    file = path / FILE_NAME if path.is_dir() else path
+    if not file.is_file():
+        raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
+    db = sqlite3.connect(file, isolation_level=None)
+    try:
+        db.execute("INSERT OR REPLACE INTO models VALUES (?, ?, ?)", (name, t, json.dumps(model)))
+    except sqlite3.DatabaseError as error:
+        raise DataError(f"{file} is damaged: {error}") from error
+    finally:
+        db.close()
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)

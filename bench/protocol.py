@@ -1,0 +1,445 @@
+"""The vocabulary of protocols: what an operator's script says, and what it gets back.
+
+A protocol is a generator. It yields messages, and for each `Step` it is sent the `Reading` that was taken
+once the step had settled::
+
+    class Parameters(ProtocolParameters):
+        target: float = parameter(60.0, unit="°C", low=-10, high=95, help="where to go")
+
+    @protocol(needs=("tec",))
+    def soak(parameters: Parameters) -> Messages:
+        \"\"\"Hold one temperature and read it.\"\"\"
+        reading = yield Step({"tec": parameters.target}, Dwell(30.0))
+        yield Note(f"arrived at {reading['tec_temperature']:.2f} °C")
+
+A protocol touches no device and no clock, and is deterministic given its parameters and its readings. So
+it can be run dry to learn its length and the extremes of its set-points before anything moves.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import math
+import pkgutil
+import sys
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticUndefined
+
+from bench.errors import ConfigurationError
+
+PROTOCOL_PACKAGE = "protocols"
+_LONGEST_PLAN = 1_000_000
+
+
+@dataclass(frozen=True)
+class Dwell:
+    """Settle by waiting a fixed time.
+
+    Raises
+    ------
+    ValueError
+        If `seconds` is negative or not finite.
+    """
+
+    seconds: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.seconds) and self.seconds >= 0):
+            raise ValueError(f"seconds: expected a finite number ≥ 0, got {self.seconds}")
+
+
+@dataclass(frozen=True)
+class UntilSteady:
+    """Settle until a signal's remaining drift, as a Kalman filter estimates it, is below a limit.
+
+    Attributes
+    ----------
+    signal : str
+        Which signal has to come to rest.
+    drift : float
+        Largest drift allowed, in units of the signal per second. The estimate's magnitude and one
+        standard deviation of its uncertainty must both fit within.
+    noise : float
+        Standard deviation of one quick reading of the signal, in units of the signal.
+    timeout : float
+        Seconds after which the step has failed and the run ends in the safe state.
+    minimum : float
+        Seconds to wait in any case.
+    """
+
+    signal: str
+    drift: float
+    noise: float
+    timeout: float
+    minimum: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.drift > 0 and self.noise > 0 and self.timeout > self.minimum >= 0):
+            raise ValueError(
+                "UntilSteady: expected drift > 0, noise > 0 and timeout > minimum ≥ 0, got "
+                f"drift={self.drift}, noise={self.noise}, timeout={self.timeout}, minimum={self.minimum}"
+            )
+
+
+Settle = Dwell | UntilSteady
+
+
+@dataclass(frozen=True)
+class Step:
+    """Send set-points, let the rig settle, and take a reading.
+
+    Attributes
+    ----------
+    setpoints : mapping of str to float
+        Set-point by device name, in the device's unit; empty to read again where the rig stands.
+    settle : Dwell or UntilSteady
+        How to wait before the reading.
+    label : str
+        A few words for the record, such as `reversal`.
+    """
+
+    setpoints: Mapping[str, float]
+    settle: Settle
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of the protocol begins; shown live and kept in the record."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Note:
+    """A sentence for the log."""
+
+    text: str
+
+
+Message = Step | Phase | Note
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was measured at the end of a step.
+
+    Attributes
+    ----------
+    step : int
+        Number of the step within the run, from 0.
+    time : float
+        Laboratory time of the reading, s.
+    settled : bool
+        Whether the settling rule was met; always true for a dwell.
+    values : mapping of str to float
+        Value by signal name, derived signals and set-points included.
+    """
+
+    step: int
+    time: float
+    settled: bool
+    values: Mapping[str, float]
+
+    def __getitem__(self, signal: str) -> float:
+        return self.values[signal]
+
+
+Messages = Generator[Message, Reading, None]
+
+
+class ProtocolParameters(BaseModel):
+    """Base of a protocol's parameters; declare each with `parameter`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def parameter(
+    default: Any,  # noqa: ANN401 - whatever type the field has
+    *,
+    unit: str,
+    help: str,  # noqa: A002 - the word that the user sees
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:  # noqa: ANN401 - stands for a field's default
+    """Declare a parameter of a protocol.
+
+    Parameters
+    ----------
+    default
+        Value when nothing is said; `...` if it must be given.
+    unit : str
+        Its unit; `1` for a count or a plain number, empty for a text.
+    help : str
+        What it does, in one sentence without a full stop.
+    low, high : float, optional
+        The allowed range, both ends included.
+    """
+    return Field(default, description=help, ge=low, le=high, json_schema_extra={"unit": unit})
+
+
+@dataclass(frozen=True)
+class ParameterHelp:
+    """One parameter as help texts show it."""
+
+    name: str
+    default: str
+    unit: str
+    allowed: str
+    text: str
+
+
+@dataclass(frozen=True)
+class ProtocolDefinition:
+    """A protocol that can be run: its name, its parameters, and its generator function."""
+
+    name: str
+    summary: str
+    description: str
+    needs: tuple[str, ...]
+    parameters: type[ProtocolParameters]
+    generator: Callable[[Any], Messages]
+
+    def parse(self, settings: Mapping[str, str]) -> ProtocolParameters:
+        """Make parameters from texts such as those of `--set`.
+
+        Raises
+        ------
+        ConfigurationError
+            If a name is unknown or a value is not allowed; it names all that is wrong.
+        """
+        try:
+            return self.parameters.model_validate(dict(settings))
+        except ValidationError as error:
+            raise ConfigurationError("\n".join(self._explain(error))) from None
+
+    def help(self) -> tuple[ParameterHelp, ...]:
+        """Return what there is to set."""
+        return tuple(self._parameter_help(name) for name in self.parameters.model_fields)
+
+    def _parameter_help(self, name: str) -> ParameterHelp:
+        info = self.parameters.model_fields[name]
+        extra = info.json_schema_extra
+        unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
+        low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), None)
+        high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), None)
+        if low is not None and high is not None:
+            allowed = f"{low:g} to {high:g}"
+        elif low is not None:
+            allowed = f"≥ {low:g}"
+        elif high is not None:
+            allowed = f"≤ {high:g}"
+        else:
+            allowed = "any " + getattr(info.annotation, "__name__", "value")
+        default = "must be given" if info.default is PydanticUndefined else str(info.default)
+        return ParameterHelp(name, default, unit, allowed, info.description or "")
+
+    def _explain(self, error: ValidationError) -> Iterator[str]:
+        for problem in error.errors():
+            name = ".".join(str(part) for part in problem["loc"]) or "parameters"
+            if problem["type"] == "extra_forbidden":
+                known = ", ".join(self.parameters.model_fields) or "none"
+                yield f"protocol {self.name}: there is no parameter {name!r}; there are: {known}"
+            elif name in self.parameters.model_fields:
+                entry = self._parameter_help(name)
+                unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
+                given = (
+                    "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
+                )
+                yield (
+                    f"protocol {self.name}: parameter {name} {given}; "
+                    f"allowed: {entry.allowed}{unit} ({problem['msg']})"
+                )
+            else:
+                yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
+
+
+def protocol(*, needs: Sequence[str]) -> Callable[[Callable[[Any], Messages]], ProtocolDefinition]:
+    """Make a generator function a protocol.
+
+    Its name is the function's, with dashes; its one argument is annotated with its parameters' class; its
+    docstring is its help.
+
+    Parameters
+    ----------
+    needs : sequence of str
+        Devices and signals that the rig must have, by name.
+
+    Raises
+    ------
+    TypeError
+        If the function is not of this form.
+    """
+
+    def define(function: Callable[[Any], Messages]) -> ProtocolDefinition:
+        hints = [hint for name, hint in get_type_hints(function).items() if name != "return"]
+        if len(hints) != 1 or not (isinstance(hints[0], type) and issubclass(hints[0], ProtocolParameters)):
+            raise TypeError(
+                f"{function.__qualname__}: a protocol takes one argument, annotated with a ProtocolParameters"
+            )
+        description = inspect.getdoc(function)
+        if not description:
+            raise TypeError(f"{function.__qualname__}: a protocol has a docstring, which is its help")
+        return ProtocolDefinition(
+            name=function.__name__.replace("_", "-"),
+            summary=description.splitlines()[0].rstrip("."),
+            description=description,
+            needs=tuple(needs),
+            parameters=hints[0],
+            generator=function,
+        )
+
+    return define
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a protocol will do, learned by running it dry.
+
+    Attributes
+    ----------
+    steps : int
+        Number of steps.
+    seconds : float
+        Laboratory time in s, steps that settle until steady counted with their minimum.
+    at_most : float
+        The same, counted with their timeouts.
+    extremes : mapping of str to (float, float)
+        Smallest and largest set-point by device.
+    """
+
+    steps: int
+    seconds: float
+    at_most: float
+    extremes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan:
+    """Run a protocol dry, echoing each set-point as `NAME_setpoint` and `NAME_temperature` and the like.
+
+    Any other signal reads as 0.
+
+    Raises
+    ------
+    ConfigurationError
+        If the protocol does not end within a million steps, or its parameters do not fit together.
+    """
+    steps, seconds, at_most = 0, 0.0, 0.0
+    extremes: dict[str, tuple[float, float]] = {}
+    echo = _Echo()
+    try:
+        messages = definition.generator(parameters)
+        message = next(messages)
+        while True:
+            if isinstance(message, Step):
+                for device, value in message.setpoints.items():
+                    low, high = extremes.get(device, (value, value))
+                    extremes[device] = (min(low, value), max(high, value))
+                    echo.setpoints[device] = value
+                shortest, longest = _durations(message.settle)
+                seconds, at_most = seconds + shortest, at_most + longest
+                reading = Reading(steps, seconds, True, echo)
+                steps += 1
+                if steps > _LONGEST_PLAN:
+                    raise ConfigurationError(
+                        f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps"
+                    )
+                message = messages.send(reading)
+            else:
+                message = next(messages)
+    except StopIteration:
+        return Plan(steps, seconds, at_most, extremes)
+    except ValueError as error:
+        raise ConfigurationError(f"protocol {definition.name}: {error}") from error
+
+
+class _Echo(dict[str, float]):
+    def __init__(self) -> None:
+        super().__init__()
+        self.setpoints: dict[str, float] = {}
+
+    def __missing__(self, signal: str) -> float:
+        return self.setpoints.get(signal.partition("_")[0], 0.0)
+
+
+def _durations(settle: Settle) -> tuple[float, float]:
+    if isinstance(settle, Dwell):
+        return settle.seconds, settle.seconds
+    return settle.minimum, settle.timeout
+
+
+def packaged_protocols() -> dict[str, ProtocolDefinition]:
+    """Return the protocols of the `protocols` package by name.
+
+    Raises
+    ------
+    ConfigurationError
+        If two protocols share a name.
+    """
+    found: dict[str, ProtocolDefinition] = {}
+    package = importlib.import_module(PROTOCOL_PACKAGE)
+    for module in pkgutil.iter_modules(package.__path__):
+        for definition in _definitions(importlib.import_module(f"{PROTOCOL_PACKAGE}.{module.name}")):
+            if definition.name in found:
+                raise ConfigurationError(f"two protocols of the package are named {definition.name}")
+            found[definition.name] = definition
+    return dict(sorted(found.items()))
+
+
+def find_protocol(name: str) -> ProtocolDefinition:
+    """Return a protocol by its name, or from a file as `path/to/file.py` or `path/to/file.py:NAME`.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none, or the file cannot be loaded or holds several.
+    """
+    path, _, wanted = name.partition(":")
+    if path.endswith(".py"):
+        return _protocol_from_file(Path(path), wanted)
+    protocols = packaged_protocols()
+    if name not in protocols:
+        raise ConfigurationError(
+            f"there is no protocol {name!r}; there are: {', '.join(protocols)} "
+            "(or a file of your own, path/to/file.py)"
+        )
+    return protocols[name]
+
+
+def _protocol_from_file(path: Path, wanted: str) -> ProtocolDefinition:
+    if not path.is_file():
+        raise ConfigurationError(f"protocol file {path} does not exist")
+    spec = importlib.util.spec_from_file_location(f"protocol_file_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ConfigurationError(f"protocol file {path} cannot be loaded as Python")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (SyntaxError, ImportError, NameError, TypeError) as error:
+        raise ConfigurationError(f"protocol file {path}: {type(error).__name__}: {error}") from error
+    found = {definition.name: definition for definition in _definitions(module)}
+    names = ", ".join(found) or "none"
+    if wanted:
+        if wanted not in found:
+            raise ConfigurationError(f"protocol file {path} has no protocol {wanted!r}; it has: {names}")
+        return found[wanted]
+    if len(found) != 1:
+        raise ConfigurationError(f"protocol file {path}: choose one by {path}:NAME; it has: {names}")
+    return next(iter(found.values()))
+
+
+def _definitions(module: ModuleType) -> list[ProtocolDefinition]:
+    return [
+        value
+        for value in vars(module).values()
+        if isinstance(value, ProtocolDefinition) and value.generator.__module__ == module.__name__
+    ]

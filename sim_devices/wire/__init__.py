@@ -1,0 +1,12 @@
+"""Wire servers: the bytes that go to an emulated instrument, and those that come back."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class WireServer(Protocol):
+    """The serial side of an emulated instrument."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the host, in whatever pieces they come; return what the instrument sends."""

@@ -1,0 +1,82 @@
+"""One emulated laboratory's time: a plant and the instruments around it, brought up to the clock together.
+
+Nothing here has a thread. Whoever asks an emulated instrument anything first calls `World.advance`, which
+integrates the plant from where it was to the clock's time and lets whatever the instruments do by
+themselves, such as a watchdog that expires, happen at its own instant in between.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Protocol
+
+from bench.clock import Clock
+
+
+class Plant(Protocol):
+    """Physics only: a state and its way through time."""
+
+    def advance(self, dt: float) -> None:
+        """Integrate over `dt` seconds, from microseconds to hours; the split must not matter."""
+
+
+class Timed(Protocol):
+    """An instrument that does something by itself at a time of its own."""
+
+    def deadline(self) -> float:
+        """Return the laboratory time (s) at which something is due; infinity when nothing is."""
+
+    def expire(self) -> None:
+        """Do what is due; the plant stands at that instant. `deadline` must move on."""
+
+
+class World:
+    """A plant, the clock, and the instruments with deadlines.
+
+    Parameters
+    ----------
+    plant : Plant
+        The physics that the instruments look at and act on.
+    clock : Clock
+        The clock of the run.
+
+    Attributes
+    ----------
+    lock : threading.RLock
+        Held by a wire server for the whole of a request, as servers of TCP ports have threads.
+    """
+
+    def __init__(self, plant: Plant, clock: Clock) -> None:
+        self.clock = clock
+        self.lock = threading.RLock()
+        self._plant = plant
+        self._time = clock.now()
+        self._timed: list[Timed] = []
+
+    @property
+    def time(self) -> float:
+        """Laboratory time (s) at which plant and instruments stand."""
+        return self._time
+
+    def add(self, timed: Timed) -> None:
+        """Have an instrument's deadlines kept."""
+        self._timed.append(timed)
+
+    def advance(self) -> None:
+        """Bring the plant and everything due to the clock's present time."""
+        with self.lock:
+            target = self.clock.now()
+            while self._timed:
+                first = min(self._timed, key=lambda timed: timed.deadline())
+                due = first.deadline()
+                if not math.isfinite(due) or due > target:
+                    break
+                self._advance_plant(max(due, self._time))
+                first.expire()
+            self._advance_plant(target)
+
+    def _advance_plant(self, instant: float) -> None:
+        if instant > self._time:
+            self._plant.advance(instant - self._time)
+            self._time = instant
