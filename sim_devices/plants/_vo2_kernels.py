@@ -1,0 +1,302 @@
+"""Compiled inner loops of the VO2 cantilever plant.
+
+The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
+a microsecond and the plant is advanced hundreds of thousands of times a run. The constants below name
+the places in these arrays. All temperatures are in degrees Celsius except inside the Peltier terms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+ZERO_CELSIUS = 273.15
+
+# Continuous state.
+PLATE, RATE, CURRENT, SINK, WANDER, DRIFT, DRIVE = range(7)
+STATE_SIZE = 7
+
+# Relay counters: relays that are on, up-thresholds and down-thresholds below the present drive.
+ON_COUNT, UP_BELOW, DOWN_BELOW = range(3)
+COUNTER_SIZE = 3
+
+# Command: loop closed (1) or open (0), target (°C), current limit (A), current command (A).
+CLOSED, TARGET, LIMIT, COMMAND = range(4)
+COMMAND_SIZE = 4
+
+# Coefficients, prepared once from the parameters.
+(
+    STEP,
+    LOOP_EE,
+    LOOP_EV,
+    LOOP_VE,
+    LOOP_VV,
+    SLEW,
+    SLEW_DECAY,
+    CURRENT_DECAY,
+    SEEBECK,
+    RESISTANCE,
+    CONDUCTANCE,
+    PLATE_LOSS,
+    PLATE_CAPACITY,
+    SINK_CAPACITY,
+    SINK_LOSS,
+    AMBIENT,
+    WANDER_DECAY,
+    WANDER_KICK,
+    DRIFT_DECAY,
+    DRIFT_KICK,
+    OFFSET,
+    COUPLING,
+    RELAY_STEP,
+) = range(23)
+COEFFICIENT_SIZE = 23
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@njit(cache=True)
+def switch_relays(
+    drive: float, counters: Integers, up: Floats, down: Floats, down_relay: Integers, on: Flags
+) -> None:
+    """Bring every relay to one new value of the drive.
+
+    A relay is on above its up-threshold, off below its down-threshold and otherwise keeps its state.
+    Relays are numbered in the order of their up-thresholds, so only those whose threshold lies in the
+    swept interval are touched.
+
+    Parameters
+    ----------
+    drive : float
+        New value of the effective temperature, °C.
+    counters : ndarray
+        Relay counters, changed in place.
+    up, down : ndarray
+        Up- and down-thresholds, °C, each sorted.
+    down_relay : ndarray
+        Relay number of each element of `down`.
+    on : ndarray
+        Relay states, changed in place.
+    """
+    size = up.size
+    count = counters[ON_COUNT]
+    above = counters[UP_BELOW]
+    while above < size and up[above] < drive:
+        if not on[above]:
+            on[above] = True
+            count += 1
+        above += 1
+    while above > 0 and up[above - 1] >= drive:
+        above -= 1
+    below = counters[DOWN_BELOW]
+    while below < size and down[below] < drive:
+        below += 1
+    while below > 0 and down[below - 1] > drive:
+        below -= 1
+        relay = down_relay[below]
+        if on[relay]:
+            on[relay] = False
+            count -= 1
+    counters[ON_COUNT] = count
+    counters[UP_BELOW] = above
+    counters[DOWN_BELOW] = below
+
+
+@njit(cache=True)
+def settle_film(
+    film: float,
+    coupling: float,
+    relay_step: float,
+    state: Floats,
+    counters: Integers,
+    up: Floats,
+    down: Floats,
+    down_relay: Integers,
+    on: Flags,
+) -> None:
+    """Sweep the effective temperature towards what the film temperature and the R fraction ask for.
+
+    The R fraction of the previous sub-step feeds back (causal), so relays that switch in the last
+    sub-step act one grid step later, as an avalanche does.
+
+    Parameters
+    ----------
+    film : float
+        Film temperature, °C.
+    coupling : float
+        Mean-field coupling, K.
+    relay_step : float
+        Largest sub-step of the effective temperature, K.
+    state, counters, up, down, down_relay, on : ndarray
+        See `switch_relays`; the effective temperature in `state` is changed in place.
+    """
+    while True:
+        wanted = film + coupling * (counters[ON_COUNT] / up.size - 0.5)
+        move = wanted - state[DRIVE]
+        if abs(move) <= relay_step:
+            state[DRIVE] = wanted
+            switch_relays(wanted, counters, up, down, down_relay, on)
+            return
+        state[DRIVE] += math.copysign(relay_step, move)
+        switch_relays(state[DRIVE], counters, up, down, down_relay, on)
+
+
+@njit(cache=True)
+def plate_rate(plate: float, current: float, sink: float, c: Floats) -> float:
+    """Evaluate the heat balance: rate of the plate temperature under a current.
+
+    Parameters
+    ----------
+    plate, sink : float
+        Temperatures of plate and heat sink, °C.
+    current : float
+        Peltier current, A; positive heats the plate.
+    c : ndarray
+        Coefficients.
+
+    Returns
+    -------
+    float
+        Rate, K/s.
+    """
+    heat = c[SEEBECK] * (plate + ZERO_CELSIUS) * current + 0.5 * c[RESISTANCE] * current * current
+    heat -= c[CONDUCTANCE] * (plate - sink) + c[PLATE_LOSS] * (plate - c[AMBIENT])
+    rate: float = heat / c[PLATE_CAPACITY]
+    return rate
+
+
+@njit(cache=True)
+def current_for(plate: float, rate: float, sink: float, c: Floats) -> float:
+    """Find the current that gives the plate a rate: the inverse of `plate_rate` on the useful branch.
+
+    Parameters
+    ----------
+    plate, sink : float
+        Temperatures of plate and heat sink, °C.
+    rate : float
+        Rate of the plate temperature, K/s.
+    c : ndarray
+        Coefficients.
+
+    Returns
+    -------
+    float
+        Current, A, the root of smaller magnitude.
+    """
+    heat = c[PLATE_CAPACITY] * rate
+    heat += c[CONDUCTANCE] * (plate - sink) + c[PLATE_LOSS] * (plate - c[AMBIENT])
+    pumped = c[SEEBECK] * (plate + ZERO_CELSIUS)
+    # The rate never asks for more cooling than the Peltier maximum: a negative root is rounding only.
+    root = math.sqrt(max(pumped * pumped + 2.0 * c[RESISTANCE] * heat, 0.0))
+    current: float = 2.0 * heat / (pumped + root)
+    return current
+
+
+@njit(cache=True)
+def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Floats) -> float:
+    """Limit a rate to the slew limit and to the heat flow that the current limit allows.
+
+    Parameters
+    ----------
+    rate : float
+        Rate that the loop wants, K/s.
+    slew : float
+        Slew limit, K/s.
+    limit : float
+        Current limit, A, of either sign; may be infinite.
+    plate, sink : float
+        Temperatures of plate and heat sink, °C.
+    c : ndarray
+        Coefficients.
+
+    Returns
+    -------
+    float
+        Rate, K/s.
+    """
+    # Beyond this current the Joule heat outgrows the pumping and more current cools less.
+    best_cooling = c[SEEBECK] * (plate + ZERO_CELSIUS) / c[RESISTANCE]
+    rate = min(max(rate, -slew), slew)
+    rate = min(rate, plate_rate(plate, limit, sink, c))
+    return max(rate, plate_rate(plate, -min(limit, best_cooling), sink, c))
+
+
+@njit(cache=True)
+def step_plate(state: Floats, command: Floats, c: Floats) -> None:
+    """Advance plate, current and sink by one grid step.
+
+    Parameters
+    ----------
+    state : ndarray
+        State, changed in place.
+    command : ndarray
+        What the amplifier was told.
+    c : ndarray
+        Coefficients.
+    """
+    step = c[STEP]
+    plate = state[PLATE]
+    rate = state[RATE]
+    current = state[CURRENT]
+    sink = state[SINK]
+
+    taken = c[SEEBECK] * (sink + ZERO_CELSIUS) * current - 0.5 * c[RESISTANCE] * current * current
+    taken -= c[CONDUCTANCE] * (plate - sink)
+    sink += step * (-taken - c[SINK_LOSS] * (sink - c[AMBIENT])) / c[SINK_CAPACITY]
+
+    if command[CLOSED] == 0.0:
+        current = command[COMMAND] + (current - command[COMMAND]) * c[CURRENT_DECAY]
+        ahead = plate_rate(plate + step * rate, current, sink, c)
+        plate += 0.5 * step * (rate + ahead)
+        rate = plate_rate(plate, current, sink, c)
+    else:
+        error = command[TARGET] - plate
+        wanted = c[LOOP_VE] * error + c[LOOP_VV] * rate
+        moved = command[TARGET] - (c[LOOP_EE] * error + c[LOOP_EV] * rate)
+        # A mode change may hand over more speed or current than the limits allow: it decays into them.
+        slew = c[SLEW] + max(abs(rate) - c[SLEW], 0.0) * c[SLEW_DECAY]
+        limit = command[LIMIT] + max(abs(current) - command[LIMIT], 0.0) * c[CURRENT_DECAY]
+        reached = limited_rate(wanted, slew, limit, plate + step * rate, sink, c)
+        plate = moved if reached == wanted else plate + 0.5 * step * (rate + reached)
+        # Once more where the plate has come to, so that the current never leaves its limit.
+        rate = limited_rate(wanted, slew, limit, plate, sink, c)
+        current = current_for(plate, rate, sink, c)
+
+    state[PLATE] = plate
+    state[RATE] = rate
+    state[CURRENT] = current
+    state[SINK] = sink
+
+
+@njit(cache=True)
+def advance_steps(
+    normals: Floats,
+    state: Floats,
+    counters: Integers,
+    command: Floats,
+    c: Floats,
+    up: Floats,
+    down: Floats,
+    down_relay: Integers,
+    on: Flags,
+) -> None:
+    """Advance the whole plant by one grid step for each row of `normals`.
+
+    Parameters
+    ----------
+    normals : ndarray
+        Standard normal numbers, one row a step: wander, drift.
+    state, counters, command, c, up, down, down_relay, on : ndarray
+        See the functions above; `state`, `counters` and `on` are changed in place.
+    """
+    for row in range(normals.shape[0]):
+        step_plate(state, command, c)
+        state[WANDER] = c[WANDER_DECAY] * state[WANDER] + c[WANDER_KICK] * normals[row, 0]
+        state[DRIFT] = c[DRIFT_DECAY] * state[DRIFT] + c[DRIFT_KICK] * normals[row, 1]
+        film = state[PLATE] + state[WANDER] + state[DRIFT] + c[OFFSET]
+        settle_film(film, c[COUPLING], c[RELAY_STEP], state, counters, up, down, down_relay, on)

@@ -1,0 +1,600 @@
+"""VO2-coated silicon microcantilever on a Peltier plate: the physics behind the ``vo2`` rig.
+
+The plant is deliberately not of the structure that identification fits. A fitted model is a Preisach
+operator with a piecewise constant density plus a quadratic in temperature; the plant has a smooth,
+correlated density made of two relay populations, a mean-field coupling that breaks congruency, and
+*one* hysteretic phase fraction that drives both the transition strain and the thermal expansion. On
+top of that the film temperature wanders, drifts and differs by a constant from session to session.
+
+Source of the geometry, of the ranges and of the observed behaviour: Zhang et al., "Modeling and inverse
+compensation of nonmonotonic hysteresis in VO2-coated microactuators", IEEE/ASME Transactions on
+Mechatronics, 2013. Numbers marked *assumed* are ours, chosen so that the plant behaves as the paper's
+specimen does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from sim_devices.plants import _vo2_kernels as kernels
+
+# A grid point counts as reached this early (s), so that rounding in the caller's clock, even one
+# that counts from 1970, does not decide on which side of a call a step falls.
+_GRID_TOLERANCE = 5e-7
+
+# Rows of random numbers drawn at a time.
+_NOISE_BLOCK = 4096
+
+_POSITIVE = (
+    "relay_count",
+    "major_width",
+    "minor_width",
+    "relay_step",
+    "beam_length",
+    "step",
+    "loop_frequency",
+    "slew_limit",
+    "seebeck",
+    "resistance",
+    "conductance",
+    "plate_capacity",
+    "sink_capacity",
+    "sink_resistance",
+    "current_lag",
+    "maximum_current",
+    "wander_time",
+    "drift_time",
+)
+_NOT_NEGATIVE = (
+    "major_spread",
+    "major_width_spread",
+    "minor_spread",
+    "minor_width_spread",
+    "coupling",
+    "plate_loss",
+    "wander_sd",
+    "drift_sd",
+)
+
+
+@dataclass(frozen=True)
+class VO2Parameters:
+    """Every number of the plant.
+
+    The values that come from the paper are the beam length and the operating range that the rest was
+    tuned to: curvature change about [-104, 1846] 1/m between 21 and 84 °C, transition within 30 to
+    70 °C, temperature held to ±0.1 K. All others are assumed.
+
+    Attributes
+    ----------
+    relay_count : int
+        Number of hysteresis relays; at least 1.
+    specimen_seed : int
+        Seed of the relay thresholds. The specimen is the same piece whatever the session's seed.
+    correlation : float
+        Correlation of threshold and width in normal scores, in (-1, 1).
+    minor_share : float
+        Share of relays in population B (the wide loops), in [0, 1].
+    major_centre, minor_centre : float
+        Mean up-threshold of populations A and B, °C.
+    major_spread, minor_spread : float
+        Standard deviation of the up-threshold of populations A and B, K.
+    major_width, minor_width : float
+        Mean of the lognormal loop width of populations A and B, K.
+    major_width_spread, minor_width_spread : float
+        Standard deviation of the loop width of populations A and B, K.
+    highest_threshold, lowest_threshold : float
+        Thresholds beyond these are reflected back, °C, so that none sits on the limits of the
+        transition range.
+    coupling : float
+        Mean-field (stress) coupling lambda of R fraction and drive, K.
+    relay_step : float
+        Largest sub-step of the effective temperature, K.
+    curvature_offset : float
+        Curvature at the expansion reference without transition, 1/m.
+    transition_curvature : float
+        Curvature of the complete transition, 1/m.
+    cold_expansion, hot_expansion : float
+        Bending by thermal expansion mismatch in the M1 and in the R phase, 1/(m K).
+    expansion_reference : float
+        Temperature of no expansion bending, °C.
+    beam_length : float
+        Length of the cantilever, m (paper: 300 µm).
+    residual_curvature : float
+        Curvature of the beam before any change, 1/m.
+    step : float
+        Step of the internal time grid, s.
+    loop_frequency : float
+        Natural frequency of the closed temperature loop, rad/s.
+    loop_damping : float
+        Damping ratio of the closed temperature loop, in (0, 1).
+    slew_limit : float
+        Largest rate of the regulated plate, K/s.
+    ambient_temperature : float
+        Temperature of the room, °C.
+    seebeck : float
+        Seebeck coefficient of the Peltier module, V/K (a 127-couple module).
+    resistance : float
+        Electrical resistance of the module, ohm.
+    conductance : float
+        Thermal conductance of the module between plate and heat sink, W/K.
+    plate_loss : float
+        Conductance from plate to room, W/K.
+    plate_capacity : float
+        Heat capacity of the plate with cantilever chip, glass and sensor, J/K.
+    sink_capacity : float
+        Heat capacity of the heat sink, J/K.
+    sink_resistance : float
+        Thermal resistance from heat sink to room, K/W.
+    current_lag : float
+        Time constant with which the amplifier's current follows a change of command, s.
+    maximum_current : float
+        Rating of the module, A; larger commands are refused. Must stay below the thermal runaway
+        ``conductance / seebeck``.
+    wander_sd, wander_time : float
+        Standard deviation (K) and correlation time (s) of the fast temperature wander, which stands
+        for the ±0.1 K of the controller.
+    drift_sd, drift_time : float
+        Standard deviation (K) and correlation time (s) of the drift of laser heating.
+    session_offset : float
+        Constant difference of the film temperature in this session, K. Zero while a model is
+        identified; ±0.2 K for a later validation and ±0.12 K for tracking are sensible.
+    """
+
+    relay_count: int = 16384
+    specimen_seed: int = 2013
+    correlation: float = -0.3
+    minor_share: float = 0.05
+    major_centre: float = 63.5
+    major_spread: float = 3.0
+    major_width: float = 4.0
+    major_width_spread: float = 2.0
+    minor_centre: float = 62.0
+    minor_spread: float = 3.0
+    minor_width: float = 14.0
+    minor_width_spread: float = 6.0
+    highest_threshold: float = 69.8
+    lowest_threshold: float = 30.2
+    coupling: float = 1.0
+    relay_step: float = 0.05
+    curvature_offset: float = 8.0
+    transition_curvature: float = 2034.0
+    cold_expansion: float = 3.05
+    hot_expansion: float = 4.25
+    expansion_reference: float = 20.0
+    beam_length: float = 300e-6
+    residual_curvature: float = 0.0
+    step: float = 0.05
+    loop_frequency: float = 2.2
+    loop_damping: float = 0.9
+    slew_limit: float = 15.0
+    ambient_temperature: float = 22.0
+    seebeck: float = 0.051
+    resistance: float = 3.1
+    conductance: float = 0.35
+    plate_loss: float = 0.01
+    plate_capacity: float = 2.2
+    sink_capacity: float = 300.0
+    sink_resistance: float = 0.4
+    current_lag: float = 0.1
+    maximum_current: float = 5.0
+    wander_sd: float = 0.03
+    wander_time: float = 5.0
+    drift_sd: float = 0.04
+    drift_time: float = 1800.0
+    session_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not math.isfinite(getattr(self, field.name)):
+                raise ValueError(f"{field.name} must be finite, not {getattr(self, field.name)}")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in _NOT_NEGATIVE:
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+        if not 0.0 < self.loop_damping < 1.0:
+            raise ValueError(f"loop_damping must lie in (0, 1), not {self.loop_damping}")
+        if not -1.0 < self.correlation < 1.0:
+            raise ValueError(f"correlation must lie in (-1, 1), not {self.correlation}")
+        if not 0.0 <= self.minor_share <= 1.0:
+            raise ValueError(f"minor_share must lie in [0, 1], not {self.minor_share}")
+        if not self.seebeck * self.maximum_current < self.conductance:
+            raise ValueError(
+                f"maximum_current must stay below the thermal runaway at "
+                f"{self.conductance / self.seebeck:.3g} A, not {self.maximum_current}"
+            )
+
+
+class VO2Snapshot(NamedTuple):
+    """Every output of the plant at one instant.
+
+    Attributes
+    ----------
+    plate_temperature, film_temperature, sink_temperature : float
+        Temperatures, °C.
+    plate_rate : float
+        Rate of the plate temperature, K/s.
+    current : float
+        Peltier current, A.
+    voltage : float
+        Voltage across the module, V.
+    r_fraction : float
+        Share of the film in the R phase, in [0, 1].
+    curvature : float
+        Curvature change of the beam, 1/m.
+    tip_deflection : float
+        Change of the tip deflection, m.
+    """
+
+    plate_temperature: float
+    film_temperature: float
+    sink_temperature: float
+    plate_rate: float
+    current: float
+    voltage: float
+    r_fraction: float
+    curvature: float
+    tip_deflection: float
+
+
+def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Make the specimen: the thresholds of its relays.
+
+    The relays are a low-discrepancy sample of the two populations, shifted by the specimen's seed:
+    a smooth density without the graininess of a random one.
+
+    Parameters
+    ----------
+    parameters : VO2Parameters
+        Parameters of the populations.
+
+    Returns
+    -------
+    tuple of ndarray
+        Up-thresholds (sorted) and the down-thresholds of the same relays, °C; the down-threshold is
+        nowhere above the up-threshold.
+    """
+    p = parameters
+    # The additive sequence of the generalised golden ratio of three dimensions, the root of x^4 = x + 1.
+    powers = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+    shift = np.random.default_rng(p.specimen_seed).random(3)
+    points = (shift + np.arange(1, p.relay_count + 1)[:, None] * powers) % 1.0
+    # Zero has no normal score; it can turn up only by rounding.
+    scores = ndtri(np.maximum(points[:, :2], np.finfo(float).tiny))
+    minor = points[:, 2] < p.minor_share
+    first = scores[:, 0]
+    second = p.correlation * first + math.sqrt(1.0 - p.correlation**2) * scores[:, 1]
+
+    up = np.where(minor, p.minor_centre + p.minor_spread * first, p.major_centre + p.major_spread * first)
+    up = np.where(up > p.highest_threshold, 2.0 * p.highest_threshold - up, up)
+    mean = np.where(minor, p.minor_width, p.major_width)
+    spread = np.where(minor, p.minor_width_spread, p.major_width_spread)
+    log_variance = np.log1p((spread / mean) ** 2)
+    down = up - mean * np.exp(np.sqrt(log_variance) * second - 0.5 * log_variance)
+    down = np.where(down < p.lowest_threshold, 2.0 * p.lowest_threshold - down, down)
+    # A width in the far tail may be reflected past its own up-threshold.
+    down = np.minimum(down, up)
+    order = np.argsort(up, kind="stable")
+    return up[order], down[order]
+
+
+class VO2Cantilever:
+    """Curvature of a VO2 microcantilever on a Peltier plate, advanced in time.
+
+    The plate is either regulated (`regulate`: the closed second-order loop of a temperature
+    controller), driven by a constant current (`drive`) or left alone (`release`). Changing between
+    them keeps the plate's temperature and rate. A positive current heats the plate. There is no sensor
+    noise here and no protection either: nothing clamps a temperature, that is for the instruments.
+
+    Time runs on a fixed grid of ``parameters.step`` seconds from construction. `advance` carries out
+    the grid steps that have become due and holds the remainder, and outputs stay constant between
+    grid points. A command acts from the next grid step on. So neither the number nor the size of the
+    calls of `advance` changes the trajectory, the noise included.
+
+    A step of the regulated plate is the exact solution of the linear loop; where slew limit, current
+    limit or the module's strongest cooling bind, the rate saturates. The current is what the Peltier
+    balance asks for at the plate's temperature and rate::
+
+        C dT/dt = S T I + R I²/2 - K (T - T_sink) - G (T - T_ambient)        (T in kelvin)
+
+    Parameters
+    ----------
+    parameters : VO2Parameters
+        The numbers.
+    rng : numpy.random.Generator
+        The session's randomness: wander and drift. The plant spawns its own generator from it and
+        never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+    initial_temperature : float, optional
+        Temperature of the plate at the start, °C; the room's by default. The film arrives there from
+        negative saturation (cold), the heat sink is at room temperature, the output is off.
+
+    Raises
+    ------
+    ValueError
+        If `initial_temperature` is not a temperature.
+    """
+
+    def __init__(
+        self,
+        parameters: VO2Parameters,
+        rng: np.random.Generator,
+        initial_temperature: float | None = None,
+    ) -> None:
+        start = parameters.ambient_temperature if initial_temperature is None else initial_temperature
+        _check_temperature("initial_temperature", start)
+        self._parameters = parameters
+        self._coefficients = _coefficients(parameters)
+        self._up, down = relay_thresholds(parameters)
+        self._down_relay = np.argsort(down, kind="stable")
+        self._down = down[self._down_relay]
+        self._on = np.zeros(parameters.relay_count, dtype=np.bool_)
+        self._counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
+        self._command = np.zeros(kernels.COMMAND_SIZE)
+        self._state = np.zeros(kernels.STATE_SIZE)
+        self._pending = 0.0
+        (self._noise,) = rng.spawn(1)
+        self._normals = np.empty((0, 2))
+        self._used = 0
+
+        state = self._state
+        wander, drift = self._noise.standard_normal(2)
+        state[kernels.PLATE] = start
+        state[kernels.SINK] = parameters.ambient_temperature
+        state[kernels.WANDER] = parameters.wander_sd * wander
+        state[kernels.DRIFT] = parameters.drift_sd * drift
+        state[kernels.DRIVE] = min(float(self._down[0]), start) - parameters.coupling - 1.0
+        state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
+        kernels.settle_film(
+            self.film_temperature,
+            parameters.coupling,
+            parameters.relay_step,
+            state,
+            self._counters,
+            self._up,
+            self._down,
+            self._down_relay,
+            self._on,
+        )
+
+    @property
+    def parameters(self) -> VO2Parameters:
+        """The numbers of this plant."""
+        return self._parameters
+
+    def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
+        """Close the temperature loop.
+
+        Parameters
+        ----------
+        target_celsius : float
+            Target of the plate temperature, °C.
+        current_limit : float, optional
+            Largest current of either sign that the amplifier may give, A. Where the loop asks for
+            more, the plate's rate saturates at what this current can do; a target out of its reach is
+            approached and not reached.
+
+        Raises
+        ------
+        ValueError
+            If the target is not a temperature or the limit is negative or not a number.
+        """
+        _check_temperature("target_celsius", target_celsius)
+        if not current_limit >= 0.0:
+            raise ValueError(f"current_limit must not be negative, not {current_limit} A")
+        self._command[kernels.CLOSED] = 1.0
+        self._command[kernels.TARGET] = target_celsius
+        self._command[kernels.LIMIT] = current_limit
+
+    def drive(self, current_ampere: float) -> None:
+        """Drive a constant current; the loop is open.
+
+        Parameters
+        ----------
+        current_ampere : float
+            Current, A; positive heats the plate. The output follows with the amplifier's lag.
+
+        Raises
+        ------
+        ValueError
+            If the magnitude exceeds the module's rating ``parameters.maximum_current``.
+        """
+        if not abs(current_ampere) <= self._parameters.maximum_current:
+            raise ValueError(f"current must lie within ±{self._parameters.maximum_current} A, not {current_ampere} A")
+        self._command[kernels.CLOSED] = 0.0
+        self._command[kernels.COMMAND] = current_ampere
+
+    def release(self) -> None:
+        """Switch the output off; the plate relaxes towards the heat sink and the room."""
+        self._command[kernels.CLOSED] = 0.0
+        self._command[kernels.COMMAND] = 0.0
+
+    def advance(self, dt: float) -> None:
+        """Advance the plant in time.
+
+        Parameters
+        ----------
+        dt : float
+            Time to advance, s, at least 0. Any size: what does not fill a grid step is held for the
+            next call. A grid point less than half a microsecond ahead counts as reached.
+
+        Raises
+        ------
+        ValueError
+            If `dt` is negative or not finite.
+        """
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f"dt must be finite and not negative, not {dt} s")
+        step = self._parameters.step
+        pending = self._pending + dt
+        due = math.floor((pending + _GRID_TOLERANCE) / step)
+        self._pending = pending - due * step
+        while due > 0:
+            if self._used == self._normals.shape[0]:
+                self._normals = self._noise.standard_normal((_NOISE_BLOCK, 2))
+                self._used = 0
+            count = min(due, self._normals.shape[0] - self._used)
+            kernels.advance_steps(
+                self._normals[self._used : self._used + count],
+                self._state,
+                self._counters,
+                self._command,
+                self._coefficients,
+                self._up,
+                self._down,
+                self._down_relay,
+                self._on,
+            )
+            self._used += count
+            due -= count
+
+    @property
+    def plate_temperature(self) -> float:
+        """Temperature of the plate, where the controller's sensor sits, °C."""
+        return float(self._state[kernels.PLATE])
+
+    @property
+    def plate_rate(self) -> float:
+        """Rate of the plate temperature, K/s."""
+        return float(self._state[kernels.RATE])
+
+    @property
+    def sink_temperature(self) -> float:
+        """Temperature of the heat sink, °C."""
+        return float(self._state[kernels.SINK])
+
+    @property
+    def film_temperature(self) -> float:
+        """Temperature of the VO2 film: plate, wander, drift and the session's offset, °C."""
+        state = self._state
+        film = state[kernels.PLATE] + state[kernels.WANDER] + state[kernels.DRIFT]
+        return float(film + self._parameters.session_offset)
+
+    @property
+    def current(self) -> float:
+        """Peltier current, A; positive heats the plate."""
+        return float(self._state[kernels.CURRENT])
+
+    @property
+    def voltage(self) -> float:
+        """Voltage across the Peltier module, V: Seebeck and ohmic part, of the sign of a heating current."""
+        p = self._parameters
+        return p.seebeck * (self.plate_temperature - self.sink_temperature) + p.resistance * self.current
+
+    @property
+    def r_fraction(self) -> float:
+        """Share of the film in the R (hot) phase, in [0, 1]."""
+        return int(self._counters[kernels.ON_COUNT]) / self._parameters.relay_count
+
+    @property
+    def curvature(self) -> float:
+        """Curvature change of the beam, 1/m: about -96 to 1838 between 21 and 84 °C."""
+        p = self._parameters
+        hot = self.r_fraction
+        expansion = p.cold_expansion * (1.0 - hot) + p.hot_expansion * hot
+        return (
+            p.curvature_offset
+            + p.transition_curvature * hot
+            - expansion * (self.film_temperature - p.expansion_reference)
+        )
+
+    @property
+    def tip_deflection(self) -> float:
+        """Deflection of the tip from where the beam of residual curvature has it, m."""
+        p = self._parameters
+        return arc_deflection(p.residual_curvature + self.curvature, p.beam_length) - arc_deflection(
+            p.residual_curvature, p.beam_length
+        )
+
+    def snapshot(self) -> VO2Snapshot:
+        """Take all outputs at the present instant.
+
+        Returns
+        -------
+        VO2Snapshot
+            The outputs.
+        """
+        return VO2Snapshot(
+            plate_temperature=self.plate_temperature,
+            film_temperature=self.film_temperature,
+            sink_temperature=self.sink_temperature,
+            plate_rate=self.plate_rate,
+            current=self.current,
+            voltage=self.voltage,
+            r_fraction=self.r_fraction,
+            curvature=self.curvature,
+            tip_deflection=self.tip_deflection,
+        )
+
+
+def arc_deflection(curvature: float, length: float) -> float:
+    """Tip deflection of a beam bent to an arc (Zhang et al., 2013, eq. 1).
+
+    Parameters
+    ----------
+    curvature : float
+        Curvature, 1/m, of either sign.
+    length : float
+        Length of the arc, m.
+
+    Returns
+    -------
+    float
+        ``(1 - cos(curvature * length)) / curvature``, m; odd in the curvature.
+    """
+    half = 0.5 * curvature * length
+    # Half-angle form: no cancellation near a straight beam, where the ratio's series is 1 - half²/6.
+    ratio = math.sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
+    return length * half * ratio * ratio
+
+
+def _check_temperature(name: str, celsius: float) -> None:
+    if not -kernels.ZERO_CELSIUS < celsius < math.inf:
+        raise ValueError(f"{name} must be a temperature above absolute zero, not {celsius} °C")
+
+
+def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
+    """Prepare the numbers that the compiled loop needs every step."""
+    p = parameters
+    step = p.step
+    # Exact transition of x'' = w² (target - x) - 2 zeta w x' over one step, in (target - x, x').
+    decay = p.loop_damping * p.loop_frequency
+    swing = p.loop_frequency * math.sqrt(1.0 - p.loop_damping**2)
+    shrink = math.exp(-decay * step)
+    cosine = shrink * math.cos(swing * step)
+    sine = shrink * math.sin(swing * step) / swing
+    wander_decay = math.exp(-step / p.wander_time)
+    drift_decay = math.exp(-step / p.drift_time)
+    values = {
+        kernels.STEP: step,
+        kernels.LOOP_EE: cosine + decay * sine,
+        kernels.LOOP_EV: -sine,
+        kernels.LOOP_VE: p.loop_frequency**2 * sine,
+        kernels.LOOP_VV: cosine - decay * sine,
+        kernels.SLEW: p.slew_limit,
+        kernels.SLEW_DECAY: math.exp(-2.0 * decay * step),
+        kernels.CURRENT_DECAY: math.exp(-step / p.current_lag),
+        kernels.SEEBECK: p.seebeck,
+        kernels.RESISTANCE: p.resistance,
+        kernels.CONDUCTANCE: p.conductance,
+        kernels.PLATE_LOSS: p.plate_loss,
+        kernels.PLATE_CAPACITY: p.plate_capacity,
+        kernels.SINK_CAPACITY: p.sink_capacity,
+        kernels.SINK_LOSS: 1.0 / p.sink_resistance,
+        kernels.AMBIENT: p.ambient_temperature,
+        kernels.WANDER_DECAY: wander_decay,
+        kernels.WANDER_KICK: p.wander_sd * math.sqrt(1.0 - wander_decay**2),
+        kernels.DRIFT_DECAY: drift_decay,
+        kernels.DRIFT_KICK: p.drift_sd * math.sqrt(1.0 - drift_decay**2),
+        kernels.OFFSET: p.session_offset,
+        kernels.COUPLING: p.coupling,
+        kernels.RELAY_STEP: p.relay_step,
+    }
+    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])

@@ -1,0 +1,632 @@
+import dataclasses
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_devices.plants import _vo2_kernels as kernels
+from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters, arc_deflection, relay_thresholds
+
+QUIET = VO2Parameters(wander_sd=0.0, drift_sd=0.0)
+SMALL = VO2Parameters(relay_count=512)
+
+
+def make(parameters=QUIET, seed=1, **kwargs):
+    return VO2Cantilever(parameters, np.random.default_rng(seed), **kwargs)
+
+
+def quasi_static(plant, targets, dwell=3.0):
+    """Film temperature, curvature and R fraction at each set-point."""
+    rows = []
+    for target in targets:
+        plant.regulate(float(target))
+        plant.advance(dwell)
+        rows.append((plant.film_temperature, plant.curvature, plant.r_fraction))
+    return np.array(rows)
+
+
+def staircase(start, stop, step):
+    return np.linspace(start, stop, round(abs(stop - start) / step) + 1)
+
+
+@pytest.fixture(scope="module")
+def major_loop():
+    plant = make()
+    quasi_static(plant, [21.0])
+    up = quasi_static(plant, staircase(21.0, 84.0, 0.1))
+    down = quasi_static(plant, staircase(84.0, 21.0, 0.1))
+    return up, down
+
+
+class TestSpecimen:
+    def test_thresholds_are_those_of_two_populations(self):
+        up, down = relay_thresholds(VO2Parameters())
+        assert up.size == down.size == 16384
+        assert np.all(np.diff(up) >= 0.0)
+        assert np.all(down <= up)
+        assert up.max() <= 69.8
+        assert down.min() >= 30.2
+        width = up - down
+        # Reflection folds the upper tail of the up-thresholds, so compare what it leaves alone.
+        assert np.median(up) == pytest.approx(63.4, abs=0.15)
+        assert np.median(width) == pytest.approx(4.0 / math.sqrt(1.25), rel=0.06)
+        assert np.mean(width > 12.0) == pytest.approx(0.03 + 0.004, abs=0.015)
+        major_up, major_down = relay_thresholds(VO2Parameters(minor_share=0.0, highest_threshold=99.0))
+        major_width = major_up - major_down
+        assert major_up.mean() == pytest.approx(63.5, abs=0.02)
+        assert major_up.std() == pytest.approx(3.0, abs=0.03)
+        assert major_width.mean() == pytest.approx(4.0, abs=0.05)
+        assert major_width.std() == pytest.approx(2.0, abs=0.1)
+        assert np.corrcoef(major_up, np.log(major_width))[0, 1] == pytest.approx(-0.3, abs=0.02)
+
+    def test_specimen_does_not_depend_on_the_session(self):
+        first, second = make(seed=1), make(seed=2)
+        curves = [quasi_static(plant, [60.0, 66.0, 63.0])[:, 1:] for plant in (first, second)]
+        assert np.array_equal(*curves)
+        other = relay_thresholds(dataclasses.replace(QUIET, specimen_seed=7))
+        assert not np.array_equal(other[0], relay_thresholds(QUIET)[0])
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"relay_count": 0},
+            {"step": math.nan},
+            {"loop_damping": 1.0},
+            {"correlation": -1.0},
+            {"minor_share": 1.5},
+            {"wander_sd": -0.1},
+            {"maximum_current": 7.0},
+            {"ambient_temperature": math.nan},
+        ],
+    )
+    def test_wrong_parameters_are_refused(self, wrong):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            VO2Parameters(**wrong)
+
+    def test_parameters_are_frozen(self):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            QUIET.coupling = 2.0
+
+
+class TestHysteresis:
+    def test_range_of_the_major_loop(self, major_loop):
+        curvature = np.concatenate([branch[:, 1] for branch in major_loop])
+        assert curvature.min() == pytest.approx(-96.0, abs=1.5)
+        assert curvature.max() == pytest.approx(1838.0, abs=2.5)
+
+    def test_ends_are_saturated(self, major_loop):
+        up, down = major_loop
+        assert up[0, 2] == down[-1, 2] == 0.0
+        assert up[-1, 2] == 1.0
+        assert up[-1, 1] == pytest.approx(8.0 + 2034.0 - 4.25 * 64.0)
+
+    def test_loop_is_not_monotone(self, major_loop):
+        # Expansion bends against the transition at both ends of either branch.
+        for branch in major_loop:
+            slopes = np.diff(branch[:, 1]) / np.diff(branch[:, 0])
+            assert slopes[0] < 0.0
+            assert slopes[-1] < 0.0
+            assert slopes.max() > 200.0
+
+    def test_steepest_slope(self, major_loop):
+        steepest = max(
+            np.max((branch[10:, 1] - branch[:-10, 1]) / (branch[10:, 0] - branch[:-10, 0])) for branch in major_loop
+        )
+        assert 260.0 < steepest < 305.0
+
+    @pytest.mark.parametrize("turn", [60.0, 63.0, 66.0])
+    def test_curve_is_locked_after_a_reversal(self, turn):
+        plant = make()
+        quasi_static(plant, staircase(22.0, turn, 0.1), dwell=2.0)
+        back = quasi_static(plant, staircase(turn, turn - 4.0, 0.1))
+        locked = (back[10, 1] - back[0, 1]) / (back[10, 0] - back[0, 0])
+        assert -4.3 < locked < -2.0
+        # By 4 K the transition runs back and the curvature falls below where it turned.
+        assert back[-1, 1] < back[:, 1].max() - 5.0
+
+    def test_reversal_on_the_cooling_branch_locks_too(self):
+        plant = make()
+        quasi_static(plant, [84.0])
+        quasi_static(plant, staircase(84.0, 60.0, 0.1), dwell=2.0)
+        back = quasi_static(plant, staircase(60.0, 61.0, 0.1))
+        assert -4.3 < back[-1, 1] - back[0, 1] < -2.0
+
+    def test_coupling_breaks_congruency(self):
+        """Minor loops between the same temperatures differ in height: no Preisach operator does that."""
+        difference = {}
+        for coupling in (0.0, 1.0):
+            heights = []
+            for history in (66.0, 84.0):
+                plant = make(dataclasses.replace(QUIET, coupling=coupling))
+                quasi_static(plant, [history], dwell=8.0)
+                fraction = quasi_static(plant, [62.0, 66.0, 62.0, 66.0, 62.0], dwell=30.0)[:, 2]
+                heights.append(fraction[3] - fraction[4])
+            difference[coupling] = heights[0] - heights[1]
+        assert abs(difference[0.0]) < 1e-4
+        assert abs(difference[1.0]) > 1e-3
+
+    @given(
+        path=st.lists(st.floats(20.0, 90.0), min_size=1, max_size=30),
+        seed=st.integers(0, 5),
+    )
+    @settings(max_examples=40, deadline=None)
+    def test_relays_equal_the_naive_rule(self, path, seed):
+        parameters = dataclasses.replace(SMALL, specimen_seed=seed)
+        up, down = relay_thresholds(parameters)
+        order = np.argsort(down, kind="stable")
+        counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
+        on = np.zeros(up.size, dtype=np.bool_)
+        naive = on.copy()
+        # A threshold itself is the edge case: neither above nor below.
+        for drive in [*path, float(up[7]), float(down[7]), float(up[500]), float(down[500])]:
+            kernels.switch_relays(drive, counters, up, down[order], order, on)
+            naive[drive > up] = True
+            naive[drive < down] = False
+            assert np.array_equal(on, naive)
+            assert counters[kernels.ON_COUNT] == naive.sum()
+
+    def test_plant_equals_a_brute_force_of_all_relays(self):
+        parameters = VO2Parameters(session_offset=0.1)
+        plant = make(parameters, seed=5)
+        up, down = relay_thresholds(parameters)
+        on = np.zeros(up.size, dtype=bool)
+        drive, fraction = 0.0, 0.0
+
+        def settle():
+            nonlocal drive, fraction
+            while True:
+                move = plant.film_temperature + parameters.coupling * (fraction - 0.5) - drive
+                last = abs(move) <= parameters.relay_step
+                drive = drive + move if last else drive + math.copysign(parameters.relay_step, move)
+                on[drive > up] = True
+                on[drive < down] = False
+                fraction = np.count_nonzero(on) / on.size
+                if last:
+                    return
+
+        # The sub-steps below every threshold switch nothing, so where the start counts from is free.
+        settle()
+        targets = np.random.default_rng(8)
+        visited = []
+        for k in range(1600):
+            if k % 40 == 0:
+                plant.regulate(float(targets.uniform(50.0, 74.0)))
+            plant.advance(0.05)
+            # Follow the plant's own rounding of the drive; that it agrees is a check as well.
+            settle()
+            assert drive == pytest.approx(float(plant._state[kernels.DRIVE]), abs=1e-9)
+            drive = float(plant._state[kernels.DRIVE])
+            assert plant.r_fraction == fraction
+            assert np.array_equal(plant._on, on)
+            visited.append(fraction)
+        assert min(visited) < 0.05
+        assert max(visited) > 0.95
+
+    def test_start_is_negative_saturation(self):
+        assert make().r_fraction == 0.0
+        assert make(initial_temperature=90.0).r_fraction == 1.0
+        # Warm, but reached from the cold: like the heating branch.
+        plant = make(initial_temperature=64.0)
+        plant.regulate(64.0)
+        plant.advance(1.0)
+        reference = make()
+        quasi_static(reference, staircase(22.0, 64.0, 0.1), dwell=2.0)
+        assert plant.r_fraction == pytest.approx(reference.r_fraction, abs=0.005)
+
+
+class TestRegulatedPlate:
+    @pytest.mark.parametrize("size", [0.5, 5.0, 30.0])
+    def test_step_response(self, size):
+        plant = make()
+        quasi_static(plant, [50.0], dwell=60.0)
+        plant.regulate(50.0 + size)
+        plate = []
+        for _ in range(200):
+            plant.advance(0.05)
+            plate.append((plant.plate_temperature - 50.0) / size)
+        assert max(plate) - 1.0 < 0.002
+        inside = np.abs(np.array(plate) - 1.0) <= 0.01
+        settled = 0.05 * (1 + np.flatnonzero(~inside).max() + 1)
+        # The slew limit of 15 K/s adds to large steps.
+        assert 2.0 < settled < 3.2 + size / 15.0
+
+    def test_matches_the_continuous_loop(self):
+        plant = make()
+        quasi_static(plant, [50.0], dwell=60.0)
+        plant.regulate(52.0)
+        frequency, damping = 2.2, 0.9
+        swing = frequency * math.sqrt(1.0 - damping**2)
+        for k in range(1, 100):
+            plant.advance(0.05)
+            t = 0.05 * k
+            wave = math.cos(swing * t) + damping * frequency / swing * math.sin(swing * t)
+            exact = 52.0 - 2.0 * math.exp(-damping * frequency * t) * wave
+            assert plant.plate_temperature == pytest.approx(exact, abs=1e-9)
+
+    def test_slew_limit(self):
+        plant = make()
+        rates = []
+        for target in (84.0, 21.0):
+            plant.regulate(target)
+            for _ in range(300):
+                plant.advance(0.05)
+                rates.append(plant.plate_rate)
+        assert max(rates) == pytest.approx(15.0)
+        assert min(rates) == pytest.approx(-15.0)
+
+    def test_current_limit_saturates_the_slew(self):
+        plant = make()
+        plant.regulate(84.0, current_limit=1.5)
+        current, rate = [], []
+        for _ in range(1200):
+            plant.advance(0.05)
+            current.append(plant.current)
+            rate.append(plant.plate_rate)
+        assert max(np.abs(current)) <= 1.5 + 1e-9
+        assert max(current) == pytest.approx(1.5)
+        assert 5.0 < max(rate) < 12.0
+        assert plant.plate_temperature == pytest.approx(84.0, abs=1e-3)
+
+    def test_target_out_of_reach_of_the_limit(self):
+        plant = make()
+        plant.regulate(84.0, current_limit=0.5)
+        plant.advance(3600.0)
+        assert plant.current == pytest.approx(0.5)
+        driven = make()
+        driven.drive(0.5)
+        driven.advance(3600.0)
+        assert plant.plate_temperature == pytest.approx(driven.plate_temperature, abs=1e-3)
+        assert plant.plate_temperature < 60.0
+
+    def test_limits_are_kept_over_hard_work(self):
+        plant = make()
+        targets = np.random.default_rng(2)
+        for _ in range(200):
+            plant.regulate(float(targets.uniform(10.0, 90.0)), current_limit=2.0)
+            for _ in range(20):
+                plant.advance(0.05)
+                assert abs(plant.current) <= 2.0 + 1e-9
+                assert abs(plant.plate_rate) <= 15.0 + 1e-9
+
+    def test_cooling_ends_where_joule_heat_wins(self):
+        plant = make()
+        plant.regulate(-200.0)
+        plant.advance(600.0)
+        # The module's strongest cooling, S T / R, whatever the target.
+        best = QUIET.seebeck * (plant.plate_temperature + 273.15) / QUIET.resistance
+        assert plant.current == pytest.approx(-best, rel=1e-3)
+        assert -60.0 < plant.plate_temperature < -20.0
+        assert plant.plate_rate == pytest.approx(0.0, abs=0.01)
+
+
+class TestPeltier:
+    @pytest.mark.parametrize("target", [84.0, 15.0])
+    def test_holding_current_has_the_sign_of_the_work(self, target):
+        plant = make()
+        plant.regulate(target)
+        plant.advance(1800.0)
+        assert plant.plate_temperature == pytest.approx(target)
+        assert math.copysign(1.0, plant.current) == math.copysign(1.0, target - 22.0)
+        assert abs(plant.current) < 1.5
+        assert plant.voltage * plant.current > 0.0
+        # Driving the same current holds the same temperature.
+        plant.drive(plant.current)
+        plant.advance(600.0)
+        assert plant.plate_temperature == pytest.approx(target, abs=0.01)
+
+    def test_range_within_four_ampere(self):
+        warm, cold = make(), make()
+        warm.drive(4.0)
+        cold.drive(-4.0)
+        warm.advance(10.0)
+        cold.advance(10.0)
+        assert warm.plate_temperature > 84.0
+        assert cold.plate_temperature < 15.0
+
+    @pytest.mark.parametrize("mode", ["drive", "regulate"])
+    def test_energy_is_conserved(self, mode):
+        """Electrical work equals the heat stored in plate and sink plus what went into the room."""
+        p = QUIET
+        plant = make(initial_temperature=30.0)
+        begin = plant.snapshot()
+        work = loss = 0.0
+
+        def flows():
+            room = p.ambient_temperature
+            out = (plant.sink_temperature - room) / p.sink_resistance
+            return plant.voltage * plant.current, out + p.plate_loss * (plant.plate_temperature - room)
+
+        for k in range(12000):
+            if k % 1000 == 0 and mode == "drive":
+                plant.drive([1.0, -1.5, 0.5, 2.0][k // 1000 % 4])
+            elif k % 1000 == 0:
+                plant.regulate([60.0, 20.0, 84.0, 50.0][k // 1000 % 4])
+            before = flows()
+            plant.advance(0.05)
+            after = flows()
+            work += 0.025 * (before[0] + after[0])
+            loss += 0.025 * (before[1] + after[1])
+        end = plant.snapshot()
+        stored = p.plate_capacity * (end.plate_temperature - begin.plate_temperature)
+        stored += p.sink_capacity * (end.sink_temperature - begin.sink_temperature)
+        assert work > 1000.0
+        assert stored + loss == pytest.approx(work, rel=0.01)
+
+    def test_current_explains_temperature_and_rate(self):
+        plant = make()
+        p = plant.parameters
+        for command in (lambda: plant.regulate(70.0), lambda: plant.drive(-2.0), plant.release):
+            command()
+            for _ in range(40):
+                plant.advance(0.05)
+                plate, sink, current = plant.plate_temperature, plant.sink_temperature, plant.current
+                heat = p.seebeck * (plate + 273.15) * current + 0.5 * p.resistance * current**2
+                heat -= p.conductance * (plate - sink) + p.plate_loss * (plate - p.ambient_temperature)
+                assert plant.plate_rate == pytest.approx(heat / p.plate_capacity, abs=1e-9)
+
+    def test_release_relaxes_to_ambient(self):
+        plant = make()
+        plant.regulate(84.0)
+        plant.advance(600.0)
+        assert plant.sink_temperature > 23.0
+        plant.release()
+        plates = []
+        for _ in range(60):
+            plant.advance(1.0)
+            plates.append(plant.plate_temperature)
+        assert np.all(np.diff(plates) < 0.0)
+        assert plant.current == pytest.approx(0.0, abs=1e-9)
+        # An idle module shows its Seebeck voltage.
+        gap = plant.plate_temperature - plant.sink_temperature
+        assert plant.voltage == pytest.approx(0.051 * gap)
+        plant.advance(3600.0)
+        assert plant.plate_temperature == pytest.approx(22.0, abs=1e-3)
+        assert plant.sink_temperature == pytest.approx(22.0, abs=1e-3)
+
+    def test_untouched_plant_stays_at_ambient(self):
+        plant = make()
+        plant.advance(3600.0)
+        assert plant.plate_temperature == plant.sink_temperature == 22.0
+        assert plant.current == 0.0
+
+    def test_changing_modes_is_bumpless(self):
+        plant = make()
+        commands = [
+            lambda: plant.regulate(80.0),
+            lambda: plant.drive(4.0),
+            lambda: plant.regulate(30.0, current_limit=1.0),
+            lambda: plant.drive(-3.0),
+            plant.release,
+            lambda: plant.regulate(25.0),
+        ]
+        for command in commands * 3:
+            before = plant.snapshot()
+            command()
+            assert plant.snapshot() == before
+            plant.advance(0.05)
+            assert abs(plant.plate_temperature - before.plate_temperature) < 0.05 * 45.0
+            plant.advance(0.95)
+        # What flows on is the same state: driving the present current does not change the rate.
+        plant.regulate(60.0)
+        plant.advance(0.5)
+        rate = plant.plate_rate
+        plant.drive(plant.current)
+        plant.advance(0.05)
+        assert plant.plate_rate == pytest.approx(rate, rel=0.03)
+
+    def test_excess_speed_decays_into_the_slew_limit(self):
+        plant = make()
+        plant.drive(4.0)
+        plant.advance(0.7)
+        assert plant.plate_rate > 20.0
+        plant.regulate(500.0)
+        rates = [plant.plate_rate]
+        for _ in range(40):
+            plant.advance(0.05)
+            rates.append(plant.plate_rate)
+        assert np.all(np.diff(rates) <= 1e-9)
+        assert np.max(-np.diff(rates)) < 0.2 * (rates[0] - 15.0)
+        assert rates[-1] == pytest.approx(15.0, abs=0.05)
+
+
+class TestNoise:
+    def test_wander_and_drift_statistics(self):
+        only_wander = make(VO2Parameters(relay_count=16, drift_sd=0.0), seed=3)
+        only_wander.regulate(40.0)
+        only_wander.advance(60.0)
+        wander = np.empty(60000)
+        for k in range(wander.size):
+            only_wander.advance(0.5)
+            wander[k] = only_wander.film_temperature - only_wander.plate_temperature
+        assert wander.std() == pytest.approx(0.03, rel=0.06)
+        assert wander.mean() == pytest.approx(0.0, abs=0.003)
+        lagged = np.mean(wander[:-10] * wander[10:]) / wander.var()
+        assert lagged == pytest.approx(math.exp(-1.0), abs=0.05)
+
+        only_drift = make(VO2Parameters(relay_count=16, wander_sd=0.0), seed=3)
+        drift = np.empty(1500)
+        for k in range(drift.size):
+            only_drift.advance(600.0)
+            drift[k] = only_drift.film_temperature - only_drift.plate_temperature
+        assert drift.std() == pytest.approx(0.04, rel=0.15)
+        lagged = np.mean(drift[:-3] * drift[3:]) / drift.var()
+        assert lagged == pytest.approx(math.exp(-1.0), abs=0.12)
+
+    def test_noise_is_stationary_from_the_start(self):
+        starts = [make(SMALL, seed=s).film_temperature - 22.0 for s in range(300)]
+        assert np.std(starts) == pytest.approx(0.05, rel=0.15)
+
+    def test_wander_does_not_show_on_the_plate(self):
+        noisy, quiet = make(VO2Parameters()), make(QUIET)
+        for plant in (noisy, quiet):
+            plant.regulate(60.0)
+            plant.advance(7.3)
+        assert noisy.plate_temperature == quiet.plate_temperature
+        assert noisy.current == quiet.current
+
+    def test_session_offset_shifts_the_film(self):
+        path = [64.0, 60.0, 65.5]
+        plain, shifted = (make(VO2Parameters(session_offset=x), seed=4) for x in (0.0, 0.2))
+        quasi_static(plain, path)
+        quasi_static(shifted, path)
+        assert shifted.film_temperature - plain.film_temperature == pytest.approx(0.2)
+        assert shifted.r_fraction > plain.r_fraction
+        # The same film temperatures, reached by other plate temperatures, give the same film.
+        other = make(VO2Parameters(session_offset=0.2), seed=4)
+        quasi_static(other, [t - 0.2 for t in path])
+        assert other.film_temperature == pytest.approx(plain.film_temperature, abs=1e-3)
+        assert other.r_fraction == pytest.approx(plain.r_fraction, abs=5e-4)
+
+
+class TestOutputs:
+    @given(st.floats(-6000.0, 6000.0))
+    def test_deflection_is_that_of_an_arc(self, curvature):
+        length = 300e-6
+        deflection = arc_deflection(curvature, length)
+        assert arc_deflection(-curvature, length) == -deflection
+        if abs(curvature) > 10.0:
+            exact = (1.0 - math.cos(curvature * length)) / curvature
+            assert deflection == pytest.approx(exact, rel=1e-8)
+        assert abs(deflection) <= abs(curvature) * length**2 / 2 * (1 + 1e-12) + 1e-300
+
+    def test_series_joins_smoothly(self):
+        length = 300e-6
+        edge = 2e-4 / length
+        below = arc_deflection(edge * (1 - 1e-12), length)
+        assert below == pytest.approx(arc_deflection(edge * (1 + 1e-12), length), rel=1e-11)
+        assert arc_deflection(0.0, length) == 0.0
+
+    def test_hot_deflection(self):
+        assert arc_deflection(1846.0, 300e-6) == pytest.approx(80.97e-6, rel=1e-4)
+        for residual in (0.0, 500.0):
+            plant = make(dataclasses.replace(QUIET, residual_curvature=residual))
+            quasi_static(plant, [84.0], dwell=20.0)
+            total = residual + plant.curvature
+            expected = arc_deflection(total, 300e-6) - arc_deflection(residual, 300e-6)
+            assert plant.tip_deflection == expected
+            assert plant.tip_deflection > 7e-5
+
+    def test_residual_curvature_lowers_the_deflection(self):
+        straight, bent = make(QUIET), make(dataclasses.replace(QUIET, residual_curvature=1000.0))
+        for plant in (straight, bent):
+            quasi_static(plant, [70.0], dwell=20.0)
+        assert bent.curvature == straight.curvature
+        assert bent.tip_deflection < straight.tip_deflection
+
+    def test_snapshot_agrees_with_the_outputs(self):
+        plant = make(VO2Parameters())
+        quasi_static(plant, [64.0])
+        for name, value in plant.snapshot()._asdict().items():
+            assert value == getattr(plant, name)
+            assert type(value) is float
+
+
+class TestTime:
+    commands = st.one_of(
+        st.tuples(st.just("regulate"), st.floats(15.0, 84.0)),
+        st.tuples(st.just("drive"), st.floats(-1.5, 1.5)),
+        st.tuples(st.just("release")),
+    )
+    # Whole microseconds, from one call to many, that add up to what the other plant does at once.
+    pieces = st.lists(st.integers(0, 700_000), min_size=1, max_size=12)
+
+    @given(st.lists(st.tuples(commands, pieces), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
+    @settings(max_examples=60, deadline=None)
+    def test_splitting_advance_changes_nothing(self, script, seed):
+        whole, split = make(SMALL, seed=seed), make(SMALL, seed=seed)
+        for (name, *arguments), parts in script:
+            getattr(whole, name)(*arguments)
+            getattr(split, name)(*arguments)
+            whole.advance(sum(parts) * 1e-6)
+            for part in parts:
+                split.advance(part * 1e-6)
+            assert split.snapshot() == whole.snapshot()
+
+    @pytest.mark.parametrize("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
+    def test_hours_in_parts(self, part):
+        """Rounding does not add up, and blocks of noise are used up alike."""
+        whole, split = make(SMALL), make(SMALL)
+        parts = min(20000, round(3600.0 / part))
+        for plant in (whole, split):
+            plant.regulate(62.0)
+        for _ in range(parts):
+            split.advance(part)
+        whole.advance(part * parts)
+        assert split.snapshot() == whole.snapshot()
+
+    def test_time_stamps_of_a_real_clock(self):
+        """Differences of a clock that counts from 1970 are rounded to a quarter of a microsecond."""
+        first, second = make(SMALL), make(SMALL)
+        begin = now = 1_700_000_000.0
+        for k in range(1, 2001):
+            later = begin + 0.05 * k
+            first.regulate(30.0 + k % 40)
+            first.advance(later - now)
+            now = later
+            second.regulate(30.0 + k % 40)
+            second.advance(0.05)
+            assert first.snapshot() == second.snapshot()
+
+    def test_outputs_are_held_between_grid_points(self):
+        plant = make()
+        plant.regulate(60.0)
+        begin = plant.snapshot()
+        plant.advance(0.03)
+        assert plant.snapshot() == begin
+        plant.advance(0.02)
+        assert plant.snapshot() != begin
+
+    def test_one_seed_one_trajectory(self):
+        runs = [quasi_static(make(VO2Parameters(), seed=s), [60.0, 66.0, 62.0]) for s in (1, 1, 2)]
+        assert np.array_equal(runs[0], runs[1])
+        assert not np.array_equal(runs[0], runs[2])
+
+    def test_other_users_of_the_generator_do_not_disturb(self):
+        rng = np.random.default_rng(1)
+        plant = VO2Cantilever(SMALL, rng)
+        rng.standard_normal(1000)
+        reference = make(SMALL, seed=1)
+        for each in (plant, reference):
+            each.advance(1000.0)
+        assert plant.snapshot() == reference.snapshot()
+
+    def test_nine_hours_take_seconds(self):
+        plant = make(VO2Parameters())
+        plant.regulate(63.0)
+        plant.advance(1.0)
+        begin = time.perf_counter()
+        for k in range(4000):
+            plant.regulate(54.0 + 30.0 * math.sin(0.02 * k))
+            plant.advance(8.0)
+        # Measured 0.15 s; the bound leaves room for a loaded machine.
+        assert time.perf_counter() - begin < 4.0
+
+
+class TestRefusals:
+    @pytest.mark.parametrize("dt", [-1e-9, math.nan, math.inf])
+    def test_advance(self, dt):
+        with pytest.raises(ValueError, match="dt must"):
+            make(SMALL).advance(dt)
+
+    @pytest.mark.parametrize("target", [-300.0, math.nan, math.inf])
+    def test_targets(self, target):
+        with pytest.raises(ValueError, match="target_celsius"):
+            make(SMALL).regulate(target)
+        with pytest.raises(ValueError, match="initial_temperature"):
+            make(SMALL, initial_temperature=target)
+
+    @pytest.mark.parametrize("limit", [-1.0, math.nan])
+    def test_current_limit(self, limit):
+        with pytest.raises(ValueError, match="current_limit"):
+            make(SMALL).regulate(50.0, current_limit=limit)
+
+    @pytest.mark.parametrize("current", [5.1, -6.0, math.nan])
+    def test_current(self, current):
+        plant = make(SMALL)
+        with pytest.raises(ValueError, match="current must lie"):
+            plant.drive(current)
+        plant.advance(1.0)
+        assert plant.current == 0.0
