@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
 from bench.errors import ConfigurationError
@@ -28,9 +29,17 @@ class Clock(ABC):
     ----------
     epoch : datetime
         Time of day (UTC) at which `now()` was zero.
+    runs_by_itself : bool
+        Whether time passes while nobody sleeps.
+    interrupted : callable
+        Asked during every sleep; when it returns True the sleep ends early.
     """
 
     epoch: datetime
+    runs_by_itself: bool = True
+
+    def __init__(self) -> None:
+        self.interrupted: Callable[[], bool] = lambda: False
 
     @abstractmethod
     def now(self) -> float:
@@ -68,6 +77,7 @@ class WallClock(Clock):
     """The time of the room: a second is a second."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.epoch = datetime.now(UTC)
         self._start = time.monotonic()
 
@@ -79,7 +89,7 @@ class WallClock(Clock):
         """Wait, in naps short enough for signals to be handled between them."""
         _check_finite(seconds)
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
+        while (left := end - time.monotonic()) > 0 and not self.interrupted():
             time.sleep(min(left, _LONGEST_NAP))
 
 
@@ -100,6 +110,7 @@ class ScaledClock(Clock):
     def __init__(self, factor: float) -> None:
         if not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"factor: expected a positive number, got {factor}")
+        super().__init__()
         self.factor = factor
         self._wall = WallClock()
         self.epoch = self._wall.epoch
@@ -111,6 +122,7 @@ class ScaledClock(Clock):
     def sleep(self, seconds: float) -> None:
         """Wait `seconds / factor` seconds of the room."""
         _check_finite(seconds)
+        self._wall.interrupted = self.interrupted
         self._wall.sleep(seconds / self.factor)
 
 
@@ -120,7 +132,10 @@ class VirtualClock(Clock):
     Only one thread should let time pass, the one that carries the run out; any thread may read the time.
     """
 
+    runs_by_itself = False
+
     def __init__(self) -> None:
+        super().__init__()
         self.epoch = VIRTUAL_EPOCH
         self._now = 0.0
         self._lock = threading.Lock()
@@ -152,6 +167,11 @@ class Stopwatch:
     def seconds(self) -> float:
         """Return the seconds of the room that have passed."""
         return time.perf_counter() - self._start
+
+
+def room_date() -> datetime:
+    """Return the time of day in the room (UTC), for names and metadata; never for control."""
+    return datetime.now(UTC)
 
 
 def make_clock(name: str) -> Clock:

@@ -142,8 +142,7 @@ class Journal:
                 f"settled INTEGER NOT NULL, setpoints TEXT NOT NULL{columns})"
             )
             self._db.execute(
-                "CREATE TABLE telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, "
-                f"step INTEGER NOT NULL{columns})"
+                f"CREATE TABLE telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, step INTEGER NOT NULL{columns})"
             )
             self._db.executemany(
                 "INSERT INTO signals VALUES (?, ?, ?, ?, ?)",
@@ -257,9 +256,7 @@ class Record:
             self.meta: dict[str, Any] = {
                 key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM meta")
             }
-            rows = self._db.execute(
-                "SELECT name, unit, description, precision FROM signals ORDER BY position"
-            )
+            rows = self._db.execute("SELECT name, unit, description, precision FROM signals ORDER BY position")
             self.signals = tuple(Signal(*row) for row in rows)
         except (sqlite3.DatabaseError, json.JSONDecodeError) as error:
             self._db.close()

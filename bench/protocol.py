@@ -251,9 +251,7 @@ class ProtocolDefinition:
             elif name in self.parameters.model_fields:
                 entry = self._parameter_help(name)
                 unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
-                given = (
-                    "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
-                )
+                given = "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
                 yield (
                     f"protocol {self.name}: parameter {name} {given}; "
                     f"allowed: {entry.allowed}{unit} ({problem['msg']})"
@@ -349,9 +347,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 reading = Reading(steps, seconds, True, echo)
                 steps += 1
                 if steps > _LONGEST_PLAN:
-                    raise ConfigurationError(
-                        f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps"
-                    )
+                    raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
             else:
                 message = next(messages)

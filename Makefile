@@ -1,0 +1,33 @@
+# Everything that a fresh clone needs: python3 with venv, and make.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SETUP := $(VENV)/.set-up
+
+.PHONY: demo test check benchmark clean
+
+# The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
+demo: $(SETUP)
+	$(BIN)/bench reproduce vo2 --out recordings
+
+test: check
+	$(BIN)/python -m pytest
+
+check: $(SETUP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# Side-by-side speed comparisons; run them on an idle machine.
+benchmark: $(SETUP)
+	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(SETUP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	touch $(SETUP)

@@ -1,0 +1,132 @@
+"""Signals that are computed from measured ones: a calibration turns what a sensor sees into what is meant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from bench.devices import Signal
+from bench.errors import DeviceError
+
+Floats = npt.NDArray[np.float64]
+
+_LARGEST_ANGLE = 2.331122370414423
+"""Where (1 - cos x)/x is largest, in rad: tan(x/2) = x. Beyond it one deflection has two curvatures."""
+_LARGEST_RATIO = (1.0 - np.cos(_LARGEST_ANGLE)) / _LARGEST_ANGLE
+
+
+def curvature_to_deflection(curvature: npt.ArrayLike, length: float, residual_curvature: float = 0.0) -> Floats:
+    """Return how far the tip of a bent cantilever moves when its curvature changes.
+
+    Parameters
+    ----------
+    curvature : array_like
+        Change of curvature from the residual one, 1/m, any shape.
+    length : float
+        Length of the beam along its arc, m.
+    residual_curvature : float
+        Curvature of the beam at rest, 1/m, from which deflection and curvature are counted.
+
+    Returns
+    -------
+    ndarray
+        Deflection in m, of the shape of `curvature`.
+
+    Notes
+    -----
+    Δz = z(κ_i + Δκ) - z(κ_i) with z(κ) = 2 sin²(κL/2)/κ, Zhang et al. 2013, eq. (1). The paper applies (1)
+    to the change of deflection as if the beam were straight at rest, which is the case κ_i = 0.
+    """
+    _check_length(length)
+    bent = np.asarray(curvature, dtype=np.float64) + residual_curvature
+    return np.asarray(length * (_ratio(bent * length) - _ratio(np.float64(residual_curvature * length))))
+
+
+def deflection_to_curvature(deflection: npt.ArrayLike, length: float, residual_curvature: float = 0.0) -> Floats:
+    """Return the change of curvature that moves the tip of a cantilever by `deflection`.
+
+    Parameters
+    ----------
+    deflection : array_like
+        Movement of the tip from its place at rest, m, any shape.
+    length : float
+        Length of the beam along its arc, m.
+    residual_curvature : float
+        Curvature of the beam at rest, 1/m.
+
+    Returns
+    -------
+    ndarray
+        Change of curvature in 1/m, of the shape of `deflection`; nan where no bending of the beam reaches
+        the deflection (more than 0.7246 lengths from straight).
+
+    Notes
+    -----
+    Newton's method from the small-angle value. (1 - cos x)/x is concave up to its maximum and below x/2,
+    so the iteration rises to the root without overshooting it.
+    """
+    _check_length(length)
+    ratio = np.asarray(deflection, dtype=np.float64) / length + _ratio(np.float64(residual_curvature * length))
+    target = np.abs(ratio)
+    angle = np.where(target < _LARGEST_RATIO, 2.0 * target, np.nan)
+    for _ in range(60):
+        step = (target - _ratio(angle)) / _ratio_slope(angle)
+        angle = np.minimum(angle + step, _LARGEST_ANGLE)
+        if not np.any(np.abs(step) > 1e-15 * (1.0 + np.abs(angle))):
+            break
+    return np.asarray(np.copysign(angle, ratio) / length - residual_curvature)
+
+
+class CantileverCurvature(BaseModel):
+    """Curvature of a cantilever from the deflection of its tip."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Literal["cantilever-curvature"]
+    source: str = Field(description="signal of the tip deflection, m")
+    length: float = Field(gt=0, le=1, description="length of the beam, m")
+    residual_curvature: float = Field(default=0.0, ge=-1e5, le=1e5, description="curvature of the beam at rest, 1/m")
+
+    def signal(self, name: str) -> Signal:
+        """Return the signal that this gives."""
+        return Signal(name, "1/m", "curvature", 2)
+
+    def compute(self, name: str, values: Mapping[str, float]) -> float:
+        """Return the curvature in 1/m from the measured values.
+
+        Raises
+        ------
+        DeviceError
+            If no bending of the beam reaches the deflection.
+        """
+        deflection = values[self.source]
+        curvature = float(deflection_to_curvature(deflection, self.length, self.residual_curvature))
+        if not np.isfinite(curvature) and np.isfinite(deflection):
+            raise DeviceError(
+                name,
+                f"a beam of {self.length * 1e6:g} µm cannot bend by {deflection * 1e6:.1f} µm; "
+                "check the spot on the detector and the calibration",
+            )
+        return curvature
+
+
+DerivedSignal = CantileverCurvature
+"""Every kind of derived signal that a rig file may ask for, chosen by its `kind`."""
+
+
+def _ratio(angle: Floats | np.float64) -> Floats:
+    half = 0.5 * np.asarray(angle)
+    return np.asarray(half * np.sinc(half / np.pi) ** 2)
+
+
+def _ratio_slope(angle: Floats) -> Floats:
+    return np.asarray(np.sinc(angle / np.pi) - 0.5 * np.sinc(0.5 * angle / np.pi) ** 2)
+
+
+def _check_length(length: float) -> None:
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError(f"length: expected a positive number of m, got {length}")

@@ -1,0 +1,185 @@
+"""Figures of runs and models (matplotlib), in the manner of the papers that the rigs come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+
+mpl.use("Agg")
+
+from matplotlib.figure import Figure
+
+from bench.hysteresis import Preisach
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = npt.NDArray[np.float64]
+
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "figure.dpi": 150.0,
+    "savefig.bbox": "tight",
+}
+_COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
+
+
+def plot_loops(
+    path: Path, inputs: Floats, measured: Floats, modelled: Floats | None, *, input_label: str, output_label: str
+) -> None:
+    """Draw measured loops, and those of a model beside them (Zhang et al. 2013, Fig. 5a).
+
+    Parameters
+    ----------
+    path : Path
+        File to write, PNG or PDF by its ending.
+    inputs, measured : ndarray, shape (N,)
+        Input and output, one sample a step.
+    modelled : ndarray or None, shape (N,)
+        Output of the model.
+    input_label, output_label : str
+        Axis labels, with units.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(inputs, measured, "-", color=_COLORS[0], linewidth=0.8, label="measured")
+        if modelled is not None:
+            axes.plot(inputs, modelled, "--", color=_COLORS[1], linewidth=0.7, label="model")
+            axes.legend(loc="upper left")
+        axes.set(xlabel=input_label, ylabel=output_label)
+        figure.savefig(path)
+
+
+def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, limits: str = "") -> None:
+    """Draw the error of each model against the sample index, one panel a model (Figs. 5b, 7 and 9).
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    errors : mapping of str to ndarray
+        Measured minus modelled by the model's title, each of shape (N,).
+    error_label : str
+        Axis label, with unit.
+    limits : str
+        A line of text above the panels.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(6.0, 1.0 + 1.7 * len(errors)), layout="constrained")
+        panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
+        for i, (title, error) in enumerate(errors.items()):
+            _error_panel(panels[i], title, error, error_label, i)
+        panels[-1].set_xlabel("index of the set-point")
+        if limits:
+            figure.suptitle(limits)
+        figure.savefig(path)
+
+
+def plot_sequence_and_errors(
+    path: Path, inputs: Floats, errors: Mapping[str, Floats], *, input_label: str, error_label: str
+) -> None:
+    """Draw an input sequence, and below it the errors of several models (Fig. 10).
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    inputs : ndarray, shape (N,)
+        Input, one sample a step.
+    errors : mapping of str to ndarray
+        Measured minus modelled by the model's title, each of shape (N,).
+    input_label, error_label : str
+        Axis labels, with units.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        top.plot(inputs, color=_COLORS[0], linewidth=0.8)
+        top.set_ylabel(input_label)
+        for i, (title, error) in enumerate(errors.items()):
+            bottom.plot(error, color=_COLORS[i], linewidth=0.8, label=title)
+        bottom.set(xlabel="index of the set-point", ylabel=error_label)
+        bottom.legend(loc="best", ncols=len(errors), fontsize=7.5)
+        figure.savefig(path)
+
+
+def plot_density(path: Path, model: Preisach) -> None:
+    """Draw a Preisach density on its plane; cells without density are white (Figs. 6 and 8).
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    model : Preisach
+        The operator.
+    """
+    levels = np.asarray(model.levels)
+    matrix = np.full((levels.size - 1, levels.size - 1), np.nan)
+    rows, columns = np.tril_indices(levels.size - 1)
+    matrix[rows, columns] = model.density
+    signed = bool(np.any(model.density < 0))
+    largest = float(np.max(np.abs(model.density))) or 1.0
+    with mpl.rc_context({**_STYLE, "axes.grid": False}):
+        figure = Figure(figsize=(5.2, 4.2), layout="constrained")
+        axes = figure.subplots()
+        image = axes.pcolormesh(
+            levels,
+            levels,
+            np.ma.masked_where(~(np.abs(matrix) > 0), matrix),
+            cmap="RdBu_r" if signed else "viridis",
+            vmin=-largest if signed else 0.0,
+            vmax=largest,
+        )
+        axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
+        axes.set(
+            xlabel=f"β / {model.input_unit or '1'}",
+            ylabel=f"α / {model.input_unit or '1'}",
+            aspect="equal",
+            xlim=(levels[0], levels[-1]),
+            ylim=(levels[0], levels[-1]),
+        )
+        unit = f"({model.output_unit or '1'})/({model.input_unit or '1'})²"
+        figure.colorbar(image, ax=axes, label=f"density / {unit}")
+        figure.savefig(path)
+
+
+def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], labels: Sequence[str]) -> None:
+    """Draw signals over laboratory time, one panel each.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    hours : ndarray, shape (N,)
+        Laboratory time in h.
+    signals : mapping of str to ndarray
+        By name, each of shape (N,).
+    labels : sequence of str
+        Axis label of each, with unit.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(7.0, 0.8 + 1.2 * len(signals)), layout="constrained")
+        panels = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+        for i, values in enumerate(signals.values()):
+            panels[i].plot(hours, values, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            panels[i].set_ylabel(labels[i], rotation=0, ha="right", va="center", fontsize=8)
+        panels[-1].set_xlabel("laboratory time / h")
+        figure.savefig(path)
+
+
+def _error_panel(axes: Axes, title: str, error: Floats, label: str, color: int) -> None:
+    axes.plot(error, color=_COLORS[color % len(_COLORS)], linewidth=0.7)
+    axes.set_ylabel(label)
+    rms = float(np.sqrt(np.mean(error**2)))
+    axes.set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")

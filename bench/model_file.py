@@ -1,0 +1,122 @@
+"""Model files: an identified operator as versioned JSON, with its units, where it comes from, and its memory.
+
+Version 1 is an object with these keys:
+
+`format`, `version`
+    `bench-model` and 1.
+`name`
+    Under which name it was identified, such as `preisach-nonmonotonic`.
+`operator`
+    The operator: its `type`, levels, densities or coefficients, ranges and units, as the operator itself
+    writes them.
+`memory`
+    The operator's state at the end of the data that it was identified from; null for one without memory.
+`provenance`
+    `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.errors import DataError
+from bench.hysteresis import MemoryCurve, Operator, operator_from_json
+
+FORMAT = "bench-model"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """The content of a model file.
+
+    Attributes
+    ----------
+    name : str
+        Under which name the operator was identified.
+    operator : Operator
+        The model itself.
+    memory : MemoryCurve or None
+        Its state at the end of the data that it was identified from.
+    provenance : mapping
+        Where it comes from.
+    """
+
+    name: str
+    operator: Operator[Any]
+    memory: MemoryCurve | None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the file's content."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": self.name,
+            "operator": self.operator.to_json(),
+            "memory": None if self.memory is None else self.memory.to_json(),
+            "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the file.
+
+        Raises
+        ------
+        DataError
+            If it cannot be written.
+        """
+        try:
+            path.write_text(json.dumps(self.to_json(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise DataError(f"model file {path} cannot be written: {error}") from None
+
+
+def load_model(path: Path) -> ModelFile:
+    """Read a model file.
+
+    Raises
+    ------
+    DataError
+        If there is none, it is damaged, or its version is unknown.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
+    return parse_model(content, str(path))
+
+
+def parse_model(content: object, source: str) -> ModelFile:
+    """Make a model of the content of a model file.
+
+    Raises
+    ------
+    DataError
+        If it is not one, is damaged, or its version is unknown; names `source`.
+    """
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")
+    if content.get("version") != VERSION:
+        raise DataError(
+            f"model file {source} has version {content.get('version')!r}; this bench reads version {VERSION}"
+        )
+    try:
+        memory = content["memory"]
+        return ModelFile(
+            name=str(content["name"]),
+            operator=operator_from_json(content["operator"]),
+            memory=None if memory is None else MemoryCurve.from_json(memory),
+            provenance=dict(content["provenance"]),
+        )
+    except KeyError as error:
+        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
+    except (ValueError, TypeError) as error:
+        raise DataError(f"model file {source} is damaged: {error}") from None

@@ -1,0 +1,253 @@
+"""A run from end to end: its folder, its journal, its dashboard, and the engine in between."""
+
+from __future__ import annotations
+
+import getpass
+import importlib.metadata
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from bench.clock import Stopwatch, make_clock, room_date
+from bench.engine import Engine, Outcome, check_before_moving
+from bench.errors import ConfigurationError
+from bench.interrupts import Interrupts
+from bench.journal import FILE_NAME, Journal
+from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.rig import Rig, load_rig
+from bench.terminal import ProgressDisplay, ask_operator
+
+RECORDING_NAME = "run.rrd"
+RIG_FILE_NAME = "rig.toml"
+_PACKAGES = ("actuator-bench", "filterpy", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What to run, and how.
+
+    Attributes
+    ----------
+    protocol : ProtocolDefinition
+        What to carry out.
+    parameters : ProtocolParameters
+        Its parameters.
+    rig : str
+        Name of a packaged rig or path of a rig file.
+    overrides : mapping of str to str
+        Values of the rig file to replace, by dotted key.
+    seed : int
+        Seed of everything random in an emulated laboratory.
+    clock : str
+        `wall`, `virtual` or `xN`.
+    folder : Path
+        Where the folder of the run is made.
+    live : bool
+        Whether to serve the live view on the loopback interface.
+    recording : bool
+        Whether to write the .rrd beside the journal while the run goes on.
+    """
+
+    protocol: ProtocolDefinition
+    parameters: ProtocolParameters
+    rig: str
+    folder: Path
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    seed: int = 0
+    clock: str = "wall"
+    live: bool = False
+    recording: bool = True
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    folder : Path
+        Its folder: journal, .rrd, rig file as used.
+    outcome : Outcome
+        How it ended.
+    wall_seconds : float
+        Seconds of the room, connecting and closing included.
+    """
+
+    folder: Path
+    outcome: Outcome
+    wall_seconds: float
+
+    @property
+    def time_ratio(self) -> float:
+        """Laboratory time over time of the room."""
+        return self.outcome.laboratory_seconds / self.wall_seconds
+
+
+def carry_out(run: Run, console: Console) -> RunResult:
+    """Carry a run out, keep its record, and leave the rig in the safe state.
+
+    Raises
+    ------
+    ConfigurationError
+        If anything is wrong before the start; nothing has moved.
+    DeviceError
+        If a device cannot be connected; nothing has moved.
+    """
+    stopwatch = Stopwatch()
+    rig_file = load_rig(run.rig, run.overrides)
+    clock = make_clock(run.clock)
+    if run.clock != "wall" and any(not _is_emulated(entry.settings) for entry in rig_file.devices):
+        raise ConfigurationError(f"rig {rig_file.name} has real devices, which know only the wall clock")
+    expected = plan(run.protocol, run.parameters)
+    with ExitStack() as stack:
+        rig = stack.enter_context(Rig(rig_file, clock, run.seed))
+        check_before_moving(rig, run.protocol, run.parameters)
+        folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
+        meta = _metadata(run, rig, expected, folder.name)
+        journal = Journal(folder / FILE_NAME, rig.signals, meta)
+        stack.callback(journal.close)
+        observers: list[Any] = []
+        if run.live or run.recording:
+            dashboard = stack.enter_context(_dashboard(run, rig, meta, folder))
+            observers.append(dashboard)
+            if run.live:
+                console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
+        layout = rig_file.dashboard
+        shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in rig.signals[:2])
+        progress = ProgressDisplay(console, run.protocol.name, rig.signals, shown, expected.steps)
+        observers.append(stack.enter_context(progress))
+        interrupts = stack.enter_context(Interrupts(lambda text: console.print(text, style="yellow")))
+        ask = (lambda: ask_operator(console)) if sys.stdin.isatty() else None
+        outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, run.parameters)
+    return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def run_card(meta: Mapping[str, Any]) -> str:
+    """Return a run's metadata as a Markdown page, for the dashboard and the report."""
+    lines = [
+        f"# {meta['rig_title']}",
+        "",
+        f"**{meta['protocol']}** on **{meta['rig']}**: {meta['protocol_summary']}",
+        "",
+    ]
+    lines += ["| | |", "|---|---|"]
+    planned = meta["plan"]
+    rows = {
+        "run": meta["run"],
+        "operator": meta["operator"],
+        "started": f"{meta['epoch']} ({meta['clock']} clock)",
+        "planned": f"{planned['steps']} steps, {planned['seconds'] / 3600:.2f} h",
+        "seed": meta["seed"],
+        **{f"device {name}": identity for name, identity in meta["devices"].items()},
+        **{f"parameter {name}": value for name, value in meta["parameters"].items()},
+        "git": meta["git"],
+    }
+    lines += [f"| {key} | {value} |" for key, value in rows.items()]
+    return "\n".join(lines)
+
+
+def _dashboard(run: Run, rig: Rig, meta: Mapping[str, Any], folder: Path) -> Any:  # noqa: ANN401 - see below
+    # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
+    from bench.dashboard import Dashboard, DashboardLayout
+
+    layout = DashboardLayout(title=rig.file.rig.title, **meta["dashboard"]) if meta["dashboard"] else None
+    return Dashboard(
+        rig.signals,
+        layout,
+        run_id=str(meta["run"]),
+        title=f"{rig.file.rig.title}: {run.protocol.name}",
+        path=folder / RECORDING_NAME if run.recording else None,
+        live=run.live,
+        card=run_card(meta),
+        properties={"rig": rig.file.name, "protocol": run.protocol.name, "seed": run.seed},
+    )
+
+
+def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:
+    return {
+        "run": name,
+        "rig": rig.file.name,
+        "rig_title": rig.file.rig.title,
+        "rig_file": rig.file.text,
+        "overrides": dict(run.overrides),
+        "protocol": run.protocol.name,
+        "protocol_summary": run.protocol.summary,
+        "parameters": run.parameters.model_dump(mode="json"),
+        "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
+        "seed": run.seed,
+        "clock": run.clock,
+        "epoch": rig.clock.epoch.isoformat(),
+        "devices": {name: str(device.identity) for name, device in rig.devices.items()},
+        "calibration": {
+            **{entry.name: entry.settings.model_dump(mode="json") for entry in rig.file.devices},
+            **{name: derived.model_dump(mode="json") for name, derived in rig.file.derived.items()},
+        },
+        "dashboard": rig.file.dashboard.model_dump(mode="json") if rig.file.dashboard else None,
+        "operator": _operator(),
+        "command": sys.argv,
+        "packages": {package: _version(package) for package in _PACKAGES},
+        "git": _git_state(),
+        "host": {
+            "name": platform.node(),
+            "system": platform.platform(),
+            "python": platform.python_version(),
+            "started": room_date().isoformat(),
+        },
+    }
+
+
+def _make_folder(parent: Path, name: str) -> Path:
+    stamp = room_date().strftime("%Y%m%d-%H%M%S")
+    for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
+        folder = parent / f"{name}-{stamp}{suffix}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
+        return folder
+    raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
+
+
+def _is_emulated(settings: Any) -> bool:  # noqa: ANN401 - a driver's own settings
+    return str(getattr(settings, "port", "")).startswith("emulated://")
+
+
+def _operator() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "unknown"
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _git_state() -> str:
+    git = shutil.which("git")
+    if git is None:
+        return "unknown"
+    here = Path(__file__).parent
+
+    def ask(*arguments: str) -> str | None:
+        answer = subprocess.run([git, *arguments], cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    commit = ask("rev-parse", "--short=12", "HEAD")
+    if commit is None:
+        return "unknown"
+    return commit + (" with changes" if ask("status", "--porcelain") else "")
