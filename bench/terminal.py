@@ -50,7 +50,7 @@ class ProgressDisplay:
         self._console = console
         self._shown = [(i, signal) for i, signal in enumerate(signals) if signal.name in shown]
         self._progress = Progress(
-            TextColumn("[bold]{task.description}"),
+            TextColumn("[bold]{task.description}[/] {task.fields[phase]}"),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
@@ -61,7 +61,7 @@ class ProgressDisplay:
             transient=False,
             disable=not console.is_terminal,
         )
-        self._task: TaskID = self._progress.add_task(title, total=steps or None, readings="")
+        self._task: TaskID = self._progress.add_task(title, total=steps or None, phase="", readings="")
         self._since_redraw = Stopwatch()
 
     def __enter__(self) -> Self:
@@ -88,8 +88,10 @@ class ProgressDisplay:
             self._progress.update(self._task, completed=record.step + 1, readings=readings)
 
     def event(self, event: Event) -> None:
-        """Print what the operator should know."""
-        if event.level != "INFO" or event.kind in ("phase", "note", "resume"):
+        """Show the phase beside the bar, and print what the operator should know."""
+        if event.kind == "phase":
+            self._progress.update(self._task, phase=event.text)
+        elif event.level != "INFO" or event.kind in ("note", "resume"):
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
                 f"{_duration(event.t):>10}  {event.kind}: {event.text}", style=style, highlight=False, markup=False

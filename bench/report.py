@@ -1,0 +1,265 @@
+"""Tables, figures and exports of a run, made from its journal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markdown import Markdown
+from rich.table import Table as Columns
+
+from bench.errors import ConfigurationError, DataError
+from bench.figures import plot_density, plot_errors, plot_loops, plot_signals
+from bench.hysteresis import Preisach
+from bench.identification import measure_errors
+from bench.journal import Record, Table
+from bench.measurements import write_csv
+from bench.model_file import ModelFile, load_model, parse_model
+from bench.modelling import IdentifiedFile, errors_json, predict
+from bench.runs import RECORDING_NAME, run_card
+
+
+def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console: Console) -> dict[str, Any]:
+    """Print a run's tables, draw its figures, and compare models on it.
+
+    Parameters
+    ----------
+    run : Path
+        Folder or journal of the run.
+    model_paths : sequence of Path
+        Model files to compare, besides those that were identified from the run.
+    out : Path or None
+        Where figures go; the folder `report` beside the journal if None.
+    console : Console
+        Where to print.
+
+    Returns
+    -------
+    dict
+        The report for programs.
+
+    Raises
+    ------
+    DataError
+        If the run or a model cannot be read.
+    """
+    with Record(run) as record:
+        folder = _make_folder(out or record.path.parent / "report")
+        console.print(Markdown(run_card(record.meta)))
+        steps = record.steps()
+        _print_status(record, len(steps), console)
+        extremes = _extremes(record, steps)
+        _print_extremes(record, extremes, console)
+        _print_events(record, console)
+        figures = _draw_run(record, steps, folder)
+        models = [*_models_of(record), *(load_model(path) for path in model_paths)]
+        comparison, more = _compare(record, steps, models, folder)
+    _print_comparison(comparison, console)
+    for path in [*figures, *more]:
+        console.print(f"figure: {path}", highlight=False, soft_wrap=True)
+    return {
+        "run": record.meta["run"],
+        "status": record.status,
+        "reason": record.meta.get("reason", ""),
+        "steps": len(steps),
+        "laboratory_seconds": record.meta.get("finished"),
+        "safe_state": record.meta.get("safe_state", {}),
+        "extremes": extremes,
+        "models": comparison,
+        "figures": [str(path) for path in [*figures, *more]],
+    }
+
+
+def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
+    """Write a run's readings and telemetry as `csv` or `parquet`, or rebuild its `rrd`.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    DataError
+        If the run cannot be read or a file cannot be written.
+    ConfigurationError
+        If the format is unknown, or a recording exists already.
+    """
+    with Record(run) as record:
+        folder = _make_folder(out or record.path.parent)
+        if format_ == "rrd":
+            from bench.dashboard import rebuild
+
+            path = folder / RECORDING_NAME
+            if path.exists():
+                raise ConfigurationError(f"{path} exists already; choose another folder by --out")
+            rebuild(record, path)
+            return [path]
+        tables = {"readings": record.steps(), "telemetry": record.telemetry()}
+        headers = {name: _headers(record, table) for name, table in tables.items()}
+    if format_ not in ("csv", "parquet"):
+        raise ConfigurationError(f"format {format_!r} is unknown; allowed are csv, parquet and rrd")
+    paths = []
+    for name, table in tables.items():
+        path = folder / f"{name}.{format_}"
+        if format_ == "csv":
+            write_csv(path, headers[name], list(table.columns.values()))
+        else:
+            _write_parquet(path, headers[name], table)
+        paths.append(path)
+    return paths
+
+
+def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
+    """Draw loops, errors and density of an identified model; return the files."""
+    folder = _make_folder(out)
+    operator = found.file.operator
+    name = found.file.name
+    unit = f" / {operator.output_unit}" if operator.output_unit else ""
+    loops, errors = folder / f"{name}-loops.png", folder / f"{name}-errors.png"
+    plot_loops(
+        loops,
+        found.inputs,
+        found.outputs,
+        found.outputs - found.identification.residuals,
+        input_label=f"{found.file.provenance['input']} / {operator.input_unit or '1'}",
+        output_label=f"{found.file.provenance['output']}{unit}",
+    )
+    plot_errors(errors, {name: found.identification.residuals}, error_label=f"error{unit}")
+    paths = [loops, errors]
+    if isinstance(operator, Preisach):
+        paths.append(folder / f"{name}-density.png")
+        plot_density(paths[-1], operator)
+    return paths
+
+
+def _print_status(record: Record, steps: int, console: Console) -> None:
+    reason = record.meta.get("reason")
+    style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
+    console.print(
+        f"[{style}]{record.status}[/] after {steps} of {record.meta['plan']['steps']} steps", highlight=False
+    )
+    if reason:
+        console.print(f"  {reason}", highlight=False, markup=False)
+    for device, state in record.meta.get("safe_state", {}).items():
+        console.print(f"  {device}: {state}", highlight=False, markup=False)
+
+
+def _extremes(record: Record, steps: Table) -> dict[str, dict[str, Any]]:
+    telemetry = record.telemetry()
+    extremes: dict[str, dict[str, Any]] = {}
+    for signal in record.signals:
+        values = np.concatenate([steps[signal.name], telemetry[signal.name]])
+        values = values[np.isfinite(values)]
+        low, high = (float(values.min()), float(values.max())) if values.size else (None, None)
+        extremes[signal.name] = {"low": low, "high": high, "unit": signal.unit}
+    return extremes
+
+
+def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+    table = Columns(
+        "signal", "lowest", "highest", "unit", title="signals, readings and telemetry", title_justify="left"
+    )
+    for signal in record.signals:
+        entry = extremes[signal.name]
+        shown = ["–" if entry[end] is None else f"{entry[end]:.{signal.precision}f}" for end in ("low", "high")]
+        table.add_row(signal.name, *shown, signal.unit)
+    console.print(table)
+
+
+def _print_events(record: Record, console: Console) -> None:
+    for event in record.events():
+        if event.level != "INFO" or event.kind == "note":
+            console.print(f"{event.t:10.1f} s  {event.kind}: {event.text}", highlight=False, markup=False)
+
+
+def _draw_run(record: Record, steps: Table, folder: Path) -> list[Path]:
+    if len(steps) == 0:
+        return []
+    names = [signal.name for signal in record.signals if np.any(np.isfinite(steps[signal.name]))]
+    labels = [f"{name}\n/ {record.unit(name)}" for name in names]
+    paths = [folder / "signals.png"]
+    plot_signals(paths[0], steps["finished"] / 3600.0, {name: steps[name] for name in names}, labels)
+    layout = record.meta.get("dashboard")
+    if layout:
+        paths.append(folder / "loop.png")
+        plot_loops(
+            paths[1],
+            steps[layout["input"]],
+            steps[layout["output"]],
+            None,
+            input_label=f"{layout['input']} / {record.unit(layout['input'])}",
+            output_label=f"{layout['output']} / {record.unit(layout['output'])}",
+        )
+    return paths
+
+
+def _compare(
+    record: Record, steps: Table, models: Sequence[ModelFile], folder: Path
+) -> tuple[dict[str, dict[str, Any]], list[Path]]:
+    comparison: dict[str, dict[str, Any]] = {}
+    residuals: dict[str, Any] = {}
+    for model in models:
+        columns = [str(model.provenance.get(end, "")) for end in ("input", "output")]
+        missing = [name for name in columns if name not in steps.columns]
+        if missing:
+            raise DataError(
+                f"model {model.name} was identified with {' and '.join(missing)}, which {record.path} lacks"
+            )
+        measured, predicted = steps[columns[1]], predict(model, steps[columns[0]])
+        comparison[model.name] = {
+            **errors_json(measure_errors(measured, predicted)),
+            "unit": model.operator.output_unit or record.unit(columns[1]),
+        }
+        residuals[model.name] = measured - predicted
+    if not residuals:
+        return comparison, []
+    unit = next(iter(comparison.values()))["unit"]
+    path = folder / "errors.png"
+    plot_errors(path, residuals, error_label=f"error / {unit}")
+    return comparison, [path]
+
+
+def _print_comparison(comparison: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+    if not comparison:
+        return
+    table = Columns(
+        "model", "max", "RMS", "unit", "RMS / % of range", title="models on this run", title_justify="left"
+    )
+    for name, entry in comparison.items():
+        table.add_row(
+            name, f"{entry['max']:.2f}", f"{entry['rms']:.2f}", entry["unit"], f"{entry['rms_percent']:.2f}"
+        )
+    console.print(table)
+
+
+def _models_of(record: Record) -> list[ModelFile]:
+    return [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
+
+
+def _headers(record: Record, table: Table) -> list[str]:
+    units = {"step": "", "settled": "", "t": "s", "started": "s", "finished": "s"}
+    units |= {signal.name: signal.unit for signal in record.signals}
+    return [f"{name} [{units[name]}]" if units[name] else name for name in table.columns]
+
+
+def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
+    # A fifth of a second of import that only this format needs.
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        pq.write_table(pa.table(dict(zip(header, table.columns.values(), strict=True))), path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be written: {error}") from None
+
+
+def _make_folder(path: Path) -> Path:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"folder {path} cannot be made: {error.strerror}") from None
+    return path

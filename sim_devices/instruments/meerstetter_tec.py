@@ -1,0 +1,721 @@
+"""Emulated Meerstetter TEC-1091: a thermoelectric cooler's amplifier and temperature controller.
+
+The instrument is its parameter table, its state machine and its protections; the plant behind it is the
+physics. The numbers, types and ranges of the parameters are those of Meerstetter 5136 (TEC controller
+communication protocol) as a TEC-1091 reports them, the error numbers those of Meerstetter 5216 (TEC-family
+user manual). Defaults are ours.
+
+Assumptions, where the manuals are silent or were not at hand:
+
+- Every request that is addressed to the device and arrives whole feeds the communication watchdog. When
+  it expires the output goes off at that instant and the live parameters (50000 and up) go back to zero.
+- Initialising takes no time: after a reset the device is ready at once.
+- `Output stage enable` 3 (hardware enable) leaves the output off: nothing is wired to the input.
+- The stability window (4040) is the allowed distance to either side of the target.
+- The first error stays until a reset; a later one does not replace it.
+
+Kept in the table without effect: the temperature ramp (3003, so 1011 is the target itself), the proximity
+width and the PID parameters (3002, 3010 to 3013: the closed loop belongs to the plant), the operating mode
+(2040), baud rate and response delay (2050, 2052), and the voltage limitation (2031), as the plants take a
+current. The error thresholds of current and voltage act.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal, Protocol
+
+import numpy as np
+
+from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
+from bench.errors import DeviceConnectionError, DeviceError
+from sim_devices.world import World
+
+RESET_DELAY = 0.2
+"""Seconds from the reset command to the restart (Meerstetter 5136, set commands)."""
+
+SUPERVISION_INTERVAL = 0.25
+"""Seconds between two checks of the protections while the output is on; a real device checks faster."""
+
+OBJECT_NOISE = 0.002
+"""Standard deviation of the object temperature reading, K."""
+
+SUPPLY_VOLTAGE = 24.0
+"""Input voltage, V; the output stage saturates there."""
+
+_OBJECT_RESOLUTION = 128.0 / 2**23  # K: a converter of 23 bits, with the range of an NTC set-up
+_SINK_RESOLUTION = 128.0 / 2**12  # K: 12 bits
+_OUTPUT_RESOLUTION = 1e-3  # A and V
+_DEVICE_TEMPERATURE = 35.0
+_DEVICE_TYPE = 1091
+_HARDWARE_VERSION = 120
+_STATIC, _LIVE, _CONTROLLER = 0, 1, 2  # values of parameter 2000
+_ENABLE_OFF, _ENABLE_ON, _ENABLE_LIVE = 0, 1, 2  # values of parameter 2010
+_HIGHEST_INT = 2**31 - 1
+
+
+class DeviceStatus(IntEnum):
+    """Values of parameter 104 (Meerstetter 5136)."""
+
+    INIT = 0
+    READY = 1
+    RUN = 2
+    ERROR = 3
+    BOOTLOADER = 4
+    RESET_PENDING = 5
+
+
+class ServerError(IntEnum):
+    """Why a request is refused (Meerstetter 5117, server error codes)."""
+
+    COMMAND_NOT_AVAILABLE = 1
+    BUSY = 2
+    COMMUNICATION = 3
+    FORMAT = 4
+    PARAMETER_NOT_AVAILABLE = 5
+    READ_ONLY = 6
+    OUT_OF_RANGE = 7
+    INSTANCE_NOT_AVAILABLE = 8
+    GENERAL = 9
+
+
+class RequestRefusedError(Exception):
+    """The device answers a request with a server error."""
+
+    def __init__(self, reason: ServerError) -> None:
+        super().__init__(reason.name)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One row of the parameter table.
+
+    Attributes
+    ----------
+    number : int
+        Number of the parameter.
+    kind : {"INT32", "FLOAT32"}
+        How the value is coded on the wire.
+    low, high : float
+        Range of the values.
+    default : float
+        Value as delivered.
+    writable : bool
+        Whether the host may write it.
+    volatile : bool
+        Whether it lives in RAM only and starts from its default after each reset.
+    """
+
+    number: int
+    kind: Literal["INT32", "FLOAT32"]
+    low: float
+    high: float
+    default: float
+    writable: bool = True
+    volatile: bool = False
+
+
+def _integer(number: int, high: float, default: float = 0, *, low: float = 0) -> Parameter:
+    return Parameter(number, "INT32", low, high, default)
+
+
+def _real(number: int, low: float, high: float, default: float) -> Parameter:
+    return Parameter(number, "FLOAT32", low, high, default)
+
+
+def _integer_reading(number: int) -> Parameter:
+    return Parameter(number, "INT32", 0, _HIGHEST_INT, 0, writable=False)
+
+
+def _real_reading(number: int) -> Parameter:
+    return Parameter(number, "FLOAT32", -math.inf, math.inf, 0.0, writable=False)
+
+
+def _live(number: int, kind: Literal["INT32", "FLOAT32"], low: float, high: float) -> Parameter:
+    return Parameter(number, kind, low, high, 0, volatile=True)
+
+
+PARAMETERS = {
+    parameter.number: parameter
+    for parameter in (
+        *(_integer_reading(number) for number in (100, 101, 102, 103, 104, 105, 106, 107, 109, 1200)),
+        *(_real_reading(number) for number in (1000, 1001, 1010, 1011, 1020, 1021, 1060, 1063)),
+        Parameter(108, "INT32", 0, 1, 0, volatile=True),
+        _integer(2000, 2, _CONTROLLER),
+        _integer(2010, 3, _ENABLE_OFF),
+        _real(2020, -4.0, 4.0, 0.0),
+        _real(2021, 0.0, 21.0, 0.0),
+        _real(2030, 0.0, 4.0, 4.0),
+        _real(2031, 0.0, 21.0, 21.0),
+        _real(2032, 0.0, 5.6, 5.0),
+        _real(2033, 0.0, 25.0, 22.0),
+        _integer(2040, 2),
+        _integer(2050, 1_000_000, 57600, low=4800),
+        _integer(2051, 254, 1, low=1),
+        _integer(2052, 100_000),
+        _real(2060, 0.0, 600.0, 0.0),
+        _real(3000, -273.0, 1000.0, 25.0),
+        _real(3002, 0.0, 200.0, 1.0),
+        _real(3003, 1e-6, 50.0, 50.0),
+        _real(3010, 0.0, 10000.0, 10.0),
+        _real(3011, 1e-4, 10000.0, 300.0),
+        _real(3012, 0.0, 10000.0, 0.0),
+        _real(3013, 0.0, 1.0, 0.3),
+        _integer(3034, 1, 1),
+        _real(4010, -273.0, 1000.0, 0.0),
+        _real(4011, -273.0, 1000.0, 105.0),
+        _real(4012, 1.0, 100_000.0, 50.0),
+        _real(4040, 0.0, 50.0, 0.1),
+        _real(4041, 0.0, 86400.0, 1.0),
+        _real(4042, 0.0, 86400.0, 0.0),
+        _real(5010, -273.0, 1000.0, 0.0),
+        _real(5011, -273.0, 1000.0, 70.0),
+        _real(5012, 1.0, 200.0, 50.0),
+        _real(6310, 0.0, 86400.0, 0.0),
+        _integer(6320, 20_000_000, 1, low=-1),
+        _live(50000, "INT32", 0, 1),
+        _live(50001, "FLOAT32", -4.0, 4.0),
+        _live(50002, "FLOAT32", 0.0, 21.0),
+        _live(50011, "INT32", 0, 1),
+        _live(50012, "FLOAT32", -273.0, 1000.0),
+    )
+}
+"""The emulated part of a TEC-1091's parameter table, by parameter number.
+
+4040 to 4042 are the stability window (K), the least time in it (s) and the longest time to get there (s, 0
+for no limit); 6320 is the time in saturation (ms, −1 for never) that leads to error 108.
+"""
+
+
+class PeltierLoad(Protocol):
+    """What the output stage is connected to; a positive current heats the plate."""
+
+    @property
+    def plate_temperature(self) -> float:
+        """Temperature of the plate with the object sensor, °C."""
+
+    @property
+    def sink_temperature(self) -> float:
+        """Temperature of the heat sink, °C."""
+
+    @property
+    def current(self) -> float:
+        """Peltier current, A."""
+
+    @property
+    def voltage(self) -> float:
+        """Voltage across the Peltier element, V."""
+
+    def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
+        """Close the temperature loop, with a current of at most `current_limit` A of either sign."""
+
+    def drive(self, current_ampere: float) -> None:
+        """Drive a constant current."""
+
+    def release(self) -> None:
+        """Switch the output off."""
+
+
+class EmulatedTEC(TECAmplifier):
+    """One TEC-1091 with its Peltier element, as the parameter table and as the role of a TEC amplifier.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    world : World
+        The time of the emulated laboratory; the instrument enters its own deadlines there.
+    load : PeltierLoad
+        The plant's Peltier element.
+    serial_number : int
+        Serial number that the device reports.
+    firmware : int
+        Firmware version times 100 that the device reports.
+    rng : numpy.random.Generator, optional
+        Noise of the object temperature; without it the readings are free of noise.
+
+    Attributes
+    ----------
+    flash_writes : int
+        How many parameters were written to the flash; a real one endures about 100 000.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        world: World,
+        load: PeltierLoad,
+        *,
+        serial_number: int = 1091_0042,
+        firmware: int = 410,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        super().__init__(name, world.clock)
+        self._world = world
+        self._load = load
+        self._rng = rng
+        self._identity = Identity(
+            "Meerstetter Engineering", f"TEC-{_DEVICE_TYPE}", str(serial_number), f"{firmware / 100:.2f}"
+        )
+        self._saved = {number: _stored(row, row.default) for number, row in PARAMETERS.items()}
+        self._values = dict(self._saved)
+        self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 102: serial_number, 103: firmware}
+        self._readings: dict[int, Callable[[], float]] = {
+            104: lambda: self._status,
+            105: lambda: self._error,
+            106: lambda: self._error_instance,
+            107: lambda: self._error_parameter,
+            109: lambda: 2 if self._values[108] else 0,
+            1000: self._object_temperature,
+            1001: lambda: _rounded(self._load.sink_temperature, _SINK_RESOLUTION),
+            1010: self._target,
+            1011: self._target,
+            1020: lambda: self._polarity * _rounded(self._load.current, _OUTPUT_RESOLUTION),
+            1021: lambda: self._polarity * _rounded(self._load.voltage, _OUTPUT_RESOLUTION),
+            1060: lambda: SUPPLY_VOLTAGE,
+            1063: lambda: _DEVICE_TEMPERATURE,
+            1200: self._stability,
+        }
+        self.flash_writes = 0
+        self._setpoint = math.nan
+        self._status = DeviceStatus.READY
+        self._error = self._error_instance = self._error_parameter = 0
+        self._output: tuple[str, float, float] | None = None
+        self._watchdog_due = self._restart_due = self._supervision_due = math.inf
+        self._supervised_at = world.time
+        self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
+        self._started_at = self._in_window_since = self._saturated_since = math.nan
+        self._plugged_in = True
+        self._corrupt_next = self._drop_next = False
+        world.add(self)
+
+    # The device as its manual has it: parameters and commands.
+
+    @property
+    def world(self) -> World:
+        """The time of the emulated laboratory."""
+        return self._world
+
+    @property
+    def address(self) -> int:
+        """Get the device address, 1 to 254 (parameter 2051)."""
+        return int(self._values[2051])
+
+    @property
+    def identification(self) -> str:
+        """Get the identification string, 20 characters; the wording is an assumption."""
+        return f"{self._identity.model} v{self._identity.firmware}".ljust(20)
+
+    @property
+    def status(self) -> DeviceStatus:
+        """Get the state of the device at the clock's present time; does not feed the watchdog."""
+        with self._world.lock:
+            self._world.advance()
+            return self._status
+
+    def attend(self) -> None:
+        """Come up to the clock's present time and feed the watchdog: a request has arrived."""
+        with self._world.lock:
+            self._world.advance()
+            now = self._world.time
+            if now > self._supervised_at:
+                self._supervise(now)
+            self._feed(now)
+
+    def parameter(self, number: int, instance: int = 1) -> Parameter:
+        """Get the row of the parameter table.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such parameter or no such instance of it; this device has one channel.
+        """
+        row = PARAMETERS.get(number)
+        if row is None:
+            raise RequestRefusedError(ServerError.PARAMETER_NOT_AVAILABLE)
+        if instance != 1:
+            raise RequestRefusedError(ServerError.INSTANCE_NOT_AVAILABLE)
+        return row
+
+    def read_parameter(self, number: int, instance: int = 1) -> float:
+        """Get the value of a parameter, in the unit of the table.
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such parameter or instance.
+        """
+        with self._world.lock:
+            self.parameter(number, instance)
+            self.attend()
+            return self._read(number)
+
+    def write_parameter(self, number: int, value: float, instance: int = 1) -> None:
+        """Set a parameter; it goes to the flash as well unless saving is off (parameter 108).
+
+        Raises
+        ------
+        RequestRefusedError
+            If there is no such parameter or instance, it is read-only, or the value is out of its range.
+        """
+        with self._world.lock:
+            row = self.parameter(number, instance)
+            self.attend()
+            if not row.writable:
+                raise RequestRefusedError(ServerError.READ_ONLY)
+            stored = _stored(row, value)
+            inside = _stored(row, row.low) <= stored <= _stored(row, row.high)
+            if not inside or (number == 2060 and 0.0 < value < 0.1):
+                raise RequestRefusedError(ServerError.OUT_OF_RANGE)
+            self._values[number] = stored
+            if not row.volatile and not self._values[108]:
+                self._saved[number] = stored
+                self.flash_writes += 1
+            if number == 2060:
+                self._feed(self._world.time)
+            self._apply()
+
+    def emergency_stop(self) -> None:
+        """Switch the output off and stay in error 11 (command `ES`)."""
+        with self._world.lock:
+            self.attend()
+            self._trip(11)
+
+    def reset(self) -> None:
+        """Restart from the flash after 0.2 s (command `RS`); the output goes off at once."""
+        with self._world.lock:
+            self.attend()
+            self._status = DeviceStatus.RESET_PENDING
+            self._watchdog_due = math.inf
+            self._restart_due = self._world.time + RESET_DELAY
+            self._apply()
+
+    # Faults to try the bench with.
+
+    @property
+    def plugged_in(self) -> bool:
+        """Get whether requests reach the device."""
+        return self._plugged_in
+
+    def trip(self, error_number: int, *, parameter: int = 0) -> None:
+        """Put the device into its error state.
+
+        Parameters
+        ----------
+        error_number : int
+            As parameter 105 will report it, such as 138.
+        parameter : int
+            The parameter that parameter 107 will name.
+        """
+        with self._world.lock:
+            self._world.advance()
+            self._trip(error_number, parameter)
+
+    def unplug(self) -> None:
+        """Let no request arrive and no answer leave; the device works on, and its watchdog expires."""
+        with self._world.lock:
+            self._world.advance()
+            self._plugged_in = False
+
+    def plug_in(self) -> None:
+        """Undo `unplug`."""
+        with self._world.lock:
+            self._world.advance()
+            self._plugged_in = True
+
+    def corrupt_next_answer(self) -> None:
+        """Have one bit of the next answer turned over on its way; the device has acted all the same."""
+        self._corrupt_next = True
+
+    def drop_next_answer(self) -> None:
+        """Have the next answer lost on its way; the device has acted all the same."""
+        self._drop_next = True
+
+    def transmit(self, answer: bytes) -> bytes:
+        """Return what arrives at the host of an answer, after the faults of the line."""
+        if self._drop_next:
+            self._drop_next = False
+            return b""
+        if self._corrupt_next:
+            self._corrupt_next = False
+            middle = len(answer) // 2
+            return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
+        return answer
+
+    # What happens by itself.
+
+    def deadline(self) -> float:
+        """Return when the watchdog, a restart or the next check of the protections is due (s)."""
+        return min(self._watchdog_due, self._restart_due, self._supervision_due)
+
+    def expire(self) -> None:
+        """Do what is due."""
+        now = self._world.time
+        if now >= self._watchdog_due:
+            self._watchdog_due = math.inf
+            self._trip(183, 2060)
+        if now >= self._restart_due:
+            self._restart()
+        if now >= self._supervision_due:
+            self._supervision_due = now + SUPERVISION_INTERVAL
+            self._supervise(now)
+
+    # The role of a TEC amplifier, as a host on the spot would play it.
+
+    @property
+    def identity(self) -> Identity:
+        """Maker, model, serial number and firmware."""
+        return self._identity
+
+    @property
+    def mode(self) -> TECMode:
+        """What is held constant (parameter 2000)."""
+        return TECMode.TEMPERATURE if self._values[2000] == _CONTROLLER else TECMode.CURRENT
+
+    def select_mode(self, mode: TECMode) -> None:
+        """Choose what is held constant; a change switches the output off."""
+        with self._request():
+            if mode is not self.mode:
+                for number in (50000, 2010, 50001):
+                    self.write_parameter(number, 0)
+                self.write_parameter(2000, _CONTROLLER if mode is TECMode.TEMPERATURE else _LIVE)
+                self._setpoint = math.nan
+
+    @property
+    def limits(self) -> Limits:
+        """The object temperature's error thresholds in °C, or the current limitation in A."""
+        if self.mode is TECMode.TEMPERATURE:
+            return Limits(self._values[4010], self._values[4011], "°C")
+        return Limits(-self._values[2030], self._values[2030], "A")
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that `set` or `stop` last took, °C or A; nan before the first."""
+        return self._setpoint
+
+    def set(self, value: float) -> Status:
+        """Send a set-point in °C or A, and switch the output on if it is off."""
+        self.check(value)
+        with self._request():
+            self._refuse_fault()
+            if self.mode is TECMode.TEMPERATURE:
+                self.write_parameter(50012, value)
+                self.write_parameter(50011, 1)
+            else:
+                self.write_parameter(50001, self._polarity * value)
+            self.write_parameter(2010, _ENABLE_LIVE)
+            self.write_parameter(50000, 1)
+            self._setpoint = value
+            self._refuse_fault()
+        if self.mode is TECMode.CURRENT:
+            return Status.completed(self.name, self._clock)
+        return Status(self.name, self._clock, self._arrived, timeout=300.0)
+
+    @property
+    def output_enabled(self) -> bool:
+        """Whether the output stage is on."""
+        with self._request():
+            return self._status is DeviceStatus.RUN
+
+    def measure(self) -> dict[str, float]:
+        """Measure object and sink temperature in °C, current in A and voltage in V."""
+        with self._request():
+            self._refuse_fault()
+            return {
+                f"{self.name}_temperature": self._read(1000),
+                f"{self.name}_sink_temperature": self._read(1001),
+                f"{self.name}_current": self._polarity * self._read(1020),
+                f"{self.name}_voltage": self._polarity * self._read(1021),
+            }
+
+    def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
+        """Hold the present temperature; in current mode the current stays as it is."""
+        with self._request():
+            if self.mode is TECMode.TEMPERATURE and self._status is DeviceStatus.RUN:
+                limits = self.limits
+                self._setpoint = min(max(self._read(1000), limits.low), limits.high)
+                self.write_parameter(50012, self._setpoint)
+
+    def safe(self) -> None:
+        """Switch the output stage off."""
+        with self._request():
+            self.write_parameter(50000, 0)
+            self.write_parameter(2010, _ENABLE_OFF)
+
+    def close(self) -> None:
+        """Do nothing: there is no line."""
+
+    def _arrived(self) -> bool:
+        with self._request():
+            self._refuse_fault()
+            if self._status is not DeviceStatus.RUN:
+                raise DeviceError(self.name, "the output was switched off before the temperature was reached")
+            return self._read(1200) == 2
+
+    @contextmanager
+    def _request(self) -> Iterator[None]:
+        with self._world.lock:
+            if not self._plugged_in:
+                raise DeviceConnectionError(self.name, "does not answer: it was unplugged")
+            self.attend()
+            yield
+
+    def _refuse_fault(self) -> None:
+        if self._status is DeviceStatus.ERROR:
+            raise DeviceError(self.name, f"error {self._error} (parameter {self._error_parameter}); reset it")
+        if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
+            raise DeviceError(self.name, f"not ready: {self._status.name.lower().replace('_', ' ')}")
+
+    # The inner workings. The lock is held and the world stands at the present.
+
+    @property
+    def _polarity(self) -> int:
+        # Parameter 3034: whether a positive current of the device heats (1) or cools (0) the object.
+        return 1 if self._values[3034] else -1
+
+    def _read(self, number: int) -> float:
+        reading = self._readings.get(number)
+        value = self._values[number] if reading is None else reading()
+        return _stored(PARAMETERS[number], value)
+
+    def _object_temperature(self) -> float:
+        noise = 0.0 if self._rng is None else OBJECT_NOISE * self._rng.standard_normal()
+        return _rounded(self._load.plate_temperature + noise, _OBJECT_RESOLUTION)
+
+    def _target(self) -> float:
+        return self._values[50012] if self._values[50011] else self._values[3000]
+
+    def _stability(self) -> int:
+        if self._status is not DeviceStatus.RUN or self._values[2000] != _CONTROLLER:
+            return 0
+        # A comparison with nan, outside of the window, is false.
+        return 2 if self._world.time - self._in_window_since >= self._values[4041] else 1
+
+    def _feed(self, now: float) -> None:
+        watched = self._values[2060] > 0.0 and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
+        self._watchdog_due = now + self._values[2060] if watched else math.inf
+
+    def _trip(self, error_number: int, parameter: int = 0) -> None:
+        if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
+            return
+        self._status = DeviceStatus.ERROR
+        self._error, self._error_instance, self._error_parameter = error_number, 1, parameter
+        self._watchdog_due = math.inf
+        if error_number == 183:
+            for number, row in PARAMETERS.items():
+                if row.volatile and number >= 50000:
+                    self._values[number] = _stored(row, row.default)
+        if self._values[6310] > 0.0:
+            self._restart_due = self._world.time + self._values[6310]
+        self._apply()
+
+    def _restart(self) -> None:
+        self._restart_due = math.inf
+        self._values |= {number: self._saved[number] for number, row in PARAMETERS.items() if row.writable}
+        self._error = self._error_instance = self._error_parameter = 0
+        self._status = DeviceStatus.READY
+        self._feed(self._world.time)
+        self._apply()
+
+    def _apply(self) -> None:
+        """Bring the output stage into the state that the table asks for."""
+        values = self._values
+        enable = values[2010]
+        wanted = enable == _ENABLE_ON or (enable == _ENABLE_LIVE and values[50000] == 1)
+        on = wanted and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
+        output: tuple[str, float, float] | None = None
+        if on:
+            limit = values[2030]
+            if values[2000] == _CONTROLLER:
+                output = ("regulate", self._target(), limit)
+            else:
+                asked = values[50001] if values[2000] == _LIVE else values[2020]
+                output = ("drive", self._polarity * min(max(asked, -limit), limit), limit)
+        if output == self._output:
+            return
+        was_on, self._output = self._output is not None, output
+        now = self._world.time
+        self._in_window_since = math.nan
+        self._started_at = now
+        if output is None:
+            self._load.release()
+            self._supervision_due = math.inf
+            self._saturated_since = math.nan
+            if self._status is DeviceStatus.RUN:
+                self._status = DeviceStatus.READY
+            return
+        kind, value, limit = output
+        if kind == "regulate":
+            self._load.regulate(value, limit)
+        else:
+            self._load.drive(value)
+        self._status = DeviceStatus.RUN
+        if not was_on:
+            self._supervision_due = now + SUPERVISION_INTERVAL
+        self._supervise(now)
+
+    def _supervise(self, now: float) -> None:
+        """Check the protections and follow the stability of the temperature."""
+        values = self._values
+        elapsed = now - self._supervised_at
+        plate, sink = self._load.plate_temperature, self._load.sink_temperature
+        # A slope over less than this would see the steps of the plant's own time grid.
+        if elapsed >= 0.5 * SUPERVISION_INTERVAL:
+            if abs(plate - self._last_object) > values[4012] * elapsed:
+                self._trip(139, 4012)
+            if abs(sink - self._last_sink) > values[5012] * elapsed:
+                self._trip(144, 5012)
+            self._last_object, self._last_sink, self._supervised_at = plate, sink, now
+        if plate < values[4010]:
+            self._trip(137, 4010)
+        elif plate > values[4011]:
+            self._trip(138, 4011)
+        if sink < values[5010]:
+            self._trip(142, 5010)
+        elif sink > values[5011]:
+            self._trip(143, 5011)
+        if self._status is DeviceStatus.RUN:
+            self._supervise_output(now)
+
+    def _supervise_output(self, now: float) -> None:
+        values = self._values
+        current, voltage = self._load.current, self._load.voltage
+        if abs(current) > values[2032]:
+            self._trip(100 if self._polarity * current > 0 else 101, 2032)
+        elif abs(voltage) > values[2033]:
+            self._trip(104 if self._polarity * voltage > 0 else 105, 2033)
+        if abs(voltage) < SUPPLY_VOLTAGE:
+            self._saturated_since = math.nan
+        elif math.isnan(self._saturated_since):
+            self._saturated_since = now
+        elif 0 <= values[6320] < 1e3 * (now - self._saturated_since):
+            self._trip(108, 6320)
+        if self._status is not DeviceStatus.RUN or values[2000] != _CONTROLLER:
+            return
+        if abs(self._load.plate_temperature - self._target()) > values[4040]:
+            self._in_window_since = math.nan
+        elif math.isnan(self._in_window_since):
+            self._in_window_since = now
+        late = values[4042] > 0.0 and now - self._started_at > values[4042]
+        if late and self._stability() != 2:
+            self._trip(182, 4042)
+
+
+def _stored(row: Parameter, value: float) -> float:
+    """Return a value as the device keeps it: an integer, or a number of single precision."""
+    if row.kind == "INT32":
+        return int(value)
+    try:
+        return float(struct.unpack(">f", struct.pack(">f", value))[0])
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def _rounded(value: float, resolution: float) -> float:
+    return round(value / resolution) * resolution

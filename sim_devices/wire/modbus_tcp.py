@@ -1,0 +1,268 @@
+"""Modbus TCP on a loopback port, for any emulated instrument that is a bank of registers.
+
+A small server of our own rather than pymodbus's, which was tried in its version 3.16: of several requests in
+one segment it answers the first only, and after a frame with a foreign protocol identifier it keeps waiting
+with the bytes in its buffer, so that the client is neither served again nor told. It also shares its framing
+with the client that the drivers use, where a misunderstanding would hide on both ends of the wire. A round
+trip takes 0.03 to 0.1 ms, no more than with that server. One thread serves all clients in turn: no event
+loop, nothing to leak.
+
+Sources: MODBUS Application Protocol Specification V1.1b3; MODBUS Messaging on TCP/IP Implementation Guide
+V1.0b, section 3.1 (MBAP header).
+"""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import socket
+import struct
+import threading
+from types import TracebackType
+from typing import Protocol
+
+ILLEGAL_FUNCTION = 1
+ILLEGAL_ADDRESS = 2
+ILLEGAL_VALUE = 3
+DEVICE_FAILURE = 4
+
+_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY = 3, 4, 6, 16
+_MOST_READ = 125  # registers in one read, Application Protocol 6.3
+_MOST_WRITTEN = 123  # registers in one write, Application Protocol 6.12
+_REGISTERS = 0x10000
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
+_MOST_BYTES = 254  # unit identifier and the longest PDU
+
+_log = logging.getLogger(__name__)
+
+
+class RegisterError(Exception):
+    """An instrument refuses an access.
+
+    Parameters
+    ----------
+    code : int
+        Modbus exception code that the client gets, 1 to 255.
+    message : str
+        Why, for whoever calls the instrument without a wire.
+    """
+
+    def __init__(self, code: int, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class FramingError(Exception):
+    """The bytes are no Modbus TCP, and where the next frame begins cannot be known."""
+
+
+class RegisterBank(Protocol):
+    """An instrument as Modbus sees it: 16-bit registers at addresses 0 to 65535."""
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        """Return `count` registers from `address` on, each 0 to 65535; raise `RegisterError` to refuse."""
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        """Write registers from `address` on, each 0 to 65535; raise `RegisterError` to refuse."""
+
+
+class ModbusTcpStream:
+    """The instrument's end of one connection: bytes in, bytes out.
+
+    Parameters
+    ----------
+    bank : RegisterBank
+        The instrument.
+    """
+
+    def __init__(self, bank: RegisterBank) -> None:
+        self._bank = bank
+        self._received = bytearray()
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the client, in whatever pieces they come; return the replies to whole frames.
+
+        Raises
+        ------
+        FramingError
+            If the header is not one of Modbus; the connection is to be closed.
+        """
+        self._received += data
+        replies = bytearray()
+        while len(self._received) >= _HEADER.size:
+            transaction, protocol, length, unit = _HEADER.unpack_from(self._received)
+            if protocol != 0 or not 2 <= length <= _MOST_BYTES:
+                raise FramingError(f"protocol {protocol}, length {length}")
+            end = _HEADER.size + length - 1
+            if len(self._received) < end:
+                break
+            reply = answer(self._bank, bytes(self._received[_HEADER.size : end]))
+            del self._received[:end]
+            # The unit is echoed whatever it is: a device on TCP is addressed by its port.
+            replies += _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
+        return bytes(replies)
+
+
+def answer(bank: RegisterBank, request: bytes) -> bytes:
+    """Return the reply to one request, both without a header and at least one byte long."""
+    function = request[0]
+    try:
+        return bytes([function]) + _carry_out(bank, function, request[1:])
+    except RegisterError as refusal:
+        return bytes([function | 0x80, refusal.code])
+    except Exception:
+        # An emulator's defect must not end the server; the client sees a device that has failed.
+        _log.exception("the emulated instrument failed on request %s", request.hex(" "))
+        return bytes([function | 0x80, DEVICE_FAILURE])
+
+
+def _carry_out(bank: RegisterBank, function: int, body: bytes) -> bytes:
+    if function not in (_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY):
+        raise RegisterError(ILLEGAL_FUNCTION, f"function {function} is not supported")
+    if len(body) < 4:
+        raise RegisterError(ILLEGAL_VALUE, "the request is too short")
+    address, number = struct.unpack_from(">HH", body)
+    if function == _WRITE_ONE:
+        if len(body) != 4:
+            raise RegisterError(ILLEGAL_VALUE, "the request is too long")
+        bank.write_registers(address, [number])
+        return body
+    if function == _WRITE_MANY:
+        if not 1 <= number <= _MOST_WRITTEN or len(body) != 5 + 2 * number or body[4] != 2 * number:
+            raise RegisterError(ILLEGAL_VALUE, "count and data do not agree")
+        _check_range(address, number)
+        bank.write_registers(address, list(struct.unpack_from(f">{number}H", body, 5)))
+        return body[:4]
+    if len(body) != 4 or not 1 <= number <= _MOST_READ:
+        raise RegisterError(ILLEGAL_VALUE, f"count: allowed are 1 to {_MOST_READ}, got {number}")
+    _check_range(address, number)
+    words = bank.read_registers(address, number)
+    return struct.pack(f">B{number}H", 2 * number, *words)
+
+
+def _check_range(address: int, count: int) -> None:
+    if address + count > _REGISTERS:
+        raise RegisterError(ILLEGAL_ADDRESS, f"registers {address} to {address + count - 1} do not exist")
+
+
+class ModbusTcpServer:
+    """Serves an emulated instrument to any number of clients.
+
+    Parameters
+    ----------
+    bank : RegisterBank
+        The instrument; it is asked from the thread of the server.
+    host : str
+        Address to listen on; anything but loopback lets other machines in.
+    port : int
+        Port to listen on; 0 lets the system choose.
+
+    Notes
+    -----
+    `start` and `close` may be called by a `with` statement. A request that makes the instrument wait, such as
+    a burst of conversions, makes the other clients wait too, as it does on the instruments themselves.
+    """
+
+    _SEND_TIMEOUT = 1.0  # a client that does not read its replies for so long is dropped
+
+    def __init__(self, bank: RegisterBank, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._bank = bank
+        self._host = host
+        self._port = port
+        self._thread: threading.Thread | None = None
+
+    @property
+    def address(self) -> str:
+        """Where clients connect, as `tcp://127.0.0.1:PORT`."""
+        return f"tcp://{self._host}:{self._port}"
+
+    @property
+    def port(self) -> int:
+        """The port, 0 before `start` if the system is to choose."""
+        return self._port
+
+    def start(self) -> ModbusTcpServer:
+        """Listen and serve; clients can connect when this returns.
+
+        Raises
+        ------
+        RuntimeError
+            If the server runs already.
+        OSError
+            If the port is taken.
+        """
+        if self._thread is not None:
+            raise RuntimeError(f"the server at {self.address} runs already")
+        self._listener = socket.create_server((self._host, self._port))
+        self._port = self._listener.getsockname()[1]
+        self._waker, wakened = socket.socketpair()
+        self._thread = threading.Thread(
+            target=self._serve, args=(self._listener, wakened), name=f"modbus {self._port}", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Drop all clients and stop listening; nothing is left when this returns. May be called again."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            self._waker.close()
+            thread.join()
+
+    def __enter__(self) -> ModbusTcpServer:
+        return self.start()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _serve(self, listener: socket.socket, wakened: socket.socket) -> None:
+        clients: dict[socket.socket, ModbusTcpStream] = {}
+        with selectors.DefaultSelector() as selector, listener, wakened:
+            selector.register(listener, selectors.EVENT_READ)
+            selector.register(wakened, selectors.EVENT_READ)
+            while True:
+                for key, _ in selector.select():
+                    ready = key.fileobj
+                    if ready is wakened:
+                        for client in clients:
+                            client.close()
+                        return
+                    if ready is listener:
+                        self._accept(listener, selector, clients)
+                        continue
+                    assert isinstance(ready, socket.socket)
+                    if not self._exchange(ready, clients[ready]):
+                        selector.unregister(ready)
+                        del clients[ready]
+                        ready.close()
+
+    def _accept(
+        self,
+        listener: socket.socket,
+        selector: selectors.BaseSelector,
+        clients: dict[socket.socket, ModbusTcpStream],
+    ) -> None:
+        try:
+            client, _ = listener.accept()
+        except OSError:
+            return  # the client went away before it was let in
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.settimeout(self._SEND_TIMEOUT)
+        clients[client] = ModbusTcpStream(self._bank)
+        selector.register(client, selectors.EVENT_READ)
+
+    @staticmethod
+    def _exchange(client: socket.socket, stream: ModbusTcpStream) -> bool:
+        """Serve what has arrived; return whether the connection goes on."""
+        try:
+            data = client.recv(4096)
+            if data:
+                client.sendall(stream.receive(data))
+        except (OSError, FramingError):
+            return False
+        return bool(data)

@@ -1,0 +1,583 @@
+"""The driver of the Meerstetter TEC controllers, against a scripted device at the other end of its line."""
+
+import math
+import struct
+from binascii import crc_hqx
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bench.clock import VirtualClock
+from bench.devices import TECMode
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from drivers import meerstetter
+from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
+from sim_devices.protocol_emulated import register, unregister
+
+PORT = "emulated://scripted-tec"
+REALS = {1000, 1001, 1020, 1021, 2030, 2031, 2060, 3000, 4040, 4041, 6310, 50001, 50002, 50012}
+
+
+def answer(body):
+    return body + b"%04X\r" % crc_hqx(body, 0)
+
+
+def bits(number, value):
+    if number in REALS:
+        return struct.pack(">f", value).hex().upper().encode()
+    return b"%08X" % (value & 0xFFFFFFFF)
+
+
+class Script:
+    """A device of a few lines: a table of values, what it received, and answers put into its mouth.
+
+    `instead` holds, request by request, bytes to send in place of the right answer (None for the right
+    one); `refusals` server errors by the beginning of a request.
+    """
+
+    def __init__(self):
+        self.values = {100: 1091, 102: 4711, 103: 412, 104: 1, 105: 0, 106: 0, 107: 0, 3034: 1, 1200: 0}
+        self.values |= {1000: 25.5, 1001: 24.0, 1020: 0.25, 1021: 1.5}
+        self.limits = {2030: (0.0, 4.0), 2031: (0.0, 21.0), 3000: (-273.0, 1000.0)}
+        self.received = []
+        self.instead = []
+        self.refusals = {}
+        self.silent = False
+        self.on_order = lambda _payload: None
+
+    def receive(self, data):
+        assert data.endswith(b"\r")
+        self.received.append(data)
+        if self.silent:
+            return b""
+        right = self.right_answer(data)
+        if self.instead:
+            other = self.instead.pop(0)
+            if other is not None:
+                return other(data, right) if callable(other) else other
+        return right
+
+    def right_answer(self, data):
+        head, payload, crc = b"!" + data[1:7], data[7:-5], data[-5:]
+        assert crc == b"%04X\r" % crc_hqx(data[:-5], 0)
+        text = payload.decode()
+        for start, code in self.refusals.items():
+            if text.startswith(start):
+                return answer(head + b"+%02X" % code)
+        if text.startswith("?VR"):
+            number = int(text[3:7], 16)
+            return answer(head + bits(number, self.values.get(number, 0)))
+        if text.startswith("?VL"):
+            number = int(text[3:7], 16)
+            low, high = self.limits.get(number, (0.0, 100000.0))
+            return answer(head + b"00" + bits(number, low) + bits(number, high))
+        if text == "?IF":
+            return answer(head + b"LDD-1121 v1.00      ")
+        self.on_order(text)
+        if text.startswith("VS"):
+            number = int(text[2:6], 16)
+            self.values[number] = struct.unpack(">f" if number in REALS else ">i", bytes.fromhex(text[8:]))[0]
+            if self.values[104] in (1, 2):
+                on = self.values.get(2010) == 2 and self.values.get(50000) == 1
+                self.values[104] = 2 if on else 1
+        return head + crc
+
+    def orders(self):
+        """Return the payloads of all that was written, once each."""
+        frames = dict.fromkeys(data for data in self.received if data[7:8] != b"?")
+        return [data[7:-5].decode() for data in frames]
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def script(clock):
+    script = Script()
+    register("scripted-tec", script, clock)
+    yield script
+    unregister("scripted-tec")
+
+
+def make_settings(**changes):
+    keys = {"port": PORT, "temperature_limits": (15, 90), "current_limit": 3.0, "voltage_limit": 12.0}
+    return MeerstetterTEC.Settings(**keys | changes)
+
+
+def connect(clock, **changes):
+    return MeerstetterTEC.connect("tec", make_settings(**changes), clock)
+
+
+@pytest.fixture
+def line(script):
+    # The maker's examples use the address that every device answers to.
+    settings = make_settings().model_copy(update={"address": 0})
+    return meerstetter._Line("tec", settings)
+
+
+@pytest.fixture
+def tec(script, clock):
+    tec = connect(clock)
+    script.received.clear()
+    return tec
+
+
+@pytest.mark.parametrize(
+    ("sequence", "request_text", "digits", "sent", "replied", "content"),
+    [
+        (0x15AB, "?VR03E801", 8, b"#0015AB?VR03E801C21A\r", b"!0015AB41CD2F28D5C2\r", "41CD2F28"),
+        (0x15B0, "VS0BB80141AE0000", 0, b"#0015B0VS0BB80141AE0000C482\r", b"!0015B0C482\r", ""),
+    ],
+)
+def test_sequences_of_the_maker(script, line, sequence, request_text, digits, sent, replied, content):
+    script.instead = [replied]
+    line._sequence = sequence - 1
+    assert line._exchange(request_text, digits) == content.encode()
+    assert script.received == [sent]
+
+
+def test_server_error_of_the_maker(script, line):
+    script.instead = [b"!0015AC+0532DA\r"]
+    line._sequence = 0x15AB
+    with pytest.raises(meerstetter._RefusedError, match="parameter is not available") as caught:
+        line.ask("?VR04D201", 8)
+    assert caught.value.code == 5
+    assert script.received == [b"#0015AC?VR04D2017BFE\r"]
+
+
+def test_values_of_the_maker():
+    temperature = meerstetter._decode("tec", meerstetter._OBJECT_TEMPERATURE, "41CD2F28")
+    assert temperature == pytest.approx(25.648, abs=5e-5)
+    assert meerstetter._encode(meerstetter._TARGET, 21.75) == "41AE0000"
+
+
+def test_first_frame_of_a_connection_is_whole(script, clock):
+    settings = make_settings()
+    line = meerstetter._Line("tec", settings)
+    line.order("VS07E401BF000000")
+    assert script.received == [b"#010001VS07E401BF000000E796\r"]
+
+
+def test_sequence_number_turns_over(script, line):
+    line._sequence = 0xFFFE
+    for _ in range(3):
+        line.ask("?VR006801", 8)
+    assert [data[3:7] for data in script.received] == [b"FFFF", b"0000", b"0001"]
+
+
+@given(st.floats(width=32, allow_nan=False), st.integers(-(2**31), 2**31 - 1))
+def test_values_survive_coding(real, integer):
+    for parameter, value in ((meerstetter._TARGET, real), (meerstetter._STATUS, integer)):
+        digits = meerstetter._encode(parameter, value)
+        assert len(digits) == 8
+        assert digits == digits.upper()
+        assert meerstetter._decode("tec", parameter, digits) == value
+
+
+def test_identity(tec):
+    assert str(tec.identity) == "Meerstetter Engineering TEC-1091, serial number 4711, firmware 4.12"
+
+
+def test_connecting_configures_and_leaves_the_output_off(script, clock):
+    script.values |= {104: 2, 2010: 2, 50000: 1}
+    connect(clock, mode="current", stable_window=0.05, stable_time=2.0)
+    orders = script.orders()
+    assert orders[0] == "VS006C0100000001"  # saving to flash off, before anything else is written
+    assert script.values[104] == 1
+    expected = {108: 1, 2000: 1, 2010: 0, 2030: 3.0, 2031: 12.0, 2060: 0.0, 6310: 0.0, 50000: 0, 50001: 0.0}
+    assert {number: script.values[number] for number in expected} == expected
+    assert script.values[4040] == pytest.approx(0.05)
+    assert script.values[4041] == 2.0
+
+
+def test_channel_selects_the_instance_of_what_belongs_to_a_channel(script, clock):
+    tec = connect(clock, channel=2)
+    script.received.clear()
+    tec.measure()
+    assert [data[7:-5] for data in script.received] == [
+        b"?VR03E802",
+        b"?VR03E902",
+        b"?VR03FC02",
+        b"?VR03FD02",
+        b"?VR006801",
+    ]
+
+
+def test_temperature_set_point_is_live_and_guarded_by_the_watchdog(script, tec):
+    status = tec.set(40.0)
+    assert script.orders() == [
+        "VSC35C0142200000",  # live target
+        "VSC35B0100000001",  # live target selected
+        "VS080C0140A00000",  # watchdog 5 s
+        "VS07DA0100000002",  # enable by live enable
+        "VSC3500100000001",  # live enable
+    ]
+    assert tec.output_enabled
+    assert not status.update()
+    # Stable still from before, as far as the device has noticed: that is not arriving.
+    script.values[1200] = 2
+    assert not status.update()
+    script.values[1000] = 39.9
+    assert status.update()
+    assert status.success
+    script.received.clear()
+    tec.set(41.0)
+    assert script.orders() == ["VSC35C0142240000"]
+
+
+def test_current_set_point_is_live_and_complete_at_once(script, clock):
+    tec = connect(clock, mode="current")
+    script.received.clear()
+    assert tec.set(-0.5).success
+    assert script.orders()[:2] == ["VSC35101BF000000", "VSC3520141400000"]
+    assert script.orders()[-1] == "VSC3500100000001"
+
+
+def test_polarity_of_the_device(script, clock):
+    script.values[3034] = 0
+    tec = connect(clock, mode="current")
+    tec.set(0.5)
+    assert script.values[50001] == -0.5
+    assert tec.measure()["tec_current"] == -0.25
+    assert tec.measure()["tec_voltage"] == -1.5
+
+
+def test_no_set_point_beyond_the_limits_is_sent(script, tec):
+    for value in (14.9, 90.1, math.nan, math.inf):
+        with pytest.raises(LimitError, match="15 to 90 °C"):
+            tec.set(value)
+    assert script.received == []
+    assert math.isnan(tec.setpoint)
+
+
+def test_output_that_goes_off_by_itself_fails_the_status(script, tec):
+    status = tec.set(40.0)
+    script.values[104] = 1
+    with pytest.raises(DeviceError, match="switched off before it reached 40 °C"):
+        status.wait()
+
+
+def test_change_of_mode_switches_off_first(script, tec):
+    tec.set(40.0)
+    script.received.clear()
+    tec.select_mode(TECMode.TEMPERATURE)
+    assert script.received == []
+    tec.select_mode(TECMode.CURRENT)
+    assert script.orders() == [
+        "VSC3500100000000",
+        "VS07DA0100000000",
+        "VS080C0100000000",
+        "VSC3510100000000",
+        "VS07D00100000001",
+    ]
+    assert math.isnan(tec.setpoint)
+    assert tec.limits.unit == "A"
+
+
+def test_stop_holds_the_present_temperature(script, tec):
+    tec.stop()
+    assert script.orders() == []
+    tec.set(40.0)
+    tec.stop()
+    assert script.values[50012] == tec.setpoint == 25.5
+    script.values[1000] = 10.0
+    tec.stop()
+    assert tec.setpoint == 15.0
+
+
+@pytest.mark.parametrize("number", sorted(DEVICE_ERRORS))
+def test_every_error_of_the_device_is_told_with_advice(script, tec, number):
+    script.values |= {104: 3, 105: number, 106: 1, 107: 1000}
+    text, advice = DEVICE_ERRORS[number]
+    with pytest.raises(DeviceError) as caught:
+        tec.measure()
+    message = str(caught.value)
+    assert message.startswith(f"tec: error {number} ({text}; instance 1, parameter 1000): {advice}, then")
+
+
+def test_error_that_the_driver_does_not_know(script, tec):
+    script.values |= {104: 3, 105: 999}
+    with pytest.raises(DeviceError, match=r"error 999 \(unknown to this driver"):
+        tec.glance()
+
+
+@pytest.mark.parametrize("code", sorted(SERVER_ERRORS))
+def test_every_server_error_is_told(script, tec, code):
+    script.refusals["VSC35C"] = code
+    with pytest.raises(DeviceError) as caught:
+        tec.set(40.0)
+    message = str(caught.value)
+    expected = "tec: refused 40 as its live target object temperature (parameter 50012): "
+    assert message.startswith(expected + SERVER_ERRORS[code])
+    assert ("allowed are" in message) is (code == 7)
+
+
+def test_refused_reading(script, tec):
+    script.refusals["?VR03E8"] = 8
+    with pytest.raises(DeviceError, match=r"object temperature \(parameter 1000\): the instance is not"):
+        tec.measure()
+
+
+@pytest.mark.parametrize(("state", "title"), [(0, "init"), (4, "bootloader"), (5, "reset pending")])
+def test_no_reading_of_a_device_that_is_not_ready(script, tec, state, title):
+    script.values[104] = state
+    with pytest.raises(DeviceError, match=rf"not ready \(device status {state}, {title}\)"):
+        tec.measure()
+
+
+def test_status_beyond_the_protocol_and_values_that_are_no_numbers(script, tec):
+    script.values[104] = 9
+    with pytest.raises(DeviceError, match="device status 9 that the protocol lacks"):
+        tec.measure()
+    script.values |= {104: 1, 1000: math.nan}
+    with pytest.raises(DeviceError, match="not a number"):
+        tec.measure()
+
+
+def test_value_that_is_no_hex_number(script, tec):
+    script.instead = [lambda _sent, right: answer(right[:7] + b"zzzzzzzz")]
+    with pytest.raises(DeviceError, match="answered 'zzzzzzzz' for its object temperature"):
+        tec.measure()
+
+
+def flipped(sent, right):
+    return right[:9] + bytes((right[9] ^ 1,)) + right[10:]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        flipped,
+        lambda _sent, right: right[:-1],
+        lambda _sent, _right: b"\r",
+        lambda _sent, _right: b"noise\r",
+        lambda _sent, right: b"!" + right,
+        lambda _sent, right: b"\x00\xff" + right,
+        lambda sent, _right: sent[:1].replace(b"#", b"!") + sent[1:7] + sent[-5:],  # an acknowledge
+        lambda _sent, right: answer(right[:7] + b"+0Z"),
+        lambda _sent, right: answer(right[:7] + b"00"),
+        lambda _sent, right: answer(b"!02" + right[3:-5]),
+    ],
+)
+def test_a_damaged_answer_costs_a_resend_with_the_same_sequence_number(script, tec, damaged):
+    script.instead = [damaged, damaged]
+    assert tec.measure()["tec_temperature"] == 25.5
+    assert tec.measure()["tec_sink_temperature"] == 24.0
+    assert len(set(script.received[:1])) == 1
+    assert all(data == script.received[0] for data in script.received if data[3:7] == script.received[0][3:7])
+
+
+def test_acknowledge_must_carry_the_crc_of_the_request(script, tec):
+    wrong = lambda _sent, right: right[:7] + b"%04X\r" % crc_hqx(right[:7], 0)  # noqa: E731
+    script.instead = [None, wrong]
+    tec.set(40.0)
+    assert script.received[1] == script.received[2]
+
+
+def test_late_answers_are_passed_over(script, tec):
+    late = answer(b"!01000142C80000")
+    script.instead = [lambda _sent, right: late + right, lambda _sent, right: late * 3 + right]
+    values = tec.measure()
+    assert (values["tec_temperature"], values["tec_sink_temperature"]) == (25.5, 24.0)
+    assert len(script.received) == 5
+
+
+def test_an_answer_that_comes_after_its_resend_is_not_taken_for_the_next(script, tec):
+    script.instead = [b"", lambda _sent, right: right + right]
+    assert tec.measure()["tec_sink_temperature"] == 24.0
+
+
+def test_endless_nonsense_ends(script, tec):
+    script.instead = [b"x" * 3000] * 3
+    with pytest.raises(DeviceConnectionError, match="at emulated://scripted-tec, address 1, after 3 requests"):
+        tec.measure()
+    script.instead = [answer(b"!01000142C80000") * 20] * 3
+    with pytest.raises(DeviceConnectionError, match="only late or damaged answers"):
+        tec.measure()
+
+
+@given(st.lists(st.one_of(st.binary(max_size=40), st.just(b"!010001+05ABCD\r")), min_size=3, max_size=3))
+def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
+    script, clock = Script(), VirtualClock()
+    register("fuzzed-tec", script, clock)
+    try:
+        line = meerstetter._Line("tec", make_settings(port="emulated://fuzzed-tec"))
+        script.instead = list(replies)
+        with pytest.raises(DeviceConnectionError):
+            line.ask("?VR03E801", 8)
+        assert line.ask("?VR03E801", 8) == "41CC0000"
+    finally:
+        unregister("fuzzed-tec")
+
+
+def test_silence_names_port_and_address_and_takes_its_time(script, tec, clock):
+    script.silent = True
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError, match=r"tec: no answer within 0\.2 s at emulated://scripted-tec"):
+        tec.measure()
+    assert len(script.received) == 3
+    assert len(set(script.received)) == 1
+    assert clock.now() - before == pytest.approx(0.6, abs=0.05)
+
+
+def test_device_that_never_answered(script, clock):
+    script.silent = True
+    with pytest.raises(DeviceConnectionError, match="emulated://scripted-tec, address 7"):
+        connect(clock, address=7)
+
+
+@pytest.mark.parametrize("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+def test_port_that_cannot_be_opened(script, clock, port):
+    with pytest.raises(DeviceConnectionError, match=f"tec: cannot open {port}"):
+        connect(clock, port=port)
+
+
+def test_line_that_is_pulled_out(script, tec):
+    unregister("scripted-tec")
+    with pytest.raises(DeviceConnectionError, match="lost the line emulated://scripted-tec"):
+        tec.measure()
+    with pytest.raises(DeviceError, match="does not confirm that its output is off"):
+        tec.safe()
+
+
+def test_wrong_device(script, clock):
+    script.values[100] = 1121
+    with pytest.raises(DeviceConnectionError, match=r"found device type 1121, LDD-1121 v1\.00; check port"):
+        connect(clock)
+    script.refusals["?IF"] = 1
+    with pytest.raises(DeviceConnectionError, match="found device type 1121; check port"):
+        connect(clock)
+    assert script.orders() == []
+
+
+def test_device_with_an_error_is_refused_and_recovered_on_request(script, clock):
+    script.values |= {104: 3, 105: 183}
+    with pytest.raises(DeviceError, match=r"error 183 .*recover"):
+        connect(clock)
+    assert script.orders() == []
+    script.on_order = lambda text: script.values.update({104: 5} if text == "RS" else {})
+    script.values[104] = 3
+    states = [5, 0, 1]
+
+    def later(sent, right):
+        if sent[7:14] == b"?VR0068" and states:
+            script.values[104] = states.pop(0)
+            return script.right_answer(sent)
+        return right
+
+    script.instead = [later] * 100
+    tec = MeerstetterTEC.recover("tec", make_settings(), clock)
+    assert script.orders()[:2] == ["RS", "VS006C0100000001"]
+    assert tec.measure()["tec_temperature"] == 25.5
+
+
+def test_device_that_does_not_come_back_from_a_reset(script, tec):
+    script.on_order = lambda _text: setattr(script, "silent", True)
+    with pytest.raises(DeviceConnectionError, match="no answer"):
+        tec.reset()
+    script.silent = False
+    script.on_order = lambda _text: script.values.update({104: 5})
+    with pytest.raises(DeviceError, match="did not start within 5 s"):
+        tec.reset()
+
+
+def test_settings_beyond_the_device_are_told_by_their_key_and_nothing_is_written(script, clock):
+    for changes, key, allowed in (
+        ({"current_limit": 6.0}, "current_limit: 6", "0 to 4"),
+        ({"voltage_limit": 20.0}, "voltage_limit: 20", "0 to 12"),
+        ({"temperature_limits": (10, 95)}, "temperature_limits: 95", "5 to 90"),
+    ):
+        script.limits |= {2031: (0.0, 12.0), 3000: (5.0, 90.0)}
+        with pytest.raises(ConfigurationError) as caught:
+            connect(clock, **changes)
+        assert key in str(caught.value)
+        assert str(caught.value).endswith(f"TEC-1091 allows, {allowed}")
+    assert script.orders() == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": ""},
+        {"address": 0},
+        {"address": 255},
+        {"channel": 5},
+        {"timeout": 0},
+        {"mode": "power"},
+        {"temperature_limits": (50, 20)},
+        {"temperature_limits": (20, 2000)},
+        {"temperature_limits": (math.nan, 50)},
+        {"current_limit": 0},
+        {"current_limit": 11},
+        {"voltage_limit": 0},
+        {"watchdog": 0.05},
+        {"watchdog": 601},
+        {"speed": 9600},
+    ],
+)
+def test_settings_that_make_no_sense(changes):
+    with pytest.raises(ValidationError):
+        make_settings(**changes)
+
+
+def test_settings_say_what_they_are():
+    for name, field in MeerstetterTEC.Settings.model_fields.items():
+        assert field.description, name
+    assert make_settings().watchdog == 5.0
+    assert make_settings(watchdog=0).watchdog == 0.0
+    assert make_settings(mode="current").mode is TECMode.CURRENT
+
+
+def test_safe_switches_off_both_ways_and_disarms(script, tec):
+    tec.set(40.0)
+    script.received.clear()
+    tec.safe()
+    assert script.orders() == ["VSC3500100000000", "VS07DA0100000000", "VS080C0100000000"]
+    assert not tec.output_enabled
+
+
+@pytest.mark.parametrize("refused", ["VSC350", "VS07DA"])
+def test_safe_goes_on_to_the_emergency_stop(script, tec, refused):
+    tec.set(40.0)
+    script.refusals[refused] = 2
+    script.on_order = lambda text: script.values.update({104: 3, 105: 11} if text == "ES" else {})
+    tec.safe()
+    assert "ES" in script.orders()
+    assert script.values[104] == 3
+
+
+def test_safe_raises_only_after_everything_was_tried(script, tec):
+    tec.set(40.0)
+    script.received.clear()
+    script.refusals |= {"VSC350": 9, "VS07DA": 9, "ES": 1}
+    with pytest.raises(DeviceError, match=r"does not confirm .*general error.*disconnect its power"):
+        tec.safe()
+    assert [data[7:-5][:6] for data in script.received if data[7:8] != b"?"] == [b"VSC350", b"VS07DA", b"ES"]
+
+
+def test_safe_of_a_silent_device_tries_everything(script, tec):
+    script.silent = True
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        tec.safe()
+    assert {data[7:-5][:6] for data in script.received} == {b"VSC350", b"VS07DA", b"ES", b"?VR006"}
+
+
+def test_safe_succeeds_when_only_an_answer_was_lost(script, tec):
+    tec.set(40.0)
+    script.instead = [b"", None, b"", None]
+    tec.safe()
+    assert "ES" not in script.orders()
+
+
+def test_closing_leaves_the_device_alone(script, tec):
+    tec.set(40.0)
+    before = len(script.received)
+    tec.close()
+    assert len(script.received) == before
+    with pytest.raises(DeviceConnectionError):
+        tec.measure()

@@ -1,0 +1,654 @@
+"""The emulated T7: its register map, its converter, its watchdog, its wire, and independent clients."""
+
+import math
+import shutil
+import socket
+import struct
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymodbus.client import ModbusTcpClient
+
+from bench.clock import VirtualClock
+from bench.errors import DeviceError
+from sim_devices.instruments.labjack_t7 import (
+    CONVERSIONS,
+    RAIL,
+    EmulatedPositionSensor,
+    EmulatedT7,
+    NormalisedPSD,
+    TwoCurrentPSD,
+)
+from sim_devices.wire.modbus_tcp import (
+    FramingError,
+    ModbusTcpServer,
+    ModbusTcpStream,
+    RegisterError,
+    answer,
+)
+from sim_devices.world import World
+
+LSB = 2 * RAIL * 10 / 65536
+
+
+class Ramp:
+    """A plant that counts its own time."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def advance(self, dt: float) -> None:
+        self.time += dt
+
+
+class Quiet:
+    """A generator without noise, for exact vectors."""
+
+    def standard_normal(self) -> float:
+        return 0.0
+
+
+def make(inputs: dict[int, Callable[[], float]] | None = None, *, seed: int | None = None) -> EmulatedT7:
+    rng = Quiet() if seed is None else np.random.default_rng(seed)
+    return EmulatedT7(World(Ramp(), VirtualClock()), inputs or {}, rng=rng)
+
+
+@pytest.fixture
+def t7() -> EmulatedT7:
+    return make()
+
+
+def frame(text: str) -> bytes:
+    return bytes.fromhex(text)
+
+
+# The register map
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        (55100, [0x0011, 0x2233]),
+        (55124, [0xC61C, 0x3C00]),
+        (60000, [0x40E0, 0x0000]),
+        (60004, list(struct.unpack(">2H", struct.pack(">f", 1.03)))),
+        (60028, [470012345 >> 16, 470012345 & 0xFFFF]),
+        (40000, [0x4120, 0x0000]),
+        (41000, [199]),
+        (9300, [0, 200]),
+        (10200, [0x45BB, 0x8000]),
+        (61600, [0, 0]),
+    ],
+)
+def test_what_registers_read_after_power_up(t7, address, words):
+    assert t7.read_registers(address, len(words)) == words
+
+
+def test_reads_may_span_values_and_begin_in_the_middle_of_one(t7):
+    whole = t7.read_registers(40000, 4)
+    assert t7.read_registers(40001, 2) == whole[1:3]
+    assert t7.read_registers(55101, 1) == [0x2233]
+
+
+@pytest.mark.parametrize("address", [28, 1004, 9028, 41014, 55102, 61616, 65535])
+def test_what_is_not_emulated_is_an_illegal_address(t7, address):
+    with pytest.raises(RegisterError) as refused:
+        t7.read_registers(address, 1)
+    assert refused.value.code == 2
+    with pytest.raises(RegisterError) as refused:
+        t7.write_registers(address, [0])
+    assert refused.value.code == 2
+
+
+def test_read_only_and_write_only(t7):
+    for call in (lambda: t7.write_value(0, 1.0), lambda: t7.read_value(30000), lambda: t7.read_value(61614)):
+        with pytest.raises(RegisterError) as refused:
+            call()
+        assert refused.value.code == 2
+
+
+@pytest.mark.parametrize(("address", "values"), [(1000, [0]), (1001, [0]), (1000, [0, 0, 0]), (40001, [0, 0])])
+def test_half_a_value_cannot_be_written(t7, address, values):
+    with pytest.raises(RegisterError) as refused:
+        t7.write_registers(address, values)
+    assert refused.value.code == 3
+
+
+def test_no_number_cannot_be_written(t7):
+    with pytest.raises(RegisterError) as refused:
+        t7.write_registers(1000, [0x7FC0, 0])
+    assert refused.value.code == 3
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "detail"),
+    [
+        (40006, 5.0, 2370),
+        (40006, -10.0, 2370),
+        (42006, 60_000.0, 2371),
+        (4008, 5000.0, 2371),
+        (41003, 4, 2373),
+        (41002, 2, 2373),
+        (41503, 9, 2375),
+        (4010, 9, 2375),
+    ],
+)
+def test_refused_settings_leave_a_detail(t7, address, value, detail):
+    before = t7.read_value(address)
+    with pytest.raises(RegisterError) as refused:
+        t7.write_value(address, value)
+    assert refused.value.code == 4
+    assert t7.read_value(55000) == detail
+    assert t7.read_value(address) == before
+    with pytest.raises(RegisterError):
+        t7.read_registers(50000, 1)
+    assert t7.read_value(55000) == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "value"),
+    [(9000, 1), (9300, 0), (9300, 16385), (10200, 0.0), (61600, 2), (61600, 1)],
+)
+def test_other_refused_settings(t7, address, value):
+    with pytest.raises(RegisterError) as refused:
+        t7.write_value(address, value)
+    assert refused.value.code == 4
+
+
+@pytest.mark.parametrize(("written", "read"), [(10, 10), (1, 1), (0.1, 0.1), (0.01, 0.01), (0, 10)])
+def test_ranges(t7, written, read):
+    t7.write_value(40026, written)
+    assert t7.read_value(40026) == pytest.approx(read, rel=1e-6)
+
+
+def test_inputs_that_do_not_exist():
+    with pytest.raises(ValueError, match="0 to 13"):
+        make({14: lambda: 0.0})
+
+
+def test_outputs(t7):
+    for volts, kept in ((2.5, 2.5), (7.0, 5.0), (-1.0, 0.0)):
+        t7.write_value(1002, volts)
+        assert t7.read_value(1002) == t7.dac_volts(1) == kept
+    t7.write_value(30004, -12.0)
+    assert t7.tdac_volts(2) == -10.0
+
+
+def test_digital_lines(t7):
+    assert t7.dio_level(3)
+    t7.write_value(2003, 0)
+    assert not t7.dio_level(3)
+    assert t7.read_value(2003) == 0
+    assert t7.read_value(2850) == 0b1000
+    t7.write_value(2900, 0b1000)
+    t7.write_value(2800, 0b1010)
+    assert t7.read_value(2800) == 0b0010
+
+
+# The converter
+
+
+def test_quantisation_at_index_1():
+    volts = 0.0
+    t7 = make({0: lambda: volts})
+    t7.write_value(41500, 1)
+    seen = set()
+    for volts in np.linspace(0.0, 10 * LSB, 1001):
+        reading = t7.convert(0)
+        assert abs(reading - volts) <= LSB / 2 + 1e-12
+        seen.add(round(reading / LSB, 6))
+    assert seen == set(range(11))
+
+
+@pytest.mark.parametrize("span", [10.0, 1.0, 0.1, 0.01])
+def test_clipping(span):
+    volts = 0.0
+    t7 = make({0: lambda: volts})
+    t7.write_value(40000, span)
+    for volts in (1.05 * span, -1.05 * span):
+        assert t7.convert(0) == pytest.approx(volts, abs=2 * RAIL * span / 65536)
+    volts = 100.0
+    assert t7.convert(0) == pytest.approx(1.06 * span, rel=1e-4)
+    volts = -100.0
+    assert t7.convert(0) == pytest.approx(-1.06 * span)
+
+
+def test_an_input_that_is_not_connected_is_grounded(t7):
+    assert t7.convert(13) == 0.0
+
+
+def test_differential():
+    t7 = make({2: lambda: 3.0, 3: lambda: 1.0})
+    t7.write_value(41002, 3)
+    assert t7.convert(2) == pytest.approx(2.0, abs=LSB)
+
+
+@pytest.mark.parametrize("index", range(9))
+def test_noise_by_resolution_index(index):
+    t7 = make({0: lambda: 1.2345}, seed=11)
+    t7.write_value(41500, index)
+    conversions = CONVERSIONS[(index or 8) - 1]
+    readings = [t7.convert(0) for _ in range(2000)]
+    quantisation = LSB / conversions / math.sqrt(12)
+    assert np.std(readings) == pytest.approx(math.hypot(LSB / math.sqrt(conversions), quantisation), rel=0.07)
+    assert np.mean(readings) == pytest.approx(1.2345, abs=4 * LSB / math.sqrt(2000))
+
+
+def test_effective_resolution_is_that_of_the_datasheet():
+    bits = [math.log2(2 * RAIL * 10 / (LSB / math.sqrt(each))) for each in CONVERSIONS]
+    assert bits == pytest.approx(np.linspace(16, 19, 8), abs=0.1)
+
+
+def test_a_burst_lets_time_pass_and_averages_over_it():
+    world = World(Ramp(), VirtualClock())
+    t7 = EmulatedT7(world, {0: lambda: world._plant.time}, rng=Quiet())
+    t7.write_value(9000, 3)
+    t7.write_value(9300, 4)
+    t7.write_value(10200, 100.0)
+    world.clock.sleep(1.0)
+    assert t7.read_value(7000) == pytest.approx(1.025, abs=LSB)
+    assert world.clock.now() == pytest.approx(1.04)
+    assert t7.read_value(7300) == pytest.approx(1.04, abs=LSB)
+    assert t7.read_value(7600) == pytest.approx(1.01, abs=LSB)
+    assert world.clock.now() == pytest.approx(1.04)  # only the average starts a burst
+
+
+def test_a_burst_has_the_noise_of_its_stream_index():
+    t7 = make({0: lambda: 0.0}, seed=5)
+    t7.write_value(41500, 8)
+    t7.write_value(9000, 3)
+    t7.write_value(9300, 1)
+    fast = np.std([t7.burst(0).average for _ in range(1000)])
+    t7.write_value(4010, 8)
+    fine = np.std([t7.burst(0).average for _ in range(1000)])
+    assert fast == pytest.approx(LSB * math.hypot(1, 1 / math.sqrt(12)), rel=0.1)
+    assert fine == pytest.approx(LSB / 8, rel=0.1)
+
+
+def test_bursts_that_cannot_be(t7):
+    with pytest.raises(RegisterError, match="EF_INDEX"):
+        t7.read_value(7000)
+    t7.write_value(9000, 3)
+    t7.write_value(10200, 1000.0)
+    with pytest.raises(RegisterError, match="too long"):
+        t7.read_value(7000)
+
+
+# The watchdog
+
+
+def arm(t7: EmulatedT7, *, strict: bool = False, timeout: int = 2) -> None:
+    for address, value in (
+        (61600, 0),
+        (61604, timeout),
+        (61610, int(strict)),
+        (61612, 0xCAFE1234),
+        (61640, 1),
+        (61642, 0.5),
+        (61630, 1),
+        (61632, 0),
+        (61634, 0b11),
+        (61636, 0b10),
+        (61600, 1),
+    ):
+        t7.write_value(address, value)
+
+
+def test_watchdog_expires_at_its_instant():
+    t7 = make()
+    clock = t7.world.clock
+    arm(t7)
+    t7.write_value(1000, 4.0)
+    t7.write_value(1002, 3.0)
+    t7.write_value(2000, 1)
+    assert t7.deadline() == 2.0
+    clock.sleep_until(math.nextafter(2.0, 0.0))
+    t7.world.advance()
+    assert t7.dac_volts(0) == 4.0
+    assert not t7.watchdog_expired
+    clock.sleep_until(2.0)
+    t7.world.advance()
+    assert t7.dac_volts(0) == 0.5
+    assert t7.dac_volts(1) == 3.0  # not enabled
+    assert not t7.dio_level(0)
+    assert t7.dio_level(1)  # inhibited
+    assert t7.watchdog_expired
+    assert t7.deadline() == math.inf
+
+
+def test_the_plant_stands_at_the_instant_of_expiry():
+    seen = []
+    t7 = make()
+    arm(t7)
+    plant = t7.world._plant
+    expire = t7.expire
+    t7.expire = lambda: (seen.append(plant.time), expire())
+    t7.world.clock.sleep(100.0)
+    assert t7.read_value(1000) == 0.5
+    assert seen == [2.0]
+    assert plant.time == 100.0
+
+
+@pytest.mark.parametrize("access", ["read", "write", "refused"])
+def test_any_communication_feeds(access):
+    t7 = make()
+    arm(t7)
+    for _ in range(10):
+        t7.world.clock.sleep(1.5)
+        if access == "read":
+            t7.read_registers(0, 1)
+        elif access == "write":
+            t7.write_value(1002, 1.0)
+        else:
+            with pytest.raises(RegisterError):
+                t7.read_registers(50000, 1)
+    assert not t7.watchdog_expired
+    assert t7.deadline() == 17.0
+
+
+def test_strict_is_fed_by_the_key_only():
+    t7 = make()
+    arm(t7, strict=True)
+    for _ in range(4):
+        t7.world.clock.sleep(1.5)
+        t7.write_value(61614, 0xCAFE1234)
+    assert t7.deadline() == 8.0
+    t7.world.clock.sleep(1.5)
+    t7.read_value(0)
+    t7.write_value(61614, 1)
+    assert t7.deadline() == 8.0
+    t7.world.clock.sleep(0.5)
+    t7.world.advance()
+    assert t7.watchdog_expired
+
+
+def test_strict_goes_on_after_it_expired():
+    t7 = make()
+    arm(t7, strict=True)
+    t7.world.clock.sleep(5.0)
+    t7.write_value(1000, 4.0)  # lasts until the next timeout, which is at 6 s
+    assert t7.dac_volts(0) == 4.0
+    assert t7.deadline() == 6.0
+    t7.world.clock.sleep_until(6.0)
+    t7.world.advance()
+    assert t7.dac_volts(0) == 0.5
+
+
+def test_watchdog_is_set_up_while_disabled_only(t7):
+    arm(t7)
+    for address in (61604, 61610, 61612, 61630, 61632, 61634, 61636, 61640, 61642, 61650, 61652):
+        with pytest.raises(RegisterError) as refused:
+            t7.write_value(address, 1)
+        assert refused.value.code == 4
+    t7.write_value(61600, 0)
+    assert t7.deadline() == math.inf
+    t7.write_value(61604, 7)
+    assert t7.read_value(61604) == 7
+
+
+# The transducers
+
+
+def test_normalised_psd():
+    deflection = 20e-6
+    psd = NormalisedPSD(lambda: deflection, 1e5, 5e-3, rng=np.random.default_rng(2))
+    volts = [psd() for _ in range(2000)]
+    assert np.mean(volts) == pytest.approx(2.0, abs=5e-4)
+    assert np.std(volts) == pytest.approx(5e-3, rel=0.06)
+    deflection = 1e-3
+    assert psd() == 10.0
+    deflection = -1e-3
+    assert psd() == -10.0
+
+
+def test_two_current_psd():
+    deflection = 0.0
+    psd = TwoCurrentPSD(lambda: deflection, noise_volts=0.0, rng=np.random.default_rng(2))
+    for deflection in (-50e-6, 0.0, 70e-6):
+        first, second = psd.first(), psd.second()
+        assert first + second == pytest.approx(8.0)
+        spot = 0.037 / 2 * (second - first) / (first + second)
+        assert spot / 185.0 == pytest.approx(deflection, abs=1e-12)
+    deflection = 101e-6
+    assert psd.first() == psd.second() == 0.0
+    deflection = 0.0
+    psd.light = 0.25
+    assert psd.first() + psd.second() == pytest.approx(2.0)
+
+
+def test_emulated_sensor_refuses_a_wrong_number_of_channels(t7):
+    with pytest.raises(ValueError, match="currents needs 2, got 1"):
+        EmulatedPositionSensor("tip", t7, readout="currents", channels=(0,))
+
+
+def test_emulated_sensor_passes_a_refusal_on(t7):
+    sensor = EmulatedPositionSensor("tip", t7)
+    t7.write_value(9000, 0)
+    with pytest.raises(DeviceError, match="tip: the instrument refuses"):
+        sensor.measure()
+
+
+# The wire
+
+
+VECTORS = [
+    ("0001 0000 0006 01 03 d73c 0002", "0001 0000 0007 01 03 04 0011 2233"),  # TEST
+    ("0002 0000 0006 01 04 d754 0002", "0002 0000 0007 01 04 04 c61c 3c00"),  # TEST_FLOAT32, function 4
+    ("0003 0000 0006 ff 03 0000 0002", "0003 0000 0007 ff 03 04 401f fe66"),  # AIN0 at 2.5 V, any unit
+    ("0004 0000 000b 01 10 9c40 0002 04 3dcc cccd", "0004 0000 0006 01 10 9c40 0002"),  # AIN0_RANGE 0.1
+    ("0005 0000 0006 01 06 a21c 0008", "0005 0000 0006 01 06 a21c 0008"),  # AIN0_RESOLUTION_INDEX 8
+    ("0006 0000 000b 01 10 9c40 0002 04 40a0 0000", "0006 0000 0003 01 90 04"),  # range 5 V: device failure
+    ("0007 0000 0006 01 03 d6d8 0001", "0007 0000 0005 01 03 02 0942"),  # LAST_ERR_DETAIL 2370
+    ("0008 0000 0002 01 2b", "0008 0000 0003 01 ab 01"),  # illegal function
+    ("0009 0000 0006 01 03 ffff 0002", "0009 0000 0003 01 83 02"),  # beyond the last address
+    ("000a 0000 0006 01 03 0000 007e", "000a 0000 0003 01 83 03"),  # 126 registers
+    ("000b 0000 0006 01 03 0000 0000", "000b 0000 0003 01 83 03"),  # none
+    ("000c 0000 0003 01 03 00", "000c 0000 0003 01 83 03"),  # too short
+    ("000d 0000 0009 01 10 9c40 0002 04 0000", "000d 0000 0003 01 90 03"),  # count and data disagree
+    ("000e 0000 0007 01 06 a21c 0008 00", "000e 0000 0003 01 86 03"),  # too long
+]
+
+
+@pytest.fixture
+def wired() -> EmulatedT7:
+    t7 = make({0: lambda: 2.5})
+    t7.write_value(41500, 1)
+    return t7
+
+
+def test_byte_vectors(wired):
+    stream = ModbusTcpStream(wired)
+    for sent, reply in VECTORS:
+        assert stream.receive(frame(sent)).hex(" ") == frame(reply).hex(" ")
+
+
+def test_the_vector_of_ain0_is_its_nearest_code(wired):
+    assert struct.unpack(">f", frame("401ffe66"))[0] == pytest.approx(round(2.5 / LSB) * LSB, rel=1e-7)
+
+
+@given(cuts=st.lists(st.integers(0, 200), max_size=20))
+def test_requests_may_come_in_any_pieces(cuts):
+    t7 = make({0: lambda: 2.5})
+    t7.write_value(41500, 1)
+    stream = ModbusTcpStream(t7)
+    data = b"".join(frame(sent) for sent, _ in VECTORS)
+    edges = sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})
+    replies = b"".join(stream.receive(data[a:b]) for a, b in pairwise(edges))
+    assert replies == b"".join(frame(reply) for _, reply in VECTORS)
+
+
+@given(st.binary(min_size=1, max_size=253))
+def test_any_request_is_answered(request_bytes):
+    reply = answer(make(), request_bytes)
+    assert reply[0] in (request_bytes[0], request_bytes[0] | 0x80)
+    if reply[0] != request_bytes[0]:
+        assert reply[1] in (1, 2, 3, 4)
+
+
+@given(st.lists(st.binary(max_size=40), max_size=10))
+def test_any_bytes_are_answered_or_end_the_connection(pieces):
+    stream = ModbusTcpStream(make())
+    try:
+        for piece in pieces:
+            stream.receive(piece)
+    except FramingError:
+        pass
+
+
+@pytest.mark.parametrize("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 00ff 01"])
+def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
+    with ModbusTcpServer(wired) as server:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as spoilt:
+            spoilt.sendall(frame(bad))
+            assert spoilt.recv(100) == b""
+        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as client:
+            client.sendall(frame(VECTORS[0][0]))
+            assert client.recv(100) == frame(VECTORS[0][1])
+
+
+def test_several_requests_in_one_segment(wired):
+    with (
+        ModbusTcpServer(wired) as server,
+        socket.create_connection(("127.0.0.1", server.port), timeout=5) as client,
+    ):
+        client.sendall(b"".join(frame(sent) for sent, _ in VECTORS))
+        expected = b"".join(frame(reply) for _, reply in VECTORS)
+        received = b""
+        while len(received) < len(expected):
+            received += client.recv(4096)
+        assert received == expected
+
+
+def test_many_clients_at_once(wired):
+    failures = []
+
+    def ask(port: int) -> None:
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+            for sent, reply in VECTORS[:2] * 50:
+                client.sendall(frame(sent))
+                if client.recv(100) != frame(reply):
+                    failures.append(sent)
+
+    with ModbusTcpServer(wired) as server:
+        threads = [threading.Thread(target=ask, args=(server.port,)) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert not failures
+
+
+def test_start_and_close_leave_nothing(wired):
+    before = threading.active_count()
+    server = ModbusTcpServer(wired)
+    assert server.address == "tcp://127.0.0.1:0"
+    server.close()
+    for _ in range(20):
+        server.start()
+        with pytest.raises(RuntimeError, match="already"):
+            server.start()
+        client = socket.create_connection(("127.0.0.1", server.port), timeout=5)
+        client.sendall(frame(VECTORS[0][0]))
+        assert client.recv(100) == frame(VECTORS[0][1])
+        server.close()
+        server.close()
+        assert client.recv(1) == b""
+        client.close()
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection(("127.0.0.1", server.port), timeout=5)
+    assert threading.active_count() == before
+
+
+def test_a_client_that_resets_its_connection_ends_alone(wired):
+    with ModbusTcpServer(wired) as server:
+        for _ in range(5):
+            client = socket.create_connection(("127.0.0.1", server.port), timeout=5)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            client.sendall(frame(VECTORS[0][0]))
+            client.close()
+        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as client:
+            client.sendall(frame(VECTORS[0][0]))
+            assert client.recv(100) == frame(VECTORS[0][1])
+
+
+def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
+    def broken() -> float:
+        raise ZeroDivisionError
+
+    t7 = make({0: broken})
+    assert answer(t7, frame("03 0000 0002")) == frame("83 04")
+    assert "the emulated instrument failed on request 03 00 00 00 02" in caplog.text
+
+
+# Independent clients
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[EmulatedT7, ModbusTcpServer]]:
+    t7 = make({0: lambda: 2.5, 1: lambda: -0.75})
+    with ModbusTcpServer(t7) as server:
+        yield t7, server
+
+
+def test_pymodbus_as_it_is(served):
+    t7, server = served
+    client = ModbusTcpClient("127.0.0.1", port=server.port, timeout=5, retries=0)
+    assert client.connect()
+    try:
+        both = client.read_input_registers(0, count=4, device_id=1)
+        volts = client.convert_from_registers(both.registers, client.DATATYPE.FLOAT32)
+        assert volts == pytest.approx([2.5, -0.75], abs=LSB)
+        words = client.convert_to_registers(3.25, client.DATATYPE.FLOAT32)
+        assert not client.write_registers(1000, words, device_id=9).isError()
+        assert t7.dac_volts(0) == 3.25
+        assert not client.write_register(41500, 3, device_id=0).isError()
+        refused = client.write_register(41500, 13, device_id=1)
+        assert (refused.isError(), refused.exception_code) == (True, 4)
+        assert client.read_holding_registers(55000, count=1, device_id=1).registers == [2375]
+        assert client.read_coils(0, count=1, device_id=1).exception_code == 1
+    finally:
+        client.close()
+
+
+def mbpoll(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = ["mbpoll", "-m", "tcp", "-p", str(port), "-a", "1", "-0", "-1", "-q", "-o", "5"]
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30, check=False)
+
+
+needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")
+
+
+@needs_mbpoll
+def test_mbpoll_reads(served):
+    _, server = served
+    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "0", "-c", "2", "127.0.0.1")
+    assert result.returncode == 0, result.stderr
+    values = [float(line.split()[-1]) for line in result.stdout.splitlines() if line.startswith("[")]
+    assert values == pytest.approx([2.5, -0.75], abs=LSB)
+    result = mbpoll(server.port, "-t", "4:hex", "-r", "55100", "-c", "2", "127.0.0.1")
+    assert [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")] == [
+        "0x0011",
+        "0x2233",
+    ]
+
+
+@needs_mbpoll
+def test_mbpoll_writes(served):
+    t7, server = served
+    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "1002", "127.0.0.1", "1.5")
+    assert result.returncode == 0, result.stderr
+    assert t7.dac_volts(1) == 1.5
+
+
+@needs_mbpoll
+def test_mbpoll_is_refused(served):
+    _, server = served
+    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "40000", "127.0.0.1", "5.0")
+    assert result.returncode != 0
+    assert "failure" in result.stderr.lower()

@@ -1,0 +1,297 @@
+"""The MeCom server: the maker's byte sequences, framing, and input that makes no sense."""
+
+import struct
+from binascii import crc_hqx
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from bench.clock import VirtualClock
+from sim_devices.instruments.meerstetter_tec import PARAMETERS, DeviceStatus, EmulatedTEC
+from sim_devices.wire.mecom import LONGEST_FRAME, MeComServer
+from sim_devices.world import World
+
+
+class Block:
+    """A block of metal at one temperature; whatever the output does, it is too large to change."""
+
+    plate_temperature = struct.unpack(">f", bytes.fromhex("41CD2F28"))[0]
+    sink_temperature = 22.0
+    current = -0.5
+    voltage = -1.25
+
+    def regulate(self, target_celsius, current_limit=4.0):
+        pass
+
+    def drive(self, current_ampere):
+        pass
+
+    def release(self):
+        pass
+
+    def advance(self, dt):
+        pass
+
+
+def make_server():
+    block = Block()
+    device = EmulatedTEC("tec", World(block, VirtualClock()), block)
+    return MeComServer(device), device
+
+
+@pytest.fixture
+def server():
+    return make_server()[0]
+
+
+@pytest.fixture
+def pair():
+    return make_server()
+
+
+def frame(payload, address=1, sequence=1):
+    body = b"#%02X%04X" % (address, sequence) + payload
+    return body + b"%04X\r" % crc_hqx(body, 0)
+
+
+def content(answer):
+    """Return the payload of one answer, after checking all that is around it."""
+    assert answer[:1] == b"!"
+    assert answer[-1:] == b"\r"
+    assert int(answer[-5:-1], 16) == crc_hqx(answer[:-5], 0)
+    return answer[7:-5]
+
+
+@pytest.mark.parametrize(
+    ("sent", "replied"),
+    [
+        # Meerstetter 5117: a value, an acknowledge, a server error.
+        (b"#0015AB?VR03E801C21A\r", b"!0015AB41CD2F28D5C2\r"),
+        (b"#0015B0VS0BB80141AE0000C482\r", b"!0015B0C482\r"),
+        (b"#0015AC?VR04D2017BFE\r", b"!0015AC+0532DA\r"),
+        (b"#010001VS07E401BF000000E796\r", b"!010001E796\r"),
+    ],
+)
+def test_sequences_of_the_maker(server, sent, replied):
+    assert server.receive(sent) == replied
+
+
+def test_values_of_the_maker_arrive(pair):
+    server, device = pair
+    server.receive(b"#0015B0VS0BB80141AE0000C482\r#010001VS07E401BF000000E796\r")
+    assert device.read_parameter(3000) == 21.75
+    assert device.read_parameter(2020) == -0.5
+
+
+def test_integers_are_twos_complement(pair):
+    server, device = pair
+    assert server.receive(frame(b"VS18B001FFFFFFFF")) == b"!010001" + frame(b"VS18B001FFFFFFFF")[-5:]
+    assert device.read_parameter(6320) == -1
+    assert content(server.receive(frame(b"?VR18B001", sequence=2))) == b"FFFFFFFF"
+
+
+def test_limits_and_metadata(server):
+    real = [struct.pack(">f", value).hex().upper().encode() for value in (0.0, 4.0)]
+    assert content(server.receive(frame(b"?VL07EE01"))) == b"00" + real[0] + real[1]
+    assert content(server.receive(frame(b"?VM07EE01", sequence=2))) == (
+        b"00" + b"03" + b"01" + b"00000001" + real[0] + real[1] + real[1]
+    )
+    assert content(server.receive(frame(b"?VM006801", sequence=3))) == (
+        b"01" + b"01" + b"01" + b"00000001" + b"00000000" + b"7FFFFFFF" + b"00000001"
+    )
+
+
+def test_identification_is_twenty_characters(server):
+    assert content(server.receive(frame(b"?IF"))) == b"TEC-1091 v4.10".ljust(20)
+
+
+def test_emergency_stop_and_reset(pair):
+    server, device = pair
+    stop = frame(b"ES")
+    assert server.receive(stop) == b"!010001" + stop[-5:]
+    assert device.status is DeviceStatus.ERROR
+    reset = frame(b"RS", sequence=2)
+    assert server.receive(reset) == b"!010002" + reset[-5:]
+    assert device.status is DeviceStatus.RESET_PENDING
+    assert content(server.receive(frame(b"?VR006801", sequence=3))) == b"00000005"
+
+
+def test_change_of_speed_is_acknowledged(server):
+    change = frame(b"CS0001C200")
+    assert server.receive(change) == b"!010001" + change[-5:]
+
+
+@pytest.mark.parametrize(
+    ("payload", "error"),
+    [
+        (b"?XX", b"+01"),
+        (b"", b"+01"),
+        (b"?", b"+01"),
+        (b"?VR", b"+04"),
+        (b"?VR03E8", b"+04"),
+        (b"?VR03E80101", b"+04"),
+        (b"?VR03e801", b"+04"),
+        (b"?VR 3E801", b"+04"),
+        (b"VS18B001-0000001", b"+04"),
+        (b"VS0BB80141AE", b"+04"),
+        (b"?IFX", b"+04"),
+        (b"ES1", b"+04"),
+        (b"CS", b"+04"),
+        (b"?VR04D201", b"+05"),
+        (b"VS03E80141AE0000", b"+06"),
+        (b"VS0BB8017FC00000", b"+07"),
+        (b"VS0BB8017F800000", b"+07"),
+        (b"VS07DA0100000004", b"+07"),
+        (b"VS080C013D4CCCCD", b"+07"),
+        (b"?VR03E802", b"+08"),
+        (b"?VR03E800", b"+08"),
+        (b"?VR\xff\xfe3E801", b"+04"),
+    ],
+)
+def test_refusals(server, payload, error):
+    assert content(server.receive(frame(payload))) == error
+
+
+def test_answers_to_its_address_and_to_all_and_to_nobody_else(pair):
+    server, device = pair
+    assert server.receive(frame(b"?VR03E801", address=0))[:3] == b"!00"
+    assert server.receive(frame(b"?VR03E801", address=2)) == b""
+    assert server.receive(frame(b"VS0BB80141F00000", address=255)) == b""
+    assert device.read_parameter(3000) == 30.0
+    device.write_parameter(2051, 2)
+    assert server.receive(frame(b"?VR03E801", address=2))[:3] == b"!02"
+    assert server.receive(frame(b"?VR03E801", address=1)) == b""
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        b"#010001VS0BB80141F00000FFFF\r",
+        b"#010001\r",
+        b"\r\r",
+        b"hello\r",
+        frame(b"VS0BB80141F00000")[1:],
+        b"!" + frame(b"VS0BB80141F00000")[1:],
+        frame(b"VS0BB80141F00000").lower(),
+    ],
+)
+def test_what_no_crc_vouches_for_is_dropped_in_silence(pair, spoilt):
+    server, device = pair
+    assert server.receive(spoilt) == b""
+    assert device.read_parameter(3000) == 25.0
+    assert server.receive(frame(b"?VR03E801")) != b""
+
+
+def test_a_new_start_sign_begins_a_new_frame(server):
+    assert server.receive(b"#0100" + frame(b"?VR006801"))[7:15] == b"00000001"
+    assert server.receive(b"noise" + frame(b"?VR006801", sequence=2))[7:15] == b"00000001"
+
+
+def test_the_same_request_again_is_answered_and_not_acted_on(pair):
+    server, device = pair
+    first = server.receive(frame(b"VS0BB80141F00000"))
+    device.write_parameter(3000, 50.0)
+    assert server.receive(frame(b"VS0BB80141F00000")) == first
+    assert device.read_parameter(3000) == 50.0
+    server.receive(frame(b"VS0BB80141F00000", sequence=2))
+    assert device.read_parameter(3000) == 30.0
+
+
+def test_the_watchdog_is_fed_by_requests_to_the_device_alone():
+    block, clock = Block(), VirtualClock()
+    device = EmulatedTEC("tec", World(block, clock), block)
+    server = MeComServer(device)
+    device.write_parameter(2060, 1.0)
+    for _ in range(3):
+        clock.sleep(0.8)
+        server.receive(frame(b"?VR006801"))
+    assert device.status is DeviceStatus.READY
+    for _ in range(3):
+        clock.sleep(0.8)
+        server.receive(frame(b"?VR006801", address=9))
+    assert device.status is DeviceStatus.ERROR
+
+
+def test_faults_of_the_line(pair):
+    server, device = pair
+    good = server.receive(frame(b"?VR006801"))
+    device.corrupt_next_answer()
+    bad = server.receive(frame(b"?VR006801"))
+    assert len(bad) == len(good)
+    assert sum(a != b for a, b in zip(good, bad, strict=True)) == 1
+    assert server.receive(frame(b"?VR006801")) == good
+    device.drop_next_answer()
+    assert server.receive(frame(b"VS0BB80141F00000", sequence=2)) == b""
+    assert device.read_parameter(3000) == 30.0
+    device.unplug()
+    assert server.receive(frame(b"VS0BB80141AE0000", sequence=3)) == b""
+    device.plug_in()
+    assert device.read_parameter(3000) == 30.0
+
+
+def test_every_parameter_goes_over_the_wire_and_back(pair):
+    server, device = pair
+    device.write_parameter(108, 1)
+    for sequence, (number, row) in enumerate(PARAMETERS.items(), start=1):
+        answer = content(server.receive(frame(b"?VR%04X01" % number, sequence=2 * sequence)))
+        kind = ">i" if row.kind == "INT32" else ">f"
+        assert struct.unpack(kind, bytes.fromhex(answer.decode()))[0] == device.read_parameter(number)
+        if row.writable and number != 2051:
+            write = frame(b"VS%04X01" % number + answer, sequence=2 * sequence + 1)
+            assert server.receive(write) == b"!" + write[1:7] + write[-5:]
+
+
+payloads = st.one_of(
+    st.binary(max_size=40),
+    st.from_regex(rb"(\?V[RLMBX]|VS|ES|RS|CS|\?IF)[0-9A-F+-]{0,20}", fullmatch=True),
+    st.builds(
+        lambda number, bits: b"VS%04X01%08X" % (number, bits),
+        st.sampled_from(sorted(PARAMETERS)),
+        st.integers(0, 2**32 - 1),
+    ),
+)
+chunks = st.one_of(
+    st.binary(max_size=200),
+    st.builds(frame, payloads, st.sampled_from([0, 1, 2, 255]), st.integers(0, 0xFFFF)),
+    st.just(b"#" * 700),
+)
+
+
+@given(st.lists(chunks, max_size=12))
+@example([b"#0" * 400, b"\r"])
+@example([b"#" + b"0" * 600, b"00\r"])
+def test_any_bytes_do_no_harm(stream):
+    server, device = make_server()
+    for chunk in stream:
+        for answer in server.receive(chunk).split(b"\r")[:-1]:
+            assert answer.startswith(b"!")
+        assert len(server._received) <= LONGEST_FRAME
+    device.write_parameter(2051, 1)
+    if server.receive(b"\r" + frame(b"?VR03E801", sequence=0)) == b"":
+        pytest.fail("the server no longer answers")
+
+
+@given(st.lists(payloads, min_size=1, max_size=5), st.data())
+def test_how_the_bytes_are_split_does_not_matter(requests, data):
+    whole, _ = make_server()
+    pieces, _ = make_server()
+    stream = b"".join(frame(each.replace(b"\r", b""), sequence=i) for i, each in enumerate(requests))
+    answers, position = b"", 0
+    while position < len(stream):
+        step = data.draw(st.integers(1, 30))
+        answers += pieces.receive(stream[position : position + step])
+        position += step
+    assert answers == whole.receive(stream)
+
+
+@given(st.sampled_from([n for n, row in PARAMETERS.items() if row.writable]), st.integers(0, 2**32 - 1))
+def test_a_value_is_taken_and_kept_or_refused(number, bits):
+    server, _ = make_server()
+    write = frame(b"VS%04X01%08X" % (number, bits))
+    answer = server.receive(write)
+    if answer == b"!010001" + write[-5:]:
+        if number != 2051:
+            assert content(server.receive(frame(b"?VR%04X01" % number, sequence=2))) == b"%08X" % bits
+    else:
+        assert content(answer) == b"+07"
