@@ -14,9 +14,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
-import click
 import typer
 from rich.console import Console
+from rich.markdown import Markdown
 from rich.table import Table
 
 from bench.errors import BenchError, ConfigurationError
@@ -35,7 +35,7 @@ app = typer.Typer(
     epilog=_EPILOG,
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
 console = Console()
@@ -114,6 +114,7 @@ def list_(
 
 @app.command(add_help_option=False)
 def run(
+    context: typer.Context,
     protocol: Annotated[
         str | None, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")
     ] = None,
@@ -157,7 +158,7 @@ def run(
     from bench.protocol import find_protocol
 
     if help_ or protocol is None:
-        console.print(click.get_current_context().get_help(), highlight=False)
+        console.print(context.get_help(), highlight=False)
         if protocol is not None:
             print_protocol(find_protocol(protocol))
         return
@@ -389,7 +390,8 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 def print_protocol(definition: Any) -> None:  # noqa: ANN401 - a ProtocolDefinition, not imported at start
     """Print a protocol's help: what it does and what can be set."""
-    console.print(f"[bold]{definition.name}[/]\n\n{definition.description}\n", highlight=False)
+    console.print(Markdown(f"**{definition.name}**: {definition.description}"))
+    console.print()
     table = Table("--set", "default", "unit", "allowed", "what it does", title="parameters", title_justify="left")
     for entry in definition.help():
         table.add_row(entry.name, entry.default, entry.unit, entry.allowed, entry.text)
@@ -439,3 +441,29 @@ def _print_table(title: str, rows: dict[str, str]) -> None:
         table.add_row(name, text)
     console.print(table)
     console.print()
+
+
+reproduce = typer.Typer(
+    help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
+    no_args_is_help=True,
+)
+app.add_typer(reproduce, name="reproduce")
+
+
+@reproduce.command("vo2")
+def reproduce_vo2_(
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
+    live: Annotated[
+        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """VO2 microactuator: characterization, identification and validation, the paper's tables beside the measured.
+
+    Zhang et al., Modeling and inverse compensation of nonmonotonic hysteresis in VO2-coated microactuators, 2013.
+    """
+    from bench.reproduce.vo2 import reproduce_vo2
+
+    result = reproduce_vo2(rig="vo2", seed=seed, out=out, live=live, console=console)
+    write_json(json_file, result)

@@ -20,7 +20,7 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
     The Preisach plane: the memory curve after each step, the input on the diagonal, the model's density.
 `/state/phase`, `/state/run`, `/state/settling`
     Where the protocol stands, changes only.
-`/events/KIND`, `/card`
+`/events`, `/card`
     What happened, and the run card.
 """
 
@@ -30,11 +30,13 @@ import json
 import math
 import queue
 import socket
+import sqlite3
 import subprocess
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -44,11 +46,13 @@ import rerun.blueprint as rrb
 import rerun_cli
 from rerun.experimental import ViewerClient
 
-from bench.clock import Stopwatch, WallClock
+from bench.clock import WallClock
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve
+from bench.hysteresis import MemoryCurve, Preisach
 from bench.journal import Event, Record, StepRecord
+from bench.model_file import parse_model
+from bench.runs import run_card
 
 QUEUED_TICKS = 20_000
 """Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""
@@ -63,6 +67,12 @@ _PORTS_TRIED = 50
 _REBUILD_ROWS = 4096
 """Rows of a chunk when a whole journal is at hand: fewer, larger chunks load faster."""
 
+_VIEWER_START_SECONDS = 30.0
+_VIEWER_SETTLE_SECONDS = 6.0
+_LOOPBACK = "127.0.0.1"
+_WIDTH = 1.15
+"""Width of the drawn loop and plane where their height is 1."""
+
 Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
@@ -71,7 +81,7 @@ _INK: Colour = (214, 219, 226)
 _FAINT: Colour = (58, 65, 74)
 _RISING: Colour = (255, 122, 72)
 _FALLING: Colour = (78, 160, 255)
-_MARKER: Colour = (255, 236, 120)
+_MARKER: Colour = (150, 248, 228)
 _SETPOINT: Colour = (150, 158, 168)
 _PALETTE: tuple[Colour, ...] = (
     (255, 122, 72),
@@ -83,17 +93,34 @@ _PALETTE: tuple[Colour, ...] = (
     (255, 128, 170),
     (178, 196, 98),
 )
+_PHASE_COLOURS: tuple[Colour, ...] = (
+    (58, 92, 138),
+    (52, 116, 122),
+    (104, 84, 140),
+    (74, 112, 78),
+    (128, 96, 62),
+    (122, 74, 104),
+)
+_RUNNING = "running"
+_NOT_SETTLED = "not settled"
 _STATES: Mapping[str, Colour] = {
-    "running": (66, 140, 92),
+    _RUNNING: (66, 140, 92),
     "paused": (190, 146, 44),
     "interlock": (206, 62, 58),
     "safe": (64, 112, 176),
     "completed": (66, 140, 92),
     "aborted": (190, 146, 44),
     "failed": (206, 62, 58),
-    "settled": (66, 140, 92),
-    "not settled": (206, 62, 58),
+    _NOT_SETTLED: (206, 118, 52),
 }
+_DENSITY_COLOURS: tuple[tuple[float, Colour], ...] = (
+    (-1.0, (92, 190, 255)),
+    (-0.4, (36, 92, 168)),
+    (0.0, (28, 33, 39)),
+    (0.25, (84, 34, 92)),
+    (0.6, (206, 66, 82)),
+    (1.0, (255, 226, 138)),
+)
 _STATE_OF_EVENT = {
     "pause": "paused",
     "resume": "running",
@@ -156,26 +183,6 @@ class DashboardLayout:
         if self.levels < 1:
             raise ConfigurationError(f"dashboard: levels: expected at least 1, got {self.levels}")
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Return the layout from its JSON form, `dataclasses.asdict` of it.
-
-        Raises
-        ------
-        ConfigurationError
-            If a key is missing, unknown, or not of its kind.
-        """
-        try:
-            values = dict(document)
-            for key in ("input_range", "output_range", "plane"):
-                low, high = values[key]
-                values[key] = (float(low), float(high))
-            return cls(**values)
-        except KeyError as error:
-            raise ConfigurationError(f"dashboard: {error.args[0]} is missing") from None
-        except (TypeError, ValueError) as error:
-            raise ConfigurationError(f"dashboard: {error}") from None
-
 
 class Dashboard:
     """Shows a run while it goes on, and records it in an .rrd file.
@@ -233,13 +240,13 @@ class Dashboard:
         if path is not None:
             sinks.append(_file_sink(path))
         if live:
-            server = rr.GrpcServerSink(bind_ip="127.0.0.1", port=_free_port(port), server_memory_limit="256MiB")
+            server = rr.GrpcServerSink(bind_ip=_LOOPBACK, port=_free_port(port), server_memory_limit="256MiB")
             self.uri = server.uri
             sinks.append(server)
         self._writer.open(sinks, title, card, properties)
         self.dropped = 0
         """Entries that the dashboard did not show because Rerun stood still."""
-        self._queue: queue.SimpleQueue[_Tick | StepRecord | Event | _Model | _End] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Entry] = queue.SimpleQueue()
         self._wake = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
@@ -292,7 +299,15 @@ class Dashboard:
         self._wake.set()
         self._thread.join(_CLOSE_SECONDS)
 
-    def _put(self, entry: StepRecord | Event | _Model | _End) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, entry: _Entry) -> None:
         if self._queue.qsize() >= QUEUED_ENTRIES:
             self.dropped += 1
         else:
@@ -306,8 +321,7 @@ class Dashboard:
             entries = [self._queue.get() for _ in range(self._queue.qsize())]
             if self.dropped > reported:
                 lost, reported = self.dropped - reported, self.dropped
-                text = f"Rerun stood still: {lost} entries are not shown; bench export rebuilds the .rrd"
-                entries.append(Event(self._writer.t, "WARN", "dashboard", text))
+                self._writer.report_loss(lost)
             self._writer.write(entries)
         self._writer.close()
 
@@ -330,31 +344,587 @@ def rebuild(record: Record, path: Path) -> None:
         If the journal is damaged.
     """
     meta = record.meta
-    document = meta.get("dashboard")
     try:
-        layout = None if document is None else DashboardLayout.from_json(document)
-        writer = _Writer(record.signals, layout, str(meta.get("run", record.path.parent.name)))
-    except ConfigurationError as error:
-        raise DataError(f"{record.path}: {error}") from error
-    title = f"{meta.get('rig', 'run')} {meta.get('protocol', '')} {meta.get('run', '')}".strip()
-    writer.open([_file_sink(path)], title, run_card(meta), card_properties(meta))
+        table = meta.get("dashboard")
+        layout = DashboardLayout(title=meta["rig_title"], **table) if table else None
+        writer = _Writer(record.signals, layout, str(meta["run"]))
+        card, title = run_card(meta), f"{meta['rig_title']}: {meta['protocol']}"
+        properties = {key: meta[key] for key in ("rig", "protocol", "seed")}
+    except (ConfigurationError, KeyError, TypeError) as error:
+        raise DataError(f"{record.path} does not say what its dashboard was: {error}") from error
+    writer.open([_file_sink(path)], title, card, properties)
     try:
         telemetry = record.telemetry()
-        writer.ticks(
-            telemetry["t"],
-            telemetry["step"].astype(np.int64),
-            np.column_stack([telemetry[signal.name] for signal in record.signals]),
-        )
-        steps, events = list(record.step_records()), record.events()
-        writer.steps(steps)
-        finished = np.array([step.finished for step in steps])
-        done = np.searchsorted(finished, [event.t for event in events], side="right")
-        writer.events(events, [steps[n - 1].step + 1 if n else 0 for n in done])
-        for name, _, model in record.models():
-            found = _density(model)
-            if found is not None:
-                writer.model(_Model(name, *found))
+        for start in range(0, len(telemetry), _REBUILD_ROWS):
+            rows = slice(start, start + _REBUILD_ROWS)
+            writer.ticks(
+                telemetry["t"][rows],
+                telemetry["step"][rows].astype(np.int64),
+                np.column_stack([telemetry[signal.name][rows] for signal in record.signals]),
+            )
+        # A step is told at its end, before what follows from it.
+        entries: list[tuple[float, _Entry]] = [(step.finished, step) for step in record.step_records()]
+        entries += [(event.t, event) for event in record.events()]
+        entries.sort(key=lambda entry: entry[0])
+        for start in range(0, len(entries), _REBUILD_ROWS):
+            writer.write([entry for _, entry in entries[start : start + _REBUILD_ROWS]])
+        writer.write([_Model(name, *density) for name, density in _densities(record)])
         if "status" in meta:
-            writer.end(_End(str(meta["status"]), str(meta.get("reason", ""))))
+            writer.write([_End(str(meta["status"]), str(meta.get("reason", "")))])
     finally:
         writer.close()
+
+
+def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, int] = (1600, 1000)) -> list[str]:
+    """Draw what a viewer shows of an .rrd file, without a screen.
+
+    Parameters
+    ----------
+    rrd : Path
+        The recording.
+    png : Path
+        The picture to write.
+    at : float or None
+        Laboratory time in s to put the cursor at; None for the end.
+    size : tuple of int
+        Width and height, pixels.
+
+    Returns
+    -------
+    list of str
+        What the views complain of; empty if all is well.
+
+    Raises
+    ------
+    DataError
+        If there is no such recording.
+    ConfigurationError
+        If the viewer does not start, for want of a graphics driver for instance.
+    """
+    if not rrd.is_file():
+        raise DataError(f"there is no recording {rrd}")
+    port = _free_port(0)
+    # The console script is a wrapper that would leave its viewer behind, and a viewer that the SDK spawns
+    # listens to the whole network.
+    command = [Path(rerun_cli.__file__).parent / "rerun", "--headless", "--hide-welcome-screen"]
+    options = ["--bind", _LOOPBACK, "--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+    viewer = subprocess.Popen(  # noqa: S603 - our own arguments
+        [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    clock = WallClock()
+    try:
+        while not _listens(port):
+            if viewer.poll() is not None or clock.now() > _VIEWER_START_SECONDS:
+                raise ConfigurationError(
+                    "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the "
+                    "one of the packages mesa-vulkan-drivers and libvulkan1"
+                )
+            clock.sleep(0.1)
+        client = ViewerClient.connect(f"rerun+http://{_LOOPBACK}:{port}/proxy")
+        client.open(str(rrd.absolute()))
+        if at is None:
+            client.set_time("t", play_state="following")
+        else:
+            client.set_time("t", duration=at, play_state="paused")
+        # The viewer draws while data still arrive, and does not say when it has them all.
+        clock.sleep(_VIEWER_SETTLE_SECONDS)
+        client.save_screenshot(str(png.absolute()))
+        return [
+            f"{view.name}: {report.severity}: {report.summary}"
+            for view in client.get_state().views
+            for report in view.reports
+        ]
+    finally:
+        viewer.terminate()
+        viewer.wait()
+
+
+@dataclass(frozen=True)
+class _Model:
+    name: str
+    density: Floats
+    grid: Floats
+
+
+@dataclass(frozen=True)
+class _End:
+    status: str
+    reason: str
+
+
+_Tick = tuple[float, int, tuple[float, ...]]
+_Entry = _Tick | StepRecord | Event | _Model | _End
+
+
+class _Writer:
+    """Turns what happened into Rerun's columns; used by one thread at a time."""
+
+    def __init__(self, signals: Sequence[Signal], layout: DashboardLayout | None, run_id: str) -> None:
+        self._signals = tuple(signals)
+        self._layout = layout
+        self._axes: tuple[int, int] | None = None
+        if layout is not None:
+            names = [signal.name for signal in self._signals]
+            for key, name in (("input", layout.input), ("output", layout.output)):
+                if name not in names:
+                    raise ConfigurationError(
+                        f"dashboard: {key}: there is no signal {name!r}; there are: {', '.join(names)}"
+                    )
+            self._axes = names.index(layout.input), names.index(layout.output)
+        ranges = {}
+        if layout is not None:
+            ranges = {layout.input: layout.input_range, layout.output: layout.output_range}
+        self._groups = _group_by_unit(self._signals, ranges)
+        self._stream = rr.RecordingStream("bench", recording_id=run_id)
+        self._memory: MemoryCurve | None = None
+        self._point: tuple[float, float] | None = None
+        self._states: dict[str, str] = {}
+        self._phases: list[str] = []
+        self._step = 0
+        self._t = 0.0
+
+    def open(
+        self,
+        sinks: Sequence[rr.FileSink | rr.GrpcServerSink],
+        title: str,
+        card: str,
+        properties: Mapping[str, Any],
+    ) -> None:
+        """Connect, and write everything that does not change."""
+        self._stream.set_sinks(*sinks, default_blueprint=self._blueprint())
+        self._stream.send_recording_name(title)
+        self._stream.send_property("bench", rr.AnyValues(**properties))
+        self._log("card", rr.TextDocument(card, media_type=rr.MediaType.MARKDOWN))
+        for group in self._groups:
+            for kind in ("signals", "readings"):
+                self._log(f"{kind}/{group.path}", group.style)
+        self._log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
+        if self._layout is not None and self._axes is not None:
+            x, y = (self._signals[column] for column in self._axes)
+            self._draw_frame("loop", _Frame.of_loop(self._layout, x, y))
+            self._draw_frame("plane", _Frame.of_plane(self._layout, x))
+            self._draw_plane(self._layout)
+
+    def write(self, entries: Sequence[_Entry]) -> None:
+        """Write entries in the order in which they happened."""
+        ticks = [entry for entry in entries if isinstance(entry, tuple)]
+        if ticks:
+            t, step, values = zip(*ticks, strict=True)
+            self.ticks(np.array(t), np.array(step), np.array(values, dtype=np.float64))
+        steps: list[StepRecord] = []
+        events: list[tuple[int, Event]] = []
+        changes: list[tuple[str, float, int, str]] = []
+        for entry in entries:
+            if isinstance(entry, StepRecord):
+                steps.append(entry)
+                changes += self._enter("run", entry.started, entry.step, _RUNNING if entry.settled else _NOT_SETTLED)
+                self._step = entry.step + 1
+                self._t = entry.finished
+            elif isinstance(entry, Event):
+                events.append((self._step, entry))
+                if entry.kind == "phase":
+                    self._colour_phase(entry.text)
+                    changes += self._enter("phase", entry.t, self._step, entry.text)
+                state = _state_after(entry)
+                if state is not None:
+                    changes += self._enter("run", entry.t, self._step, state)
+                self._t = entry.t
+            elif isinstance(entry, _Model):
+                self._draw_model(entry)
+            elif isinstance(entry, _End):
+                self._stream.send_property("outcome", rr.AnyValues(status=entry.status, reason=entry.reason))
+        self._write_steps(steps)
+        self._write_events(events)
+        self._write_changes(changes)
+
+    def ticks(self, t: Floats, step: npt.NDArray[np.int64], values: Floats) -> None:
+        """Write ticks: times in s, shape (n,), step numbers, shape (n,), and values, shape (n, signals)."""
+        self._scalars("signals", _times(t, step), values)
+        self._t = float(t[-1])
+
+    def report_loss(self, entries: int) -> None:
+        """Say in the log that entries are missing."""
+        text = f"Rerun stood still, {entries} entries are missing here; the journal has them"
+        self.write([Event(self._t, "WARN", "dashboard", text)])
+
+    def close(self) -> None:
+        """Let go of file and viewers."""
+        self._stream.disconnect()
+
+    def _write_steps(self, steps: Sequence[StepRecord]) -> None:
+        if not steps:
+            return
+        values = np.array([step.values for step in steps], dtype=np.float64)
+        times = _times([step.finished for step in steps], [step.step for step in steps])
+        self._scalars("readings", times, values)
+        if self._layout is None or self._axes is None:
+            return
+        segments, colours, drawn, memories, inputs = [], [], [], [], []
+        for step, (x, y) in zip(steps, values[:, self._axes].tolist(), strict=True):
+            if not (math.isfinite(x) and math.isfinite(y)):
+                continue
+            previous = self._point or (x, y)
+            segments.append([previous, (x, y)])
+            colours.append(_RISING if x >= previous[0] else _FALLING)
+            self._point = (x, y)
+            self._memory = self._memory.step(x) if self._memory else MemoryCurve.from_negative_saturation(x)
+            memories.append(self._memory.corners(*self._layout.plane))
+            inputs.append(memories[-1][-1])
+            drawn.append(step)
+        if not drawn:
+            return
+        times = _times([step.finished for step in drawn], [step.step for step in drawn])
+        points = [segment[1] for segment in segments]
+        send = self._stream.send_columns
+        send("loop/data/path", times, rr.LineStrips2D.columns(strips=segments, colors=colours))
+        send("loop/data/now", times, rr.Points2D.columns(positions=points))
+        send("plane/data/memory", times, rr.LineStrips2D.columns(strips=memories))
+        send("plane/data/input", times, rr.Points2D.columns(positions=inputs))
+
+    def _write_events(self, events: Sequence[tuple[int, Event]]) -> None:
+        if not events:
+            return
+        columns = rr.TextLog.columns(
+            # The viewer leaves its own time column too narrow to read.
+            text=[f"{_clock_face(event.t)}  {event.text}" for _, event in events],
+            level=[event.level for _, event in events],
+        )
+        times = _times([event.t for _, event in events], [step for step, _ in events])
+        self._stream.send_columns("events", times, columns)
+
+    def _write_changes(self, changes: Sequence[tuple[str, float, int, str]]) -> None:
+        for lane in dict.fromkeys(change[0] for change in changes):
+            _, t, step, state = zip(*(change for change in changes if change[0] == lane), strict=True)
+            self._stream.send_columns(f"state/{lane}", _times(t, step), rr.StateChange.columns(state=state))
+
+    def _colour_phase(self, phase: str) -> None:
+        if phase not in self._phases:
+            self._phases.append(phase)
+            colours = [_PHASE_COLOURS[i % len(_PHASE_COLOURS)] for i in range(len(self._phases))]
+            self._log("state/phase", rr.StateConfiguration(values=self._phases, colors=colours))
+
+    def _enter(self, lane: str, t: float, step: int, state: str) -> list[tuple[str, float, int, str]]:
+        if self._states.get(lane) == state:
+            return []
+        self._states[lane] = state
+        return [(lane, t, step, state)]
+
+    def _scalars(self, kind: str, times: list[rr.TimeColumn], values: Floats) -> None:
+        for group in self._groups:
+            columns = rr.Scalars.columns(scalars=(values[:, group.columns] * group.factor).ravel())
+            lengths = np.full(len(values), len(group.columns))
+            self._stream.send_columns(f"{kind}/{group.path}", times, columns.partition(lengths))
+
+    def _log(self, path: str, *what: rr.AsComponents) -> None:
+        self._stream.log(path, *what, static=True)
+
+    def _draw_frame(self, path: str, frame: _Frame) -> None:
+        """Draw axes, and give what is logged below `path`/data their units."""
+        columns = [(frame.x(value), value * frame.x_factor) for value in _round_values(*frame.x_range)]
+        rows = [(frame.y(value), value * frame.y_factor) for value in _round_values(*frame.y_range)]
+        lines = [[(x, 0.0), (x, -1.0)] for x, _ in columns] + [[(0.0, y), (_WIDTH, y)] for y, _ in rows]
+        box = [(0.0, 0.0), (_WIDTH, 0.0), (_WIDTH, -1.0), (0.0, -1.0), (0.0, 0.0)]
+        self._log(f"{path}/axes/grid", _lines(lines, _FAINT, 0.5, -20.0))
+        self._log(f"{path}/axes/box", _lines([box], _INK, 0.75, 10.0))
+        places = [(x, 0.02) for x, _ in columns] + [(-0.065, y - 0.035) for y, _ in rows]
+        texts = [f"{value:.6g}" for _, value in (*columns, *rows)]
+        self._log(f"{path}/axes/ticks", _texts(places, texts))
+        titles = [(_WIDTH / 2, 0.09), (0.0, -1.1)]
+        self._log(f"{path}/axes/titles", _texts(titles, [frame.x_title, frame.y_title]))
+        matrix = np.diag([frame.x(1.0) - frame.x(0.0), frame.y(1.0) - frame.y(0.0), 1.0])
+        self._log(f"{path}/data", rr.Transform3D(mat3x3=matrix, translation=[frame.x(0.0), frame.y(0.0), 0.0]))
+
+    def _draw_plane(self, layout: DashboardLayout) -> None:
+        low, high = layout.plane
+        inner = np.linspace(low, high, layout.levels + 1)[1:-1]
+        lattice = [[(low, value), (value, value), (value, high)] for value in inner]
+        triangle = [(low, low), (high, high), (low, high), (low, low)]
+        self._log("plane/data/lattice", _lines(lattice, _FAINT, 0.5, -15.0))
+        self._log("plane/data/triangle", _lines([triangle], _INK, 1.0, 10.0))
+        self._log("plane/data/memory", _line_style(1.75, _MARKER))
+        self._log("plane/data/input", _point_style())
+        self._log("loop/data/path", _line_style(1.25))
+        self._log("loop/data/now", _point_style())
+
+    def _draw_model(self, model: _Model) -> None:
+        if self._layout is None or self._axes is None:
+            return
+        x, y = (self._signals[column] for column in self._axes)
+        frame = _Frame.of_plane(self._layout, x)
+        low, high, cells = model.grid[0], model.grid[-1], len(model.grid) - 1
+        # Several pixels a cell, for the diagonal and for intervals of unequal length.
+        pixels = cells * max(8, 256 // cells)
+        middles = low + (np.arange(pixels) + 0.5) * (high - low) / pixels
+        cell = np.clip(np.searchsorted(model.grid, middles, side="right") - 1, 0, cells - 1)
+        density = np.where(middles[:, None] >= middles, model.density[np.ix_(cell, cell)], np.nan)
+        greatest = float(np.nanmax(np.abs(density))) or 1.0
+        self._draw_image("plane/density", _coloured(density / greatest)[::-1], frame, (low, high), (low, high))
+        # The legend stands in the corner below the diagonal, where there is no plane.
+        least = -greatest if np.nanmin(density) < 0 else 0.0
+        ramp = np.linspace(least / greatest, 1.0, 128)[None, :].repeat(8, axis=0)
+        low, high = self._layout.plane
+        left, right, bottom, top = low + np.array([0.62, 0.92, 0.06, 0.1]) * (high - low)
+        self._draw_image("plane/legend/bar", _coloured(ramp), frame, (left, right), (bottom, top))
+        unit = f"{_in_brackets(y.unit)}/{_in_brackets(x.unit)}²"
+        middle, above = frame.x((left + right) / 2), frame.y(top)
+        self._log(
+            "plane/legend/ends",
+            _texts(
+                [(frame.x(left), above - 0.09), (frame.x(right), above - 0.09)], [f"{least:.3g}", f"{greatest:.3g}"]
+            ),
+        )
+        self._log(
+            "plane/legend/title",
+            _texts([(middle, above - 0.23), (middle, above - 0.16)], [model.name, f"density [{unit}]"]),
+        )
+
+    def _draw_image(
+        self, path: str, image: npt.NDArray[np.uint8], frame: _Frame, x: Sequence[float], y: Sequence[float]
+    ) -> None:
+        """Put an image, its first row at the top, between two values of x and two of y."""
+        height, width = image.shape[:2]
+        across, down = (frame.x(x[1]) - frame.x(x[0])) / width, (frame.y(y[0]) - frame.y(y[1])) / height
+        self._log(
+            path,
+            rr.Transform3D(mat3x3=np.diag([across, down, 1.0]), translation=[frame.x(x[0]), frame.y(y[1]), 0.0]),
+            rr.Image(image, draw_order=-10.0),
+        )
+
+    def _blueprint(self) -> rrb.Blueprint:
+        forever = rrb.TimeRangeBoundary.infinite()
+        whole_run = rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
+        series = [
+            rrb.TimeSeriesView(
+                origin=f"/signals/{group.path}",
+                name=group.title,
+                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(group.columns) > 1),
+                axis_x=whole_run,
+            )
+            for group in self._groups
+        ]
+        state = rrb.StateTimelineView(origin="/state", name="Protocol", time_view=whole_run)
+        log = rrb.TextLogView(
+            origin="/events",
+            name="Log",
+            columns=rrb.TextLogColumns(timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)], text_log_columns=["LogLevel", "Body"]),
+        )
+        card = rrb.TextDocumentView(origin="/card", name="Run card")
+        below = rrb.Vertical(state, rrb.Horizontal(log, card, column_shares=[3, 2]), row_shares=[3, 5])
+        right: rrb.Container = below
+        if self._layout is not None:
+            past = [
+                rrb.VisibleTimeRange(
+                    timeline,
+                    start=rrb.TimeRangeBoundary.infinite(),
+                    end=rrb.TimeRangeBoundary.cursor_relative(),
+                )
+                for timeline in ("t", "step")
+            ]
+            bounds = rrb.VisualBounds2D(x_range=(-0.2, _WIDTH + 0.08), y_range=(-1.16, 0.2))
+            views = [
+                rrb.Spatial2DView(
+                    origin="/loop",
+                    name=self._layout.title,
+                    visual_bounds=bounds,
+                    background=_BACKGROUND,
+                    overrides={"/loop/data/path": rrb.VisibleTimeRanges(past)},
+                ),
+                rrb.Spatial2DView(
+                    origin="/plane", name="Preisach plane", visual_bounds=bounds, background=_BACKGROUND
+                ),
+            ]
+            right = rrb.Vertical(rrb.Horizontal(*views), below, row_shares=[8, 7])
+        return rrb.Blueprint(
+            rrb.Horizontal(
+                rrb.Vertical(*series, row_shares=[group.height for group in self._groups]),
+                right,
+                column_shares=[2, 3],
+            ),
+            rrb.BlueprintPanel(state="hidden"),
+            rrb.SelectionPanel(state="hidden"),
+            rrb.TimePanel(state="collapsed", timeline="t", play_state="following"),
+        )
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The signals of one unit."""
+
+    path: str
+    title: str
+    columns: list[int]
+    factor: float
+    height: int
+    style: rr.SeriesLines
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A pair of axes: ranges in the units of the data, and what is written beside them."""
+
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    x_title: str
+    y_title: str
+    x_factor: float
+    y_factor: float
+
+    @classmethod
+    def of_loop(cls, layout: DashboardLayout, x: Signal, y: Signal) -> _Frame:
+        x_factor, x_unit = _prefixed(x.unit, layout.input_range)
+        y_factor, y_unit = _prefixed(y.unit, layout.output_range)
+        titles = f"{x.description} [{x_unit}]", f"{y.description} [{y_unit}]"
+        return cls(layout.input_range, layout.output_range, *titles, x_factor, y_factor)
+
+    @classmethod
+    def of_plane(cls, layout: DashboardLayout, x: Signal) -> _Frame:
+        factor, unit = _prefixed(x.unit, layout.plane)
+        return cls(layout.plane, layout.plane, f"β [{unit}]", f"α [{unit}]", factor, factor)
+
+    def x(self, value: float) -> float:
+        low, high = self.x_range
+        return _WIDTH * (value - low) / (high - low)
+
+    def y(self, value: float) -> float:
+        low, high = self.y_range
+        return -(value - low) / (high - low)
+
+
+def _group_by_unit(signals: Sequence[Signal], ranges: Mapping[str, tuple[float, float]]) -> list[_Group]:
+    groups = []
+    for unit in dict.fromkeys(signal.unit for signal in signals):
+        columns = [i for i, signal in enumerate(signals) if signal.unit == unit]
+        members = [signals[i] for i in columns]
+        extents = [ranges[signal.name] for signal in members if signal.name in ranges]
+        # Without a range, the digits that are worth showing tell how large the numbers are.
+        factor, shown = _prefixed(unit, extents[0] if extents else (0.0, 10.0 ** (3 - members[0].precision)))
+        quantity = _QUANTITIES.get(unit, unit)
+        title = quantity if len(members) > 1 else members[0].description
+        style = rr.SeriesLines(
+            names=[f"{signal.name} [{shown}]" for signal in members],
+            colors=[_colour(signals[i].name, i) for i in columns],
+            widths=[1.5] * len(members),
+        )
+        path = rr.escape_entity_path_part(quantity)
+        headline = f"{title[:1].upper()}{title[1:]} [{shown}]"
+        groups.append(_Group(path, headline, columns, factor, 2 if extents else 1, style))
+    return groups
+
+
+def _colour(name: str, position: int) -> Colour:
+    return _SETPOINT if name.endswith("_setpoint") else _PALETTE[position % len(_PALETTE)]
+
+
+def _state_after(event: Event) -> str | None:
+    """Return the state of the run that an event leads to, if it does."""
+    return event.text if event.kind == "end" else _STATE_OF_EVENT.get(event.kind)
+
+
+def _densities(record: Record) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
+    """Yield name, density and grid of the models that have a density, the newest last."""
+    database = sqlite3.connect(f"{record.path.absolute().as_uri()}?mode=ro", uri=True)
+    try:
+        rows = database.execute("SELECT name, model FROM models ORDER BY t").fetchall()
+    except sqlite3.DatabaseError as error:
+        raise DataError(f"{record.path} is damaged: {error}") from error
+    finally:
+        database.close()
+    for name, text in rows:
+        try:
+            operator = parse_model(json.loads(text), name).operator
+        except (DataError, json.JSONDecodeError):
+            continue
+        if isinstance(operator, Preisach):
+            yield name, (operator.density_matrix(), operator.levels)
+
+
+def _times(t: npt.ArrayLike, step: npt.ArrayLike) -> list[rr.TimeColumn]:
+    nanoseconds = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
+    return [
+        rr.TimeColumn("t", duration=nanoseconds),
+        rr.TimeColumn("step", sequence=np.asarray(step, dtype=np.int64)),
+    ]
+
+
+def _clock_face(t: float) -> str:
+    minutes, seconds = divmod(max(int(t), 0), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _lines(strips: Any, colour: Colour, points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
+    return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)
+
+
+def _line_style(points: float, colour: Colour | None = None) -> rr.LineStrips2D:
+    return rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(points), colors=colour, draw_order=20.0)
+
+
+def _point_style() -> rr.Points2D:
+    return rr.Points2D.from_fields(radii=rr.Radius.ui_points(5.0), colors=_MARKER, draw_order=30.0)
+
+
+def _texts(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:
+    return rr.Points2D(places, labels=texts, show_labels=True, colors=_INK, radii=0.0)
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Return some five round values within a range."""
+    rough = (high - low) / 5
+    magnitude = 10.0 ** math.floor(math.log10(rough))
+    step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda step: abs(step - rough))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [n * step for n in range(first, last + 1)]
+
+
+def _prefixed(unit: str, extent: tuple[float, float]) -> tuple[float, str]:
+    """Return factor and unit that make the numbers of an axis readable."""
+    greatest = max(abs(extent[0]), abs(extent[1]))
+    if unit in ("m", "A", "V", "N", "W"):
+        for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "µ")):
+            if greatest * factor >= 1.0:
+                return factor, prefix + unit
+    return 1.0, unit
+
+
+def _in_brackets(unit: str) -> str:
+    return f"({unit})" if "/" in unit else unit
+
+
+def _coloured(values: Floats) -> npt.NDArray[np.uint8]:
+    """Return colours of values from -1 to 1; NaN is transparent."""
+    stops = np.array([stop for stop, _ in _DENSITY_COLOURS])
+    colours = np.array([colour for _, colour in _DENSITY_COLOURS], dtype=np.float64)
+    known = np.nan_to_num(values)
+    image = np.stack(
+        [*(np.interp(known, stops, colours[:, i]) for i in range(3)), np.where(np.isnan(values), 0.0, 255.0)],
+        axis=-1,
+    )
+    return image.round().astype(np.uint8)
+
+
+def _file_sink(path: Path) -> rr.FileSink:
+    # Rerun would truncate the file.
+    if path.exists():
+        raise ConfigurationError(f"{path} exists already; a recording is never overwritten")
+    if not path.parent.is_dir():
+        raise ConfigurationError(f"{path}: there is no folder {path.parent}")
+    return rr.FileSink(path)
+
+
+def _free_port(first: int) -> int:
+    """Return `first` or the next port of the loopback address that is free; for 0, any free port."""
+    # Rerun itself does not say that a port is taken, and takes 0 without telling which it became.
+    for port in range(first, min(first + _PORTS_TRIED, 65536)) if first else (0,):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((_LOOPBACK, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise ConfigurationError(f"no port of {_LOOPBACK} from {first} to {first + _PORTS_TRIED - 1} is free")
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((_LOOPBACK, port)) == 0

@@ -309,6 +309,14 @@ class Record:
         """Return what happened, in its order."""
         return [Event(*row) for row in self._query("SELECT t, level, kind, text FROM events ORDER BY event")]
 
+    def models(self) -> dict[str, Any]:
+        """Return the content of the model files that were identified from this run, by name."""
+        rows = self._query("SELECT name, model FROM models ORDER BY name").fetchall()
+        try:
+            return {name: json.loads(model) for name, model in rows}
+        except json.JSONDecodeError as error:
+            raise DataError(f"{self.path} is damaged: {error}") from error
+
     def close(self) -> None:
         """Close the file."""
         self._db.close()

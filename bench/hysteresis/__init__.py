@@ -1,0 +1,23 @@
+"""Hysteresis operators: immutable models, explicit memory, numbers only."""
+
+from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.operator import Operator, operator_from_json
+from bench.hysteresis.polynomial import Polynomial
+from bench.hysteresis.preisach import Preisach, Segment, uniform_levels
+from bench.hysteresis.regressor import Regressor
+from bench.hysteresis.reversible import QuadraticTerm, Reversible, ThermalExpansion, reversible_from_json
+
+__all__ = [
+    "MemoryCurve",
+    "Operator",
+    "Polynomial",
+    "Preisach",
+    "QuadraticTerm",
+    "Regressor",
+    "Reversible",
+    "Segment",
+    "ThermalExpansion",
+    "operator_from_json",
+    "reversible_from_json",
+    "uniform_levels",
+]

@@ -1,0 +1,570 @@
+"""Compiled loops over the memory curve. Imported on first use only: numba takes its time to load.
+
+The on-region of the plane is a staircase of pieces (left edge, height); see `MemoryCurve.staircase`.
+With each diagonal cell completed to a square, the integral of the density over {β < b, α < a} is bilinear
+within a cell: G + y row + x col + density x y, with x, y measured from the cell's lower left node. What the
+completion adds below the diagonal depends on the input alone and is taken off again (`below`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@njit(cache=True)
+def locate(levels: Floats, inverse_step: float, value: float) -> int:
+    """Return k with levels[k] <= value < levels[k + 1], kept within the lattice."""
+    last = levels.size - 2
+    if inverse_step > 0.0:
+        k = int((value - levels[0]) * inverse_step)
+        if k < 0:
+            k = 0
+        elif k > last:
+            k = last
+        # Rounding may put a node into the neighbouring cell.
+        while k > 0 and value < levels[k]:
+            k -= 1
+        while k < last and value >= levels[k + 1]:
+            k += 1
+        return k
+    low, high = 0, last
+    while low < high:
+        middle = (low + high + 1) // 2
+        if levels[middle] <= value:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@njit(cache=True)
+def _bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) -> float:
+    x = b - levels[j]
+    y = a - levels[i]
+    # Indexed one by one: a row view would cost reference counting in the innermost loop.
+    value: float = table[i, j, 0] + y * table[i, j, 1] + x * (table[i, j, 2] + y * table[i, j, 3])
+    return value
+
+
+@njit(cache=True)
+def reversible_value(breaks: Floats, quadratics: Floats, u: float) -> float:
+    """Return the single-valued part at u."""
+    r = 0
+    while r < breaks.size and u > breaks[r]:
+        r += 1
+    value: float = quadratics[r, 0] + u * (quadratics[r, 1] + u * quadratics[r, 2])
+    return value
+
+
+@njit(cache=True)
+def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, saturation: int) -> int:
+    """Step the stack of extrema through `inputs`; return the new count."""
+    rising = (saturation < 0) == (count % 2 == 0)
+    for n in range(inputs.size):
+        value = inputs[n]
+        if value > present:
+            if not rising:
+                stack[count] = present
+                count += 1
+                rising = True
+            while count >= 2 and stack[count - 2] <= value:
+                count -= 2
+        elif value < present:
+            if rising:
+                stack[count] = present
+                count += 1
+                rising = False
+            while count >= 2 and stack[count - 2] >= value:
+                count -= 2
+        present = value
+    return count
+
+
+@njit(cache=True)
+def load(
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    left: Floats,
+    height: Floats,
+    column: Integers,
+    row: Integers,
+    mass_left: Floats,
+    n: int,
+    u: float,
+) -> tuple[int, float]:
+    """Fill in what belongs to n given pieces; return the input's cell and the mass up to the input.
+
+    mass_left[p] is the integral of the completed density over the pieces to the left of piece p.
+    """
+    mass = 0.0
+    for p in range(n):
+        column[p] = locate(levels, inverse_step, left[p])
+        row[p] = locate(levels, inverse_step, height[p])
+        mass_left[p] = mass
+        right = left[p + 1] if p + 1 < n else u
+        k = locate(levels, inverse_step, right)
+        mass += _bilinear(table, levels, right, k, height[p], row[p])
+        mass -= _bilinear(table, levels, left[p], column[p], height[p], row[p])
+    return locate(levels, inverse_step, u), mass
+
+
+@njit(cache=True)
+def move(
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    left: Floats,
+    height: Floats,
+    column: Integers,
+    row: Integers,
+    mass_left: Floats,
+    n: int,
+    present: float,
+    k: int,
+    mass: float,
+    u: float,
+) -> tuple[int, int, float]:
+    """Move the staircase from input `present` to u; return the pieces' number, the cell and the mass."""
+    if u == present:
+        return n, k, mass
+    if u > present:
+        edge, edge_column, edge_mass = present, k, mass
+        while n > 0 and height[n - 1] <= u:
+            n -= 1
+            edge, edge_column, edge_mass = left[n], column[n], mass_left[n]
+        k = locate(levels, inverse_step, u)
+        left[n] = edge
+        column[n] = edge_column
+        mass_left[n] = edge_mass
+        height[n] = u
+        row[n] = k
+        n += 1
+    else:
+        k = locate(levels, inverse_step, u)
+        while n > 0 and left[n - 1] >= u:
+            n -= 1
+    mass = 0.0
+    if n > 0:
+        p = n - 1
+        mass = mass_left[p]
+        mass += _bilinear(table, levels, u, k, height[p], row[p])
+        mass -= _bilinear(table, levels, left[p], column[p], height[p], row[p])
+    return n, k, mass
+
+
+@njit(cache=True)
+def output_at(
+    levels: Floats,
+    table: Floats,
+    below: Floats,
+    offset: float,
+    breaks: Floats,
+    quadratics: Floats,
+    raw: float,
+    u: float,
+    k: int,
+    mass: float,
+) -> float:
+    """Return the output at input `raw`, which is u within the plane, given the mass up to u."""
+    x = u - levels[k]
+    mass -= below[k] + 0.5 * table[k, k, 3] * x * x
+    return offset + 2.0 * mass + reversible_value(breaks, quadratics, raw)
+
+
+@njit(cache=True)
+def evaluate(
+    inputs: Floats,
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    below: Floats,
+    offset: float,
+    breaks: Floats,
+    quadratics: Floats,
+    left0: Floats,
+    height0: Floats,
+    u0: float,
+) -> Floats:
+    """Return the outputs of a sequence: a running sum on the staircase, O(1) amortised a sample."""
+    size = inputs.size + left0.size + 1
+    left = np.empty(size)
+    height = np.empty(size)
+    column = np.empty(size, np.int64)
+    row = np.empty(size, np.int64)
+    mass_left = np.empty(size)
+    low, high = levels[0], levels[-1]
+    n = left0.size
+    for p in range(n):
+        left[p] = left0[p]
+        height[p] = height0[p]
+    k, mass = load(levels, inverse_step, table, left, height, column, row, mass_left, n, u0)
+    present = u0
+    outputs = np.empty(inputs.size)
+    for t in range(inputs.size):
+        raw = inputs[t]
+        u = min(max(raw, low), high)
+        n, k, mass = move(levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u)
+        present = u
+        outputs[t] = output_at(levels, table, below, offset, breaks, quadratics, raw, u, k, mass)
+    return outputs
+
+
+@njit(cache=True)
+def segment_up(
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    breaks: Floats,
+    quadratics: Floats,
+    high: float,
+    edge: float,
+    above: float,
+    u: float,
+) -> tuple[float, float, float]:
+    """Return (stop, A, B): output(u + d) - output(u) = A d² + B d up to input `stop`.
+
+    `edge` is the left edge of the piece that rises with u, `above` the height of the piece before it.
+    """
+    stop = high
+    a, b = 0.0, 0.0
+    if u < levels[0]:
+        stop = min(stop, levels[0])
+    elif u < levels[-1]:
+        i = locate(levels, inverse_step, u)
+        stop = min(stop, levels[i + 1], above)
+        j = locate(levels, inverse_step, edge)
+        a = table[i, i, 3]
+        if i == j:
+            # One product, so that equal edges give an exact zero.
+            b = 2.0 * a * (u - edge)
+        else:
+            b = table[i, i, 1] - table[i, j, 1]
+            b = 2.0 * (b + a * (u - levels[i]) - table[i, j, 3] * (edge - levels[j]))
+    r = 0
+    while r < breaks.size and u >= breaks[r]:
+        r += 1
+    if r < breaks.size:
+        stop = min(stop, breaks[r])
+    return stop, a + quadratics[r, 2], b + quadratics[r, 1] + 2.0 * quadratics[r, 2] * u
+
+
+@njit(cache=True)
+def segment_down(
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    breaks: Floats,
+    quadratics: Floats,
+    low: float,
+    edge: float,
+    top: float,
+    u: float,
+) -> tuple[float, float, float]:
+    """Return (stop, A, B): output(u - d) - output(u) = A d² + B d down to input `stop`.
+
+    `edge` and `top` are left edge and height of the piece immediately left of u.
+    """
+    stop = low
+    a, b = 0.0, 0.0
+    if u > levels[-1]:
+        stop = max(stop, levels[-1])
+    elif u > levels[0]:
+        j = locate(levels, inverse_step, u)
+        if u == levels[j]:
+            j -= 1
+        stop = max(stop, levels[j], edge)
+        i = locate(levels, inverse_step, top)
+        if top == levels[i] and i > j:
+            i -= 1
+        a = -table[j, j, 3]
+        if i == j:
+            b = 2.0 * a * (top - u)
+        else:
+            b = table[i, j, 2] - table[j + 1, j, 2] + table[i, j, 3] * (top - levels[i])
+            b = -2.0 * (b - a * (levels[j + 1] - u))
+    r = breaks.size
+    while r > 0 and u <= breaks[r - 1]:
+        r -= 1
+    if r > 0:
+        stop = max(stop, breaks[r - 1])
+    return stop, a + quadratics[r, 2], b - quadratics[r, 1] - 2.0 * quadratics[r, 2] * u
+
+
+@njit(cache=True)
+def rising_piece(levels: Floats, left: Floats, height: Floats, n: int, u: float) -> tuple[int, float, float]:
+    """Return what rises from u: pieces before it, its left edge, and the height at which it meets the last."""
+    edge = max(u, levels[0])
+    if n > 0 and height[n - 1] <= u:
+        n -= 1
+        edge = left[n]
+    return n, edge, height[n - 1] if n > 0 else math.inf
+
+
+@njit(cache=True)
+def segment(
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    breaks: Floats,
+    quadratics: Floats,
+    low: float,
+    high: float,
+    left: Floats,
+    height: Floats,
+    u: float,
+    direction: int,
+) -> tuple[float, float, float]:
+    """Return (length, A, B) of the segment from the state (pieces, raw input u)."""
+    n = left.size
+    if direction > 0:
+        _, edge, above = rising_piece(levels, left, height, n, u)
+        stop, a, b = segment_up(levels, inverse_step, table, breaks, quadratics, high, edge, above, u)
+        return max(stop - u, 0.0), a, b
+    edge, top = (left[n - 1], height[n - 1]) if n > 0 else (u, u)
+    stop, a, b = segment_down(levels, inverse_step, table, breaks, quadratics, low, edge, top, u)
+    return max(u - stop, 0.0), a, b
+
+
+@njit(cache=True)
+def _span(levels: Floats, inverse_step: float, low: float, high: float) -> tuple[int, int]:
+    """Return the first and last cell that [low, high] overlaps by more than a point."""
+    first = locate(levels, inverse_step, low)
+    last = locate(levels, inverse_step, high)
+    if last > first and high == levels[last]:
+        last -= 1
+    return first, last
+
+
+@njit(cache=True)
+def _rectangle(
+    levels: Floats,
+    inverse_step: float,
+    b0: float,
+    b1: float,
+    a0: float,
+    a1: float,
+    factor: float,
+    cells: NDArray[np.int32],
+    changes: Floats,
+    end: int,
+    write: bool,
+) -> int:
+    """Append factor * overlap with [b0, b1] x [a0, a1] (above the diagonal) for each cell touched."""
+    if b1 <= b0 or a1 <= a0:
+        return end
+    j0, j1 = _span(levels, inverse_step, b0, b1)
+    i0, i1 = _span(levels, inverse_step, a0, a1)
+    if not write:
+        return end + (i1 - i0 + 1) * (j1 - j0 + 1)
+    for i in range(i0, i1 + 1):
+        y = factor * (min(a1, levels[i + 1]) - max(a0, levels[i]))
+        base = i * (i + 1) // 2
+        for j in range(j0, j1 + 1):
+            cells[end] = base + j
+            changes[end] = y * (min(b1, levels[j + 1]) - max(b0, levels[j]))
+            end += 1
+    return end
+
+
+@njit(cache=True)
+def _triangle(
+    levels: Floats,
+    inverse_step: float,
+    low: float,
+    high: float,
+    factor: float,
+    cells: NDArray[np.int32],
+    changes: Floats,
+    end: int,
+    write: bool,
+) -> int:
+    """Append factor * overlap with {low <= β <= α <= high} for each cell touched."""
+    if high <= low:
+        return end
+    i0, i1 = _span(levels, inverse_step, low, high)
+    if not write:
+        count = i1 - i0 + 1
+        return end + count * (count + 1) // 2
+    for i in range(i0, i1 + 1):
+        y = min(high, levels[i + 1]) - max(low, levels[i])
+        base = i * (i + 1) // 2
+        for j in range(i0, i):
+            cells[end] = base + j
+            changes[end] = factor * y * (min(high, levels[j + 1]) - max(low, levels[j]))
+            end += 1
+        cells[end] = base + i
+        changes[end] = 0.5 * factor * y * y
+        end += 1
+    return end
+
+
+@njit(cache=True)
+def swept_areas(
+    levels: Floats,
+    inverse_step: float,
+    left: Floats,
+    height: Floats,
+    u: float,
+    cells: NDArray[np.int32],
+    changes: Floats,
+    write: bool,
+) -> int:
+    """List twice the on-area of each cell that the staircase touches; return the number of entries."""
+    end = _triangle(levels, inverse_step, levels[0], u, 2.0, cells, changes, 0, write)
+    for p in range(left.size):
+        right = left[p + 1] if p + 1 < left.size else u
+        end = _rectangle(levels, inverse_step, left[p], right, u, height[p], 2.0, cells, changes, end, write)
+    return end
+
+
+@njit(cache=True)
+def swept_differences(
+    inputs: Floats,
+    levels: Floats,
+    inverse_step: float,
+    left0: Floats,
+    height0: Floats,
+    u0: float,
+    starts: Integers,
+    cells: NDArray[np.int32],
+    changes: Floats,
+    write: bool,
+) -> int:
+    """List, sample by sample, the change of 2 * on-area of the cells that the input swept."""
+    left = np.empty(inputs.size + left0.size + 1)
+    height = np.empty(inputs.size + left0.size + 1)
+    left[: left0.size] = left0
+    height[: left0.size] = height0
+    n = left0.size
+    low, high = levels[0], levels[-1]
+    present = u0
+    end = 0
+    for t in range(inputs.size):
+        starts[t] = end
+        u = min(max(inputs[t], low), high)
+        if u > present:
+            right = present
+            edge = present
+            while n > 0 and height[n - 1] <= u:
+                n -= 1
+                edge = left[n]
+                end = _rectangle(levels, inverse_step, edge, right, height[n], u, 2.0, cells, changes, end, write)
+                right = edge
+            end = _triangle(levels, inverse_step, present, u, 2.0, cells, changes, end, write)
+            left[n] = edge
+            height[n] = u
+            n += 1
+        elif u < present:
+            right = present
+            p = n - 1
+            while p >= 0 and right > u:
+                edge = max(left[p], u)
+                end = _rectangle(
+                    levels, inverse_step, edge, right, present, height[p], -2.0, cells, changes, end, write
+                )
+                right = edge
+                p -= 1
+            end = _triangle(levels, inverse_step, u, present, -2.0, cells, changes, end, write)
+            while n > 0 and left[n - 1] >= u:
+                n -= 1
+        present = u
+    starts[inputs.size] = end
+    return end
+
+
+@njit(cache=True)
+def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floats, weights: Floats) -> Floats:
+    """Return the running sum of (row differences) @ weights."""
+    result = np.empty(starts.size - 1)
+    total = 0.0
+    for t in range(result.size):
+        step = 0.0
+        for e in range(starts[t], starts[t + 1]):
+            step += changes[e] * weights[cells[e]]
+        total += step
+        result[t] = total
+    return result
+
+
+@njit(cache=True)
+def difference_transpose_product(
+    starts: Integers, cells: NDArray[np.int32], changes: Floats, residuals: Floats, result: Floats
+) -> None:
+    """Add (row differences).T @ (reverse running sum of residuals) to result."""
+    total = 0.0
+    for t in range(residuals.size - 1, -1, -1):
+        total += residuals[t]
+        if total != 0.0:
+            for e in range(starts[t], starts[t + 1]):
+                result[cells[e]] += changes[e] * total
+
+
+@njit(cache=True)
+def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base: Floats, result: Floats) -> None:
+    """Fill result[:, : base.size] with the rows themselves."""
+    row = base.copy()
+    for t in range(starts.size - 1):
+        for e in range(starts[t], starts[t + 1]):
+            row[cells[e]] += changes[e]
+        result[t, : base.size] = row
+
+
+@njit(cache=True)
+def by_column(
+    starts: Integers, cells: NDArray[np.int32], changes: Floats, columns: int
+) -> tuple[Integers, NDArray[np.int32], Floats]:
+    """Return the row differences column by column, rows increasing, entries of one row added up."""
+    offsets = np.zeros(columns + 1, np.int64)
+    for e in range(cells.size):
+        offsets[cells[e] + 1] += 1
+    for c in range(columns):
+        offsets[c + 1] += offsets[c]
+    fill = offsets[:-1].copy()
+    rows = np.empty(cells.size, np.int32)
+    values = np.empty(cells.size)
+    for t in range(starts.size - 1):
+        for e in range(starts[t], starts[t + 1]):
+            c = cells[e]
+            at = fill[c]
+            if at > offsets[c] and rows[at - 1] == t:
+                values[at - 1] += changes[e]
+            else:
+                rows[at] = t
+                values[at] = changes[e]
+                fill[c] = at + 1
+    # Close the gaps that merging left.
+    packed = np.empty(columns + 1, np.int64)
+    end = 0
+    for c in range(columns):
+        packed[c] = end
+        for at in range(offsets[c], fill[c]):
+            rows[end] = rows[at]
+            values[end] = values[at]
+            end += 1
+    packed[columns] = end
+    return packed, rows[:end].copy(), values[:end].copy()
+
+
+@njit(cache=True)
+def best_staircases(columns: Floats, widths: Floats) -> Floats:
+    """Return F[j, i]: the greatest mass below a non-increasing staircase over columns < j, heights >= i.
+
+    columns[i, j] is the mass per unit width of column j below level i; -inf marks i <= j.
+    """
+    size = widths.size
+    best = np.full((size + 1, size + 1), -math.inf)
+    best[0, :] = 0.0
+    for j in range(size):
+        running = -math.inf
+        for i in range(size, j, -1):
+            running = max(running, best[j, i] + widths[j] * columns[i, j])
+            best[j + 1, i] = running
+    return best

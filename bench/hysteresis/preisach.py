@@ -1,0 +1,439 @@
+"""The Preisach operator with piecewise constant density, exact to the partially covered cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.regressor import Regressor
+from bench.hysteresis.reversible import Reversible, reversible_from_json
+
+
+class Segment(NamedTuple):
+    """One quadratic piece of a monotone move: output(u ± d) - output(u) = quadratic d² + linear d.
+
+    It holds for 0 <= d <= length: up to the next level, the next corner of the memory curve, the next
+    breakpoint of the reversible part or the end of the operating range (Zhang et al. 2013, eqs. 13 to 17).
+    """
+
+    length: float
+    quadratic: float
+    linear: float
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """What the compiled loops need of an operator, computed once.
+
+    `table[i, j]` holds, at the lower left node of cell (row i of α, column j of β), the integral of the
+    density to the lower left, along the row, along the column, and the cell's density, with diagonal cells
+    completed to squares; `below[k]` is what the completion added up to level k.
+    """
+
+    levels: Floats
+    inverse_step: float
+    table: Floats
+    below: Floats
+    offset: float
+    breaks: Floats
+    quadratics: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Preisach:
+    """A weighted superposition of hysterons, plus a bias and an optional reversible part.
+
+    output = bias + sum over cells of density * (2 on-area - area) + reversible(input): Zhang et al. 2013,
+    eqs. 2, 10 and 12. The levels l_0 < ... < l_M divide the plane {l_0 <= β <= α <= l_M} into K = M(M+1)/2
+    cells of constant density; diagonal cells are triangles. Beyond the plane every hysteron is saturated and
+    the reversible part goes on. The non-monotonic model of VO2 films is the case
+    `reversible=ThermalExpansion(...)`.
+
+    Parameters
+    ----------
+    levels : array_like, shape (M + 1,)
+        Increasing discretization levels, input units.
+    density : array_like, shape (K,)
+        Density per cell, output units per input unit squared, of either sign. Cell (row i of α, column j of
+        β, j <= i) is at i (i + 1) / 2 + j.
+    bias : float
+        Constant, output units.
+    reversible : Reversible or None
+        The part without memory.
+    input_range : tuple of float or None
+        Operating range of the input; contains the plane. Default: the plane's range.
+    input_unit, output_unit : str
+        Units, for labels.
+
+    Raises
+    ------
+    ValueError
+        If levels do not increase, the density has the wrong length, a number is not finite, or the
+        operating range does not contain the plane.
+    """
+
+    levels: Floats
+    density: Floats
+    bias: float = 0.0
+    reversible: Reversible | None = None
+    input_range: tuple[float, float] = None  # type: ignore[assignment]
+    input_unit: str = ""
+    output_unit: str = ""
+
+    def __post_init__(self) -> None:
+        levels = _checks.increasing("levels", self.levels)
+        density = _checks.samples("density", self.density)
+        order = levels.size - 1
+        if density.size != order * (order + 1) // 2:
+            raise ValueError(
+                f"density: expected {order * (order + 1) // 2} values for {order} intervals, got {density.size}"
+            )
+        span = (levels[0], levels[-1]) if self.input_range is None else self.input_range
+        low, high = _checks.increasing("input_range", span).tolist()
+        if low > levels[0] or high < levels[-1]:
+            raise ValueError(
+                f"input_range: expected it to contain the plane [{levels[0]}, {levels[-1]}], got [{low}, {high}]"
+            )
+        object.__setattr__(self, "levels", _checks.frozen(levels))
+        object.__setattr__(self, "density", _checks.frozen(density))
+        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
+        object.__setattr__(self, "input_range", (low, high))
+
+    @property
+    def order(self) -> int:
+        """Number of intervals M."""
+        return self.levels.size - 1
+
+    @property
+    def coefficients(self) -> Floats:
+        """Density, then the reversible part's coefficients, shape (K + q,)."""
+        if self.reversible is None:
+            return self.density
+        return np.concatenate([self.density, self.reversible.coefficients])
+
+    def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Preisach:
+        """Return the same operator with other coefficients, shape (K + q,), and bias.
+
+        Raises
+        ------
+        ValueError
+            If there are not K + q coefficients or one is not finite.
+        """
+        values = _checks.samples("coefficients", coefficients)
+        cells = self.density.size
+        if values.size != self.coefficients.size:
+            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        term = self.reversible
+        if term is not None:
+            term = term.with_coefficients(values[cells:].tolist())
+        return replace(self, density=values[:cells], bias=bias, reversible=term)
+
+    def cell_areas(self) -> Floats:
+        """Return the area of each cell, shape (K,); a diagonal cell has half a square."""
+        steps = np.diff(self.levels)
+        areas = np.outer(steps, steps)
+        areas[np.diag_indices(self.order)] *= 0.5
+        return np.asarray(areas[np.tril_indices(self.order)])
+
+    def density_matrix(self) -> Floats:
+        """Return the density as matrix [row of α, column of β], shape (M, M), NaN below the diagonal."""
+        matrix = np.full((self.order, self.order), np.nan)
+        matrix[np.tril_indices(self.order)] = self.density
+        return matrix
+
+    @cached_property
+    def lattice(self) -> Lattice:
+        """The tables of prefix sums that the compiled loops read."""
+        order, steps = self.order, np.diff(self.levels)
+        density = np.zeros((order, order))
+        density[np.tril_indices(order)] = self.density
+        along_row = np.zeros((order, order + 1))
+        np.cumsum(density * steps, axis=1, out=along_row[:, 1:])
+        along_column = np.zeros((order + 1, order))
+        np.cumsum(density * steps[:, None], axis=0, out=along_column[1:])
+        corner = np.zeros((order + 1, order + 1))
+        np.cumsum(along_column * steps, axis=1, out=corner[:, 1:])
+        table = np.stack([corner[:order, :order], along_row[:, :order], along_column[:order], density], axis=2)
+        below = np.concatenate([[0.0], np.cumsum(0.5 * np.diag(density) * steps**2)])
+        if self.reversible is None:
+            breaks, quadratics = np.empty(0), np.zeros((1, 3))
+        else:
+            breaks, quadratics = self.reversible.pieces()
+        mean = (self.levels[-1] - self.levels[0]) / order
+        uniform = bool(np.abs(steps - mean).max() <= 1e-9 * mean)
+        return Lattice(
+            levels=self.levels.copy(),
+            inverse_step=1.0 / mean if uniform else 0.0,
+            table=np.ascontiguousarray(table),
+            below=below,
+            offset=self.bias - float(self.density @ self.cell_areas()),
+            breaks=breaks,
+            quadratics=np.ascontiguousarray(quadratics),
+        )
+
+    def initial_state(self) -> MemoryCurve:
+        """Return negative saturation: every hysteron off, the input at the low end of the operating range."""
+        return MemoryCurve.from_negative_saturation(self.input_range[0])
+
+    def _pieces(self, state: MemoryCurve | None) -> tuple[Floats, Floats, float]:
+        memory = self.initial_state() if state is None else state
+        left, height, present = memory.staircase(float(self.levels[0]), float(self.levels[-1]))
+        return np.array(left, dtype=np.float64), np.array(height, dtype=np.float64), present
+
+    def evaluate(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Floats:
+        """Return the outputs of a sequence of inputs.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (N,)
+            Inputs, between which the input moves monotonically.
+        state : MemoryCurve or None
+            Memory before the first sample; default negative saturation. `state.advance(inputs)` is the
+            memory after the last.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Outputs, output units.
+
+        Raises
+        ------
+        ValueError
+            If `inputs` is empty, not one-dimensional or not finite.
+        """
+        from bench.hysteresis import _kernels
+
+        t = self.lattice
+        return np.asarray(
+            _kernels.evaluate(
+                _checks.samples("inputs", inputs),
+                t.levels,
+                t.inverse_step,
+                t.table,
+                t.below,
+                t.offset,
+                t.breaks,
+                t.quadratics,
+                *self._pieces(state),
+            )
+        )
+
+    def value(self, state: MemoryCurve) -> float:
+        """Return the output of a state, in a time proportional to its corners."""
+        from bench.hysteresis import _kernels
+
+        t = self.lattice
+        return float(
+            _kernels.evaluate(
+                np.array([state.input]),
+                t.levels,
+                t.inverse_step,
+                t.table,
+                t.below,
+                t.offset,
+                t.breaks,
+                t.quadratics,
+                *self._pieces(state),
+            )[0]
+        )
+
+    def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
+        """Return memory and output after the input moved monotonically to `value`.
+
+        Raises
+        ------
+        ValueError
+            If `value` is not finite.
+        """
+        after = state.step(value)
+        return after, self.value(after)
+
+    def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
+        """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).
+
+        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17.
+
+        Raises
+        ------
+        ValueError
+            If `direction` is neither -1 nor 1.
+        """
+        from bench.hysteresis import _kernels
+
+        if direction not in (-1, 1):
+            raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
+        t = self.lattice
+        left, height, _ = self._pieces(state)
+        found = Segment(
+            *_kernels.segment(
+                t.levels,
+                t.inverse_step,
+                t.table,
+                t.breaks,
+                t.quadratics,
+                *self.input_range,
+                left,
+                height,
+                state.input,
+                direction,
+            )
+        )
+        return found if found.length > 0.0 else None
+
+    def regressor(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Regressor:
+        """Return the matrix of s = 2 on-area - area per cell, then the reversible part's columns.
+
+        evaluate(inputs) = bias + regressor @ coefficients (Zhang et al. 2013, eqs. 10 and 12).
+
+        Parameters
+        ----------
+        inputs : array_like, shape (N,)
+            Inputs.
+        state : MemoryCurve or None
+            Memory before the first sample; default negative saturation.
+
+        Raises
+        ------
+        ValueError
+            If `inputs` is empty, not one-dimensional or not finite.
+        """
+        from bench.hysteresis import _kernels
+
+        sequence = _checks.samples("inputs", inputs)
+        t = self.lattice
+        left, height, present = self._pieces(state)
+        no_cells, no_changes = np.empty(0, dtype=np.int32), np.empty(0)
+
+        count = _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, no_cells, no_changes, False)
+        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
+        _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, cells, changes, True)
+        base = np.bincount(cells, changes, minlength=self.density.size) - self.cell_areas()
+
+        starts = np.empty(sequence.size + 1, dtype=np.int64)
+        arguments = (sequence, t.levels, t.inverse_step, left, height, present, starts)
+        count = _kernels.swept_differences(*arguments, no_cells, no_changes, False)
+        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
+        _kernels.swept_differences(*arguments, cells, changes, True)
+        if self.reversible is None:
+            extra = np.empty((sequence.size, 0))
+        else:
+            extra = np.ascontiguousarray(self.reversible.columns(sequence))
+        return Regressor(base=base, starts=starts, cells=cells, changes=changes, extra=extra)
+
+    def output_range(self) -> tuple[float, float]:
+        """Return the least and greatest output over every memory the operating range can produce.
+
+        With a nonnegative density both are on the two major branches (Zhang et al. 2013, proposition 1).
+        For a signed density the best memory curve over each input is found by dynamic programming over the
+        columns. Either way each quadratic piece is tested at its ends and at its vertex.
+        """
+        return -self._greatest(-1.0), self._greatest(1.0)
+
+    def _greatest(self, sign: float) -> float:
+        """Return the greatest value of sign * output."""
+        from bench.hysteresis import _kernels
+
+        t, order = self.lattice, self.order
+        low, high = self.input_range
+        steps = np.diff(self.levels)
+        quadratics = sign * t.quadratics
+        density = sign * t.table[:, :, 3]
+        row = sign * t.table[:, :, 1]
+        column = np.zeros((order + 1, order))
+        np.cumsum(density * steps[:, None], axis=0, out=column[1:])
+        corner = np.zeros((order + 1, order + 1))
+        np.cumsum(column * steps, axis=1, out=corner[:, 1:])
+        below = sign * t.below
+        best = _kernels.best_staircases(np.where(np.tri(order + 1, order, -1) > 0, column, -np.inf), steps)
+        full = 2.0 * (corner[order, order] - below[order])
+        offset = sign * t.offset
+        # (from, to, origin, constant, linear, quadratic): constant + linear x + quadratic x², x = u - origin.
+        pieces: list[tuple[float, float, float, Floats, Floats, float]] = []
+        nothing = np.zeros(1)
+        pieces.append((low, self.levels[0], low, nothing, nothing, 0.0))
+        pieces.append((self.levels[-1], high, high, np.array([full]), nothing, 0.0))
+        for k in range(order):
+            h, m = steps[k], density[k, k]
+            settled = 2.0 * (corner[k, k] - below[k])
+            # The staircase reaches above this row over the first j columns, j <= k ...
+            j = np.arange(k + 1)
+            gain = 2.0 * (best[j, k + 1] - corner[k + 1, j])
+            constants = [settled + gain + 2.0 * h * row[k, j]]
+            linears = [2.0 * (row[k, k] - row[k, j])]
+            pieces.append((self.levels[k], self.levels[k + 1], self.levels[k], constants[0], linears[0], float(m)))
+            # ... or over the partial column too, there up to level i > k.
+            i = np.arange(k + 1, order + 1)
+            constant = settled + 2.0 * (best[k, i] - corner[k + 1, k]) + 2.0 * h * row[k, k]
+            linear = 2.0 * (h * m + column[i, k] - column[k + 1, k])
+            pieces.append((self.levels[k], self.levels[k + 1], self.levels[k], constant, linear, float(-m)))
+        greatest = -np.inf
+        for start, stop, origin, constant, linear, quadratic in pieces:
+            cuts = [start, *t.breaks[(t.breaks > start) & (t.breaks < stop)].tolist(), stop]
+            for p, q in pairwise(cuts):
+                r = int(np.searchsorted(t.breaks, 0.5 * (p + q)))
+                c0, c1, c2 = quadratics[r]
+                a = quadratic + c2
+                b = linear + c1 + 2.0 * c2 * origin
+                c = constant + c0 + origin * (c1 + origin * c2)
+                points = [np.full_like(b, p - origin), np.full_like(b, q - origin)]
+                if a < 0.0:
+                    points.append(np.clip(-b / (2.0 * a), p - origin, q - origin))
+                for x in points:
+                    greatest = max(greatest, float((c + x * (b + x * a)).max()))
+        return greatest + offset
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the operator as a JSON object."""
+        return {
+            "type": "preisach",
+            "levels": self.levels.tolist(),
+            "density": self.density.tolist(),
+            "bias": self.bias,
+            "reversible": None if self.reversible is None else self.reversible.to_json(),
+            "input_range": list(self.input_range),
+            "input_unit": self.input_unit,
+            "output_unit": self.output_unit,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Preisach:
+        """Return the operator that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        term = document.get("reversible") if isinstance(document, Mapping) else None
+        return cls(
+            _checks.json_field(document, "levels", "preisach"),
+            _checks.json_field(document, "density", "preisach"),
+            _checks.json_field(document, "bias", "preisach"),
+            None if term is None else reversible_from_json(term),
+            document.get("input_range"),  # type: ignore[arg-type]
+            document.get("input_unit", ""),
+            document.get("output_unit", ""),
+        )
+
+
+def uniform_levels(low: float, high: float, intervals: int) -> Floats:
+    """Return `intervals` + 1 equally spaced discretization levels from low to high.
+
+    Raises
+    ------
+    ValueError
+        If low >= high or there is no interval.
+    """
+    first, last = _checks.increasing("low, high", [low, high]).tolist()
+    if intervals < 1:
+        raise ValueError(f"intervals: expected at least 1, got {intervals}")
+    return np.linspace(first, last, intervals + 1)

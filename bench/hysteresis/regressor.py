@@ -1,0 +1,102 @@
+"""The matrix that maps an operator's coefficients to its outputs, kept as sparse row differences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Regressor:
+    """A regressor of shape (N, K + q): K columns that change only when swept, and q dense ones.
+
+    Row n differs from row n - 1 only in the cells that the input swept between the two samples, so a
+    product costs O(N M) instead of O(N M²). A cell may be listed more than once in a row: entries add.
+
+    Parameters
+    ----------
+    base : ndarray, shape (K,)
+        The row of the state before the first sample.
+    starts : ndarray of int64, shape (N + 1,)
+        Row n's entries are starts[n] to starts[n + 1].
+    cells : ndarray of int32, shape (nnz,)
+        Column of each entry.
+    changes : ndarray, shape (nnz,)
+        Change of that column from the row before.
+    extra : ndarray, shape (N, q)
+        The dense columns, right of the sparse ones.
+    """
+
+    base: Floats
+    starts: NDArray[np.int64]
+    cells: NDArray[np.int32]
+    changes: Floats
+    extra: Floats
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Samples and coefficients."""
+        return self.extra.shape[0], self.base.size + self.extra.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, bytes."""
+        return self.base.nbytes + self.starts.nbytes + self.cells.nbytes + self.changes.nbytes + self.extra.nbytes
+
+    def product(self, coefficients: ArrayLike) -> Floats:
+        """Return R @ coefficients, shape (N,).
+
+        Raises
+        ------
+        ValueError
+            If `coefficients` has not the shape (K + q,) or is not finite.
+        """
+        from bench.hysteresis import _kernels
+
+        weights = self._vector("coefficients", coefficients, self.shape[1])
+        count = self.base.size
+        result = self.extra @ weights[count:]
+        if count:
+            result += self.base @ weights[:count]
+            result += _kernels.difference_product(self.starts, self.cells, self.changes, weights[:count])
+        return result
+
+    def transpose_product(self, residuals: ArrayLike) -> Floats:
+        """Return R.T @ residuals, shape (K + q,).
+
+        Raises
+        ------
+        ValueError
+            If `residuals` has not the shape (N,) or is not finite.
+        """
+        from bench.hysteresis import _kernels
+
+        values = self._vector("residuals", residuals, self.shape[0])
+        count = self.base.size
+        result = np.empty(self.shape[1])
+        result[count:] = self.extra.T @ values
+        if count:
+            result[:count] = self.base * values.sum()
+            _kernels.difference_transpose_product(self.starts, self.cells, self.changes, values, result[:count])
+        return result
+
+    def dense(self) -> Floats:
+        """Return the whole matrix, shape (N, K + q): 8 N (K + q) bytes."""
+        from bench.hysteresis import _kernels
+
+        result = np.empty(self.shape)
+        _kernels.dense_rows(self.starts, self.cells, self.changes, self.base, result)
+        result[:, self.base.size :] = self.extra
+        return result
+
+    @staticmethod
+    def _vector(name: str, values: ArrayLike, size: int) -> Floats:
+        vector = _checks.samples(name, values)
+        if vector.size != size:
+            raise ValueError(f"{name}: expected {size} values, got {vector.size}")
+        return vector

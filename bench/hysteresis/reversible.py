@@ -1,0 +1,202 @@
+"""The single-valued part beside the hysterons: exact quadratics of the input, piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+
+
+class Reversible(Protocol):
+    """A term without memory, linear in its coefficients and piecewise quadratic in the input."""
+
+    @property
+    def coefficients(self) -> Floats:
+        """The coefficients that identification may change, shape (q,)."""
+        ...
+
+    @property
+    def nonnegative(self) -> bool:
+        """Whether physics demands coefficients >= 0."""
+        ...
+
+    def with_coefficients(self, coefficients: Sequence[float]) -> Reversible:
+        """Return the same term with other coefficients."""
+        ...
+
+    def columns(self, inputs: ArrayLike) -> Floats:
+        """Return the regressor's columns, shape (N, q)."""
+        ...
+
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Return breakpoints (n,) and quadratics (n + 1, 3): c0 + c1 u + c2 u² between them."""
+        ...
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the term as a JSON object."""
+        ...
+
+
+@dataclass(frozen=True)
+class QuadraticTerm:
+    """The reversible term linear (u - origin) + quadratic (u - origin)².
+
+    Parameters
+    ----------
+    linear : float
+        Slope at the origin, output units per input unit.
+    quadratic : float or None
+        Curvature coefficient, output units per input unit squared; None leaves it out altogether.
+    origin : float
+        Input at which the term is zero.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
+    """
+
+    linear: float = 0.0
+    quadratic: float | None = None
+    origin: float = 0.0
+
+    def __post_init__(self) -> None:
+        _checks.number("linear", self.linear)
+        _checks.number("origin", self.origin)
+        if self.quadratic is not None:
+            _checks.number("quadratic", self.quadratic)
+
+    @property
+    def coefficients(self) -> Floats:
+        """Linear, and quadratic if present, shape (1,) or (2,)."""
+        return np.array([self.linear] if self.quadratic is None else [self.linear, self.quadratic])
+
+    @property
+    def nonnegative(self) -> bool:
+        """The signs are free."""
+        return False
+
+    def with_coefficients(self, coefficients: Sequence[float]) -> QuadraticTerm:
+        """Return the same term with other coefficients, as many as it has."""
+        values = _checks.samples("coefficients", coefficients)
+        if values.size != self.coefficients.size:
+            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        return QuadraticTerm(float(values[0]), None if self.quadratic is None else float(values[1]), self.origin)
+
+    def columns(self, inputs: ArrayLike) -> Floats:
+        """Return (u - origin) and, if present, (u - origin)², shape (N, 1) or (N, 2)."""
+        shifted = np.asarray(inputs, dtype=np.float64) - self.origin
+        return np.column_stack([shifted] if self.quadratic is None else [shifted, shifted**2])
+
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Return one quadratic and no breakpoint."""
+        a, b, u0 = self.quadratic or 0.0, self.linear, self.origin
+        return np.empty(0), np.array([[a * u0 * u0 - b * u0, b - 2.0 * a * u0, a]])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the term as a JSON object."""
+        return {"type": "quadratic", "linear": self.linear, "quadratic": self.quadratic, "origin": self.origin}
+
+
+@dataclass(frozen=True)
+class ThermalExpansion:
+    """The thermal term of a film whose phase fraction θ is a ramp: -[k0 (1 - θ) + k1 θ] (T - reference).
+
+    θ = clip((T - low) / (high - low), 0, 1): Zhang et al. 2013, eqs. 6, 7 and 11.
+
+    Parameters
+    ----------
+    k0, k1 : float
+        Expansion coefficients of the low- and high-temperature phase, output units per kelvin, >= 0.
+    low, high : float
+        Phase-transition range, °C, low < high.
+    reference : float
+        Temperature of zero expansion T0, °C.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or low >= high.
+    """
+
+    k0: float = 0.0
+    k1: float = 0.0
+    low: float = 30.0
+    high: float = 70.0
+    reference: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name in ("k0", "k1", "low", "high", "reference"):
+            _checks.number(name, getattr(self, name))
+        if self.low >= self.high:
+            raise ValueError(f"low: expected a value below high = {self.high}, got {self.low}")
+
+    @property
+    def coefficients(self) -> Floats:
+        """K0 and k1, shape (2,)."""
+        return np.array([self.k0, self.k1])
+
+    @property
+    def nonnegative(self) -> bool:
+        """Both are differences of expansion coefficients, known to be >= 0."""
+        return True
+
+    def with_coefficients(self, coefficients: Sequence[float]) -> ThermalExpansion:
+        """Return the same term with other k0, k1."""
+        values = _checks.samples("coefficients", coefficients)
+        if values.size != 2:
+            raise ValueError(f"coefficients: expected k0 and k1, got {values.size} values")
+        return ThermalExpansion(float(values[0]), float(values[1]), self.low, self.high, self.reference)
+
+    def columns(self, inputs: ArrayLike) -> Floats:
+        """Return -(1 - θ)(T - T0) and -θ (T - T0), shape (N, 2)."""
+        temperature = np.asarray(inputs, dtype=np.float64)
+        theta = np.clip((temperature - self.low) / (self.high - self.low), 0.0, 1.0)
+        rise = temperature - self.reference
+        return np.column_stack([-(1.0 - theta) * rise, -theta * rise])
+
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Return the ramp's ends and line, quadratic, line (Zhang et al. 2013, eq. 15)."""
+        k0, k1, t0 = self.k0, self.k1, self.reference
+        q = (k1 - k0) / (self.high - self.low)
+        middle = [(k0 - q * self.low) * t0, q * (t0 + self.low) - k0, -q]
+        return np.array([self.low, self.high]), np.array([[k0 * t0, -k0, 0.0], middle, [k1 * t0, -k1, 0.0]])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the term as a JSON object."""
+        return {
+            "type": "thermal-expansion",
+            "k0": self.k0,
+            "k1": self.k1,
+            "low": self.low,
+            "high": self.high,
+            "reference": self.reference,
+        }
+
+
+def reversible_from_json(document: Mapping[str, Any]) -> Reversible:
+    """Return the term that `to_json` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the type is unknown or a key is missing or wrong.
+    """
+    kind = _checks.json_field(document, "type", "reversible")
+    fields = {key: value for key, value in document.items() if key != "type"}
+    terms: dict[str, type[QuadraticTerm] | type[ThermalExpansion]] = {
+        "quadratic": QuadraticTerm,
+        "thermal-expansion": ThermalExpansion,
+    }
+    if kind not in terms:
+        raise ValueError(f"reversible: expected type {' or '.join(map(repr, terms))}, got {kind!r}")
+    try:
+        return terms[kind](**fields)
+    except TypeError as error:
+        raise ValueError(f"reversible: {error}") from None

@@ -1,0 +1,457 @@
+"""The command line: what it prints, what it writes, what it exits with."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.journal import FILE_NAME, Record
+
+FAST = ["--rig", "vo2", "--clock", "virtual"]
+SHORT_CREEP = ["--set", "duration=4", "--set", "settling=2"]
+
+
+@pytest.fixture
+def bench(capsys):
+    """Run a command in this process; return exit code, standard output and standard error."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stopped:
+            main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    result = folder / "run.json"
+    command = ["damped-oscillation", *FAST, "--set", "half_cycles=2", "--set", "increment=1.5", "--out", str(folder)]
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", *command, "--json", str(result)])
+    assert not stopped.value.code
+    return json.loads(result.read_text())
+
+
+def write_loop(path, rows=400):
+    """A CSV file of a rate-independent loop that a Preisach operator fits."""
+    inputs = 5 * np.sin(np.linspace(0, 6 * np.pi, rows)) * np.linspace(1, 0.2, rows)
+    play, outputs = 0.0, []
+    for value in inputs:
+        play = min(max(play, value - 1.0), value + 1.0)
+        outputs.append(play)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["voltage [V]", "displacement [µm]"])
+        writer.writerows(zip(inputs, outputs, strict=True))
+    return inputs, np.array(outputs)
+
+
+class TestHelp:
+    @pytest.mark.parametrize("command", ["", "list", "run", "identify", "predict", "report", "export", "reproduce"])
+    def test_every_command_has_help(self, bench, command):
+        code, out, _ = bench(*command.split(), "--help")
+        assert code == 0
+        assert "Usage" in out
+
+    def test_help_says_what_exit_codes_mean(self, bench):
+        _, out, _ = bench("--help")
+        assert "Exit codes" in out
+
+    def test_help_of_a_protocol_shows_its_parameters_with_units_and_ranges(self, bench):
+        code, out, _ = bench("run", "damped-oscillation", "--help")
+        assert code == 0
+        assert "half_cycles" in out
+        assert "°C" in out
+        assert "1 to 1000" in out
+
+    def test_help_does_not_import_what_it_does_not_need(self):
+        code = (
+            "import sys\n"
+            "from bench.cli import main\n"
+            "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+            "heavy = {'numba', 'scipy', 'rerun', 'matplotlib', 'pymodbus', 'filterpy', 'pyarrow'}\n"
+            "heavy &= set(sys.modules)\n"
+            "assert not heavy, heavy\n"
+        )
+        subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+class TestList:
+    def test_shows_rigs_protocols_and_models(self, bench, tmp_path):
+        code, out, _ = bench("list", "--json", tmp_path / "list.json")
+        assert code == 0
+        content = json.loads((tmp_path / "list.json").read_text())
+        assert {"vo2", "vo2-hardware"} <= set(content["rigs"])
+        assert {"creep", "damped-oscillation", "random-validation"} <= set(content["protocols"])
+        assert {"preisach", "preisach-signed", "preisach-nonmonotonic", "polynomial"} <= set(content["models"])
+        assert "vo2-hardware" in out
+
+    def test_gives_a_copy_of_a_rig_file(self, bench, tmp_path):
+        _, out, _ = bench("list", "vo2")
+        copy = tmp_path / "copy.toml"
+        copy.write_text(out)
+        code, _, _ = bench("run", "creep", "--rig", copy, "--clock", "virtual", *SHORT_CREEP, "--out", tmp_path)
+        assert code == 0
+
+    def test_unknown_name_lists_what_there_is(self, bench):
+        code, _, err = bench("list", "nothing")
+        assert code == 2
+        assert "vo2" in err
+
+
+class TestRun:
+    def test_leaves_a_record_and_a_recording(self, finished_run):
+        folder = Path(finished_run["folder"])
+        assert finished_run["status"] == "completed"
+        assert finished_run["safe_state"] == {"tec": "safe", "psd": "safe"}
+        assert finished_run["laboratory_seconds"] > 8 * finished_run["steps"]
+        assert (folder / "run.rrd").stat().st_size > 0
+        with Record(folder) as record:
+            steps = record.steps()
+            assert len(steps) == finished_run["steps"]
+            assert record.meta["seed"] == 0
+            assert "Meerstetter" in record.meta["devices"]["tec"]
+            assert record.meta["parameters"]["half_cycles"] == 2
+            assert record.meta["calibration"]["psd"]["volts_per_metre"] == 1e5
+            # The plate arrives at each set-point, and the beam bends by about what the film makes it.
+            assert np.max(np.abs(steps["tec_temperature"] - steps["tec_setpoint"])) < 0.2
+            assert np.ptp(steps["curvature"]) > 1500
+
+    def test_same_seed_gives_the_same_record(self, bench, tmp_path):
+        journals = []
+        for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+            result = tmp_path / f"{name}.json"
+            code, _, _ = bench(
+                "run", "creep", *FAST, *SHORT_CREEP, "--seed", seed, "--out", tmp_path, "--json", result
+            )
+            assert code == 0
+            with Record(Path(json.loads(result.read_text())["folder"])) as record:
+                steps, ticks, events = record.steps(), record.telemetry(), record.events()
+                journals.append((steps, ticks, events, record.meta["epoch"], record.meta["finished"]))
+        first, second, other = journals
+        for table, again in zip(first[:2], second[:2], strict=True):
+            assert all(np.array_equal(table[name], again[name], equal_nan=True) for name in table.columns)
+        assert first[2:] == second[2:]
+        assert not np.array_equal(first[0]["curvature"], other[0]["curvature"])
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (["nothing", *FAST], ["there is no protocol", "creep"]),
+            (["creep", "--rig", "nothing"], ["there is no rig", "vo2"]),
+            (["creep"], ["--rig"]),
+            (["creep", "--rig", "vo2", "--clock", "fast"], ["clock", "virtual"]),
+            (["creep", *FAST, "--set", "heat=3"], ["heat", "hot"]),
+            (["creep", *FAST, "--set", "hot=900"], ["hot", "900", "-20 to 150", "°C"]),
+            (["creep", *FAST, "--set", "hot"], ["KEY=VALUE"]),
+            (["creep", *FAST, "--set", "hot=140"], ["140", "15 to 95 °C"]),
+            (["creep", *FAST, "--set", "settling=90"], ["settling", "duration"]),
+            (["creep", *FAST, "--override", "devices.tec.watchdog=700"], ["vo2.toml", "devices.tec.watchdog", "700"]),
+            (["creep", *FAST, "--override", "devices.psd.colour=1"], ["devices.psd.colour", "allowed"]),
+            (["creep", "--rig", "vo2-hardware", "--clock", "virtual"], ["wall clock"]),
+        ],
+    )
+    def test_bad_input_is_one_message_before_anything_moves(self, bench, tmp_path, arguments, words):
+        code, _, err = bench("run", *arguments, "--out", tmp_path)
+        assert code == 2
+        assert "Traceback" not in err
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
+        assert not list(tmp_path.iterdir())
+
+    def test_hardware_that_does_not_answer_is_one_message(self, bench, tmp_path):
+        code, _, err = bench(
+            "run",
+            "creep",
+            "--rig",
+            "vo2-hardware",
+            "--override",
+            f"devices.tec.port={tmp_path}/none",
+            "--out",
+            tmp_path,
+        )
+        assert code == 4
+        assert "tec" in err
+        assert "Traceback" not in err
+
+    def test_interlock_ends_the_run_and_keeps_the_record(self, bench, tmp_path):
+        rig = tmp_path / "tight.toml"
+        _, text, _ = bench("list", "vo2")
+        rig.write_text(text.replace("high = 100.0", "high = 60.0"))
+        code, _, err = bench(
+            "run", "creep", "--rig", rig, "--clock", "virtual", "--out", tmp_path, "--json", tmp_path / "r.json"
+        )
+        assert code == 5
+        assert "tec_temperature" in err
+        result = json.loads((tmp_path / "r.json").read_text())
+        assert result["status"] == "failed"
+        assert result["safe_state"] == {"tec": "safe", "psd": "safe"}
+        with Record(Path(result["folder"])) as record:
+            assert record.status == "failed"
+            assert len(record.steps()) == result["steps"] > 0
+
+    @pytest.mark.parametrize(
+        ("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130)], ids=lambda v: str(v)
+    )
+    def test_a_signal_ends_the_process_in_the_safe_state(self, tmp_path, sent, code):
+        command = ["run", "creep", "--rig", "vo2", "--clock", "x2", "--out", str(tmp_path)]
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        try:
+            wait_for_a_tick(process, tmp_path)
+            process.send_signal(sent)
+            output, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
+        assert process.returncode == code, output
+        assert "Traceback" not in output
+        (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
+        with Record(folder) as record:
+            assert record.status == "aborted"
+            assert record.meta["safe_state"] == {"tec": "safe", "psd": "safe"}
+
+    def test_a_killed_process_leaves_a_readable_record(self, bench, tmp_path):
+        command = ["run", "creep", "--rig", "vo2", "--clock", "x5", "--out", str(tmp_path)]
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        wait_for_a_tick(process, tmp_path)
+        process.kill()
+        process.wait()
+        (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
+        with Record(folder) as record:
+            assert record.status == "unfinished"
+            assert len(record.telemetry()) > 0
+        code, out, _ = bench("report", folder)
+        assert code == 0
+        assert "unfinished" in out
+
+
+def wait_for_a_tick(process, folder):
+    """Return once the run that a process carries out has recorded telemetry."""
+    from bench.clock import WallClock
+
+    clock = WallClock()
+    while clock.now() < 60:
+        assert process.poll() is None
+        for path in folder.glob(f"*/{FILE_NAME}"):
+            try:
+                with Record(path) as record:
+                    if len(record.telemetry()) > 0:
+                        return
+            except Exception:
+                continue
+        clock.sleep(0.05)
+    raise AssertionError("the run did not begin within a minute")
+
+
+class TestIdentifyAndPredict:
+    def test_round_trip(self, bench, tmp_path):
+        inputs, outputs = write_loop(tmp_path / "loop.csv")
+        arguments = ["--input", "voltage", "--output", "displacement", "--model", "preisach", "--levels", "20"]
+        code, out, _ = bench(
+            "identify", tmp_path / "loop.csv", *arguments, "--skip", 70,
+            "--out", tmp_path / "model.json", "--json", tmp_path / "fit.json", "--figures", tmp_path / "figures",
+        )  # fmt: skip
+        assert code == 0
+        assert "KKT" in out
+        fit = json.loads((tmp_path / "fit.json").read_text())
+        assert {"samples", "levels", "max", "rms", "rms_percent", "kkt"} <= set(fit)
+        assert fit["samples"] == 330
+        assert fit["levels"] == 20
+        assert fit["kkt"] < 1e-10
+        assert fit["rms_percent"] < 1.5
+        assert len(list((tmp_path / "figures").iterdir())) == 3
+
+        code, _, _ = bench(
+            "predict", tmp_path / "model.json", tmp_path / "loop.csv", "--input", "voltage",
+            "--output", "displacement", "--out", tmp_path / "out.csv", "--json", tmp_path / "predict.json",
+        )  # fmt: skip
+        assert code == 0
+        with (tmp_path / "out.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        assert list(rows[0]) == ["voltage", "predicted"]
+        predicted = np.array([float(row["predicted"]) for row in rows])
+        np.testing.assert_array_equal([float(row["voltage"]) for row in rows], inputs)
+        assert np.sqrt(np.mean((predicted - outputs)[70:] ** 2)) == pytest.approx(fit["rms"], rel=1e-9)
+
+    def test_a_run_is_as_good_as_a_file(self, bench, tmp_path, finished_run):
+        options = ["--input", "tec_temperature", "--output", "curvature", "--model", "polynomial"]
+        bench("export", finished_run["folder"], "--format", "csv", "--out", tmp_path)
+        results = []
+        for source in (finished_run["folder"], tmp_path / "readings.csv"):
+            code, _, _ = bench(
+                "identify", source, *options, "--out", tmp_path / "m.json", "--json", tmp_path / "r.json"
+            )
+            assert code == 0
+            results.append(json.loads((tmp_path / "r.json").read_text()))
+            operator = json.loads((tmp_path / "m.json").read_text())["operator"]
+            assert (operator["input_unit"], operator["output_unit"]) == ("°C", "1/m")
+        assert results[0] == results[1]
+
+    @pytest.mark.parametrize(
+        ("mend", "words"),
+        [
+            (lambda text: text.replace("voltage", "current", 1), ["no column 'voltage'", "current [V]"]),
+            (lambda text: replace_cell(text, 5, "1 V"), ["row 5", "voltage", "'1 V' is not a number"]),
+            (lambda text: replace_cell(text, 7, "nan"), ["row 7", "voltage", "finite"]),
+            (lambda text: replace_cell(text, 9, ""), ["row 9", "voltage", "empty"]),
+            (lambda text: "\n".join(text.splitlines()[:5]) + "\n", ["4 rows", "10"]),
+            (lambda text: re.sub(r"(?m)^-?[0-9.e-]+,", "1.5,", text), ["voltage", "1.5", "excites nothing"]),
+            (lambda _: "", ["empty"]),
+        ],
+        ids=["column", "text", "nan", "empty cell", "few rows", "constant", "empty file"],
+    )
+    def test_trouble_in_a_file_is_one_message_with_row_and_column(self, bench, tmp_path, mend, words):
+        write_loop(tmp_path / "loop.csv")
+        path = tmp_path / "bad.csv"
+        path.write_text(mend((tmp_path / "loop.csv").read_text()))
+        code, _, err = bench(
+            "identify", path, "--input", "voltage", "--output", "displacement", "--model", "preisach"
+        )
+        assert code == 3
+        assert err.count("error:") == 1
+        for word in ["bad.csv", *words]:
+            assert word in re.sub(r"\s+", " ", err)
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (["--model", "nothing"], ["preisach-signed"]),
+            (["--model", "polynomial", "--levels", "20"], ["levels"]),
+            (["--model", "preisach", "--plane", "3", "1"], ["increasing", "3", "1"]),
+            (["--model", "preisach", "--reversible", "cubic"], ["reversible", "quadratic"]),
+            (["--model", "preisach", "--skip", "-3"], ["--skip"]),
+        ],
+    )
+    def test_wrong_options_are_one_message(self, bench, tmp_path, options, words):
+        write_loop(tmp_path / "loop.csv")
+        code, _, err = bench(
+            "identify", tmp_path / "loop.csv", "--input", "voltage", "--output", "displacement", *options
+        )
+        assert code == 2
+        assert "Traceback" not in err
+        for word in words:
+            assert word in err
+
+    @pytest.mark.parametrize(
+        ("mend", "word"),
+        [
+            (lambda model: {**model, "version": 99}, "version 99"),
+            (lambda model: {**model, "format": "other"}, "not a model file"),
+            (lambda model: {key: value for key, value in model.items() if key != "operator"}, "operator"),
+            (lambda model: {**model, "operator": {**model["operator"], "density": [1.0]}}, "density"),
+            (lambda _: [], "not a model file"),
+        ],
+    )
+    def test_a_damaged_model_file_is_one_message(self, bench, tmp_path, mend, word):
+        write_loop(tmp_path / "loop.csv")
+        path = tmp_path / "model.json"
+        bench(
+            "identify", tmp_path / "loop.csv", "--input", "voltage", "--output", "displacement",
+            "--model", "preisach", "--levels", "5", "--out", path,
+        )  # fmt: skip
+        path.write_text(json.dumps(mend(json.loads(path.read_text()))))
+        code, _, err = bench(
+            "predict", path, tmp_path / "loop.csv", "--input", "voltage", "--out", tmp_path / "o.csv"
+        )
+        assert code == 3
+        assert word in err
+        assert not (tmp_path / "o.csv").exists()
+
+    def test_a_column_of_another_unit_is_refused(self, bench, tmp_path):
+        write_loop(tmp_path / "loop.csv")
+        path = tmp_path / "model.json"
+        options = ["--input", "voltage", "--output", "displacement", "--model", "polynomial", "--out", path]
+        bench("identify", tmp_path / "loop.csv", *options)
+        other = tmp_path / "other.csv"
+        other.write_text((tmp_path / "loop.csv").read_text().replace("[V]", "[mV]"))
+        code, _, err = bench("predict", path, other, "--input", "voltage", "--out", tmp_path / "o.csv")
+        assert code == 3
+        assert "mV" in err
+
+
+def replace_cell(text, row, value):
+    lines = text.splitlines()
+    lines[row] = f"{value},{lines[row].partition(',')[2]}"
+    return "\n".join(lines) + "\n"
+
+
+class TestReportAndExport:
+    def test_report_compares_models_of_the_run_and_others(self, bench, tmp_path, finished_run):
+        options = ["--input", "tec_temperature", "--output", "curvature", "--model", "polynomial"]
+        bench("identify", finished_run["folder"], *options, "--out", tmp_path / "model.json")
+        code, out, _ = bench(
+            "report", finished_run["folder"], "--model", tmp_path / "model.json",
+            "--out", tmp_path / "figures", "--json", tmp_path / "report.json",
+        )  # fmt: skip
+        assert code == 0
+        assert "completed" in out
+        report = json.loads((tmp_path / "report.json").read_text())
+        assert report["steps"] == finished_run["steps"]
+        assert report["models"]["polynomial"]["rms"] > 0
+        assert report["extremes"]["tec_temperature"]["high"] == pytest.approx(84, abs=0.2)
+        assert all(Path(path).stat().st_size > 0 for path in report["figures"])
+
+    @pytest.mark.parametrize("format_", ["csv", "parquet"])
+    def test_export_holds_the_journal_with_units(self, bench, tmp_path, finished_run, format_):
+        code, _, _ = bench("export", finished_run["folder"], "--format", format_, "--out", tmp_path)
+        assert code == 0
+        with Record(Path(finished_run["folder"])) as record:
+            tables = {"readings": record.steps(), "telemetry": record.telemetry()}
+        for name, table in tables.items():
+            columns = read_table(tmp_path / f"{name}.{format_}")
+            assert "tec_temperature [°C]" in columns
+            assert "curvature [1/m]" in columns
+            np.testing.assert_array_equal(columns["curvature [1/m]"], table["curvature"])
+
+    def test_recording_is_rebuilt_but_never_overwritten(self, bench, tmp_path, finished_run):
+        code, _, _ = bench("export", finished_run["folder"], "--format", "rrd", "--out", tmp_path)
+        assert code == 0
+        assert (tmp_path / "run.rrd").stat().st_size > 0
+        code, _, err = bench("export", finished_run["folder"], "--format", "rrd")
+        assert code == 2
+        assert "exists already" in err
+
+    def test_what_is_no_run_is_one_message(self, bench, tmp_path):
+        code, _, err = bench("report", tmp_path)
+        assert code == 3
+        assert "not a run" in err
+
+
+def read_table(path):
+    if path.suffix == ".csv":
+        with path.open() as file:
+            rows = list(csv.reader(file))
+        return {name: np.array([float(row[i]) for row in rows[1:]]) for i, name in enumerate(rows[0])}
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def test_the_environment_has_no_say_in_the_exit_code():
+    environment = {**os.environ, "COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, "-m", "bench", "--help"], env=environment, capture_output=True, check=False
+    )
+    assert done.returncode == 0
