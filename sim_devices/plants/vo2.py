@@ -345,11 +345,12 @@ class VO2Cantilever:
         self._used = 0
 
         state = self._state
-        wander, drift = self._noise.standard_normal(2)
+        wander = float(self._noise.standard_normal())
         state[kernels.PLATE] = start
         state[kernels.SINK] = parameters.ambient_temperature
         state[kernels.WANDER] = parameters.wander_sd * wander
-        state[kernels.DRIFT] = parameters.drift_sd * drift
+        # The session's offset is that of the moment at which the laser is aligned: drift begins there.
+        state[kernels.DRIFT] = 0.0
         state[kernels.DRIVE] = min(float(self._down[0]), start) - parameters.coupling - 1.0
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
         kernels.settle_film(
