@@ -7,6 +7,34 @@ import math
 import numpy as np
 
 
+def agility_for(*, drift: float, noise: float, period: float) -> float:
+    """Return the agility with which a `DriftEstimator` can tell that a drift is below a limit.
+
+    Parameters
+    ----------
+    drift : float
+        The limit, in units of the signal per second.
+    noise : float
+        Standard deviation of one reading, in units of the signal.
+    period : float
+        Seconds between two readings.
+
+    Returns
+    -------
+    float
+        Agility in units/s per √s, with which the uncertainty of the drift comes down to about half of the
+        limit; never more than the limit itself in one √s, as a faster past is then forgotten soon enough.
+
+    Notes
+    -----
+    With many readings within the filter's memory its uncertainty tends to √√2 agility^¾ (noise² period)^⅛;
+    with few it is what the drift may change within one period, agility √(period/3).
+    """
+    many = (0.5 / 2**0.25) ** (4 / 3) * (drift / (noise * math.sqrt(period))) ** (1 / 3)
+    few = 0.5 / math.sqrt(period)
+    return float(drift * min(1.0, many, few))
+
+
 class DriftEstimator:
     """Estimates how fast a signal still drifts, from readings at any spacing.
 
@@ -15,13 +43,13 @@ class DriftEstimator:
     noise : float
         Standard deviation of one reading, in units of the signal.
     agility : float
-        Standard deviation by which the drift itself may change in one second, in units/s per √s. Choose the
-        drift that still matters: then the estimate forgets a faster past within a few seconds.
+        Standard deviation by which the drift itself may change in one second, in units/s per √s; see
+        `agility_for`.
 
     Raises
     ------
     ValueError
-        If a parameter is not positive.
+        If a parameter is not a positive finite number.
 
     Notes
     -----
@@ -31,7 +59,7 @@ class DriftEstimator:
     """
 
     def __init__(self, *, noise: float, agility: float) -> None:
-        if not (noise > 0 and agility > 0):
+        if not (0 < noise < math.inf and 0 < agility < math.inf):
             raise ValueError(f"noise, agility: expected positive numbers, got {noise} and {agility}")
         # Half a second of import that only those who settle until steady shall pay.
         from filterpy.kalman import KalmanFilter
@@ -57,10 +85,12 @@ class DriftEstimator:
         Raises
         ------
         ValueError
-            If the reading is not a finite number or its time goes back.
+            If the reading or its time is not a finite number, or the time goes back.
         """
         if not math.isfinite(value):
             raise ValueError(f"value: expected a finite number, got {value}")
+        if not math.isfinite(t):
+            raise ValueError(f"t: expected a finite number, got {t}")
         if self._time is None:
             self._filter.x = np.array([value, 0.0])
             # Nothing is known of the drift; the first reading fixes the value.

@@ -9,16 +9,33 @@ completion adds below the diagonal depends on the input alone and is taken off a
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-@njit(cache=True)
+def _unowned(typing_context: Any, array: Any) -> Any:  # noqa: ANN401, ARG001
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
+        view = context.make_array(signature.return_type)(context, builder, arguments[0])
+        for owner in ("meminfo", "parent"):
+            setattr(view, owner, getattr(view, owner).type(None))
+        return view._getvalue()
+
+    return array(array), build
+
+
+# The same array without ownership: passing it on costs no reference counting, which is atomic and would take
+# several times as long as the short functions here. The caller must hold the array: borrow arguments only.
+borrowed: Any = intrinsic(_unowned)
+
+
+@njit(cache=True, forceinline=True)
 def locate(levels: Floats, inverse_step: float, value: float) -> int:
     """Return k with levels[k] <= value < levels[k + 1], kept within the lattice."""
     last = levels.size - 2
@@ -44,8 +61,8 @@ def locate(levels: Floats, inverse_step: float, value: float) -> int:
     return low
 
 
-@njit(cache=True)
-def _bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) -> float:
+@njit(cache=True, forceinline=True)
+def bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) -> float:
     x = b - levels[j]
     y = a - levels[i]
     # Indexed one by one: a row view would cost reference counting in the innermost loop.
@@ -53,7 +70,7 @@ def _bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int)
     return value
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def reversible_value(breaks: Floats, quadratics: Floats, u: float) -> float:
     """Return the single-valued part at u."""
     r = 0
@@ -111,12 +128,12 @@ def load(
         mass_left[p] = mass
         right = left[p + 1] if p + 1 < n else u
         k = locate(levels, inverse_step, right)
-        mass += _bilinear(table, levels, right, k, height[p], row[p])
-        mass -= _bilinear(table, levels, left[p], column[p], height[p], row[p])
+        mass += bilinear(table, levels, right, k, height[p], row[p])
+        mass -= bilinear(table, levels, left[p], column[p], height[p], row[p])
     return locate(levels, inverse_step, u), mass
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def move(
     levels: Floats,
     inverse_step: float,
@@ -132,7 +149,7 @@ def move(
     mass: float,
     u: float,
 ) -> tuple[int, int, float]:
-    """Move the staircase from input `present` to u; return the pieces' number, the cell and the mass."""
+    """Move the staircase from input `present` to u; return number of pieces, the input's cell, the mass."""
     if u == present:
         return n, k, mass
     if u > present:
@@ -155,12 +172,12 @@ def move(
     if n > 0:
         p = n - 1
         mass = mass_left[p]
-        mass += _bilinear(table, levels, u, k, height[p], row[p])
-        mass -= _bilinear(table, levels, left[p], column[p], height[p], row[p])
+        mass += bilinear(table, levels, u, k, height[p], row[p])
+        mass -= bilinear(table, levels, left[p], column[p], height[p], row[p])
     return n, k, mass
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def output_at(
     levels: Floats,
     table: Floats,
@@ -180,6 +197,41 @@ def output_at(
 
 
 @njit(cache=True)
+def _run(
+    inputs: Floats,
+    levels: Floats,
+    inverse_step: float,
+    table: Floats,
+    below: Floats,
+    offset: float,
+    breaks: Floats,
+    quadratics: Floats,
+    left0: Floats,
+    height0: Floats,
+    u0: float,
+    stack: Floats,
+    indices: Integers,
+    outputs: Floats,
+) -> None:
+    levels, table, below = borrowed(levels), borrowed(table), borrowed(below)
+    breaks, quadratics = borrowed(breaks), borrowed(quadratics)
+    left, height, mass_left = borrowed(stack[0]), borrowed(stack[1]), borrowed(stack[2])
+    column, row = borrowed(indices[0]), borrowed(indices[1])
+    low, high = levels[0], levels[-1]
+    n = left0.size
+    left[:n] = left0
+    height[:n] = height0
+    k, mass = load(levels, inverse_step, table, left, height, column, row, mass_left, n, u0)
+    present = u0
+    for t in range(inputs.size):
+        raw = inputs[t]
+        u = min(max(raw, low), high)
+        n, k, mass = move(levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u)
+        present = u
+        outputs[t] = output_at(levels, table, below, offset, breaks, quadratics, raw, u, k, mass)
+
+
+@njit(cache=True)
 def evaluate(
     inputs: Floats,
     levels: Floats,
@@ -194,30 +246,30 @@ def evaluate(
     u0: float,
 ) -> Floats:
     """Return the outputs of a sequence: a running sum on the staircase, O(1) amortised a sample."""
-    size = inputs.size + left0.size + 1
-    left = np.empty(size)
-    height = np.empty(size)
-    column = np.empty(size, np.int64)
-    row = np.empty(size, np.int64)
-    mass_left = np.empty(size)
-    low, high = levels[0], levels[-1]
-    n = left0.size
-    for p in range(n):
-        left[p] = left0[p]
-        height[p] = height0[p]
-    k, mass = load(levels, inverse_step, table, left, height, column, row, mass_left, n, u0)
-    present = u0
+    room = inputs.size + left0.size + 1
+    stack = np.empty((3, room))
+    indices = np.empty((2, room), np.int64)
     outputs = np.empty(inputs.size)
-    for t in range(inputs.size):
-        raw = inputs[t]
-        u = min(max(raw, low), high)
-        n, k, mass = move(levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u)
-        present = u
-        outputs[t] = output_at(levels, table, below, offset, breaks, quadratics, raw, u, k, mass)
+    _run(
+        inputs,
+        levels,
+        inverse_step,
+        table,
+        below,
+        offset,
+        breaks,
+        quadratics,
+        left0,
+        height0,
+        u0,
+        stack,
+        indices,
+        outputs,
+    )
     return outputs
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def segment_up(
     levels: Floats,
     inverse_step: float,
@@ -256,7 +308,7 @@ def segment_up(
     return stop, a + quadratics[r, 2], b + quadratics[r, 1] + 2.0 * quadratics[r, 2] * u
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def segment_down(
     levels: Floats,
     inverse_step: float,
@@ -298,7 +350,7 @@ def segment_down(
     return stop, a + quadratics[r, 2], b - quadratics[r, 1] - 2.0 * quadratics[r, 2] * u
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def rising_piece(levels: Floats, left: Floats, height: Floats, n: int, u: float) -> tuple[int, float, float]:
     """Return what rises from u: pieces before it, its left edge, and the height at which it meets the last."""
     edge = max(u, levels[0])

@@ -21,7 +21,7 @@ class Regressor:
     Parameters
     ----------
     base : ndarray, shape (K,)
-        The row of the state before the first sample.
+        The row of the state before the first sample; K = M(M+1)/2 cells of a Preisach plane, or none.
     starts : ndarray of int64, shape (N + 1,)
         Row n's entries are starts[n] to starts[n + 1].
     cells : ndarray of int32, shape (nnz,)

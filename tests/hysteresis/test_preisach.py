@@ -1,0 +1,320 @@
+"""The Preisach operator against explicit relays, its own regressor and its laws."""
+
+import json
+import math
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.hysteresis import (
+    MemoryCurve,
+    Preisach,
+    QuadraticTerm,
+    ThermalExpansion,
+    operator_from_json,
+    uniform_levels,
+)
+
+LOW, HIGH = 30.0, 70.0
+TERMS = {
+    "none": None,
+    "linear": QuadraticTerm(1.5, origin=50.0),
+    "quadratic": QuadraticTerm(1.5, -0.2, 40.0),
+    "thermal": ThermalExpansion(2.8, 4.3),
+}
+
+
+def make(order=10, seed=0, term="none", signed=True, uniform=True, zeros=0.0):
+    rng = np.random.default_rng(seed)
+    levels = uniform_levels(LOW, HIGH, order)
+    if not uniform:
+        levels[1:-1] = np.sort(rng.uniform(LOW, HIGH, order - 1))
+    density = rng.normal(size=order * (order + 1) // 2)
+    if not signed:
+        density = np.abs(density)
+    density[rng.random(density.size) < zeros] = 0.0
+    return Preisach(levels, density, 3.0, TERMS[term], (21.0, 84.0), "°C", "1/m")
+
+
+def relays(operator, inputs, side):
+    """Explicit relays on a side x side grid of the plane, weight = density x area."""
+    h = (HIGH - LOW) / side
+    grid = LOW + (np.arange(side) + 0.5) * h
+    beta, alpha = (x[np.tril_indices(side)] for x in np.meshgrid(grid, grid))
+    i, j = (np.searchsorted(operator.levels, x, side="right") - 1 for x in (alpha, beta))
+    weight = operator.density[i * (i + 1) // 2 + j] * h * h
+    weight[alpha == beta] /= 2
+    on = np.full(alpha.size, -1.0)
+    outputs = []
+    for value in inputs:
+        on[alpha <= value] = 1.0
+        on[beta > value] = -1.0
+        outputs.append(operator.bias + weight @ on)
+    outputs = np.array(outputs)
+    if operator.reversible is not None:
+        outputs += operator.reversible.columns(inputs) @ operator.reversible.coefficients
+    return outputs
+
+
+histories = st.lists(st.floats(22.0, 83.0), min_size=1, max_size=25)
+seeds = st.integers(0, 50)
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_equals_320000_relays(term):
+    operator = make(term=term)
+    rng = np.random.default_rng(1)
+    # Inputs half way between the relays' thresholds: the sum over relays then errs only on the diagonal.
+    inputs = LOW + np.round(rng.uniform(-0.2, 1.2, 60) * 800) * (HIGH - LOW) / 800
+    exact = operator.evaluate(inputs)
+    explicit = relays(operator, inputs, 800)
+    assert np.abs(exact - explicit).max() < 2e-3 * np.ptp(exact)
+
+
+@given(histories, seeds, st.sampled_from(list(TERMS)), st.booleans())
+def test_regressor_step_and_sequence_agree(history, seed, term, uniform):
+    operator = make(seed=seed, term=term, uniform=uniform)
+    outputs = operator.evaluate(history)
+    regressor = operator.regressor(history)
+    dense = regressor.dense()
+    scale = np.abs(dense).sum()
+    np.testing.assert_allclose(dense @ operator.coefficients + operator.bias, outputs, atol=1e-9)
+    np.testing.assert_allclose(regressor.product(operator.coefficients), dense @ operator.coefficients, atol=1e-9)
+    np.testing.assert_allclose(regressor.transpose_product(outputs), dense.T @ outputs, atol=1e-12 * scale * 100)
+    state = operator.initial_state()
+    for value, output in zip(history, outputs, strict=True):
+        state, y = operator.step(state, value)
+        assert y == pytest.approx(output, abs=1e-9)
+    assert state == operator.initial_state().advance(history)
+
+
+@given(histories, histories, seeds)
+def test_continues_from_a_state(first, second, seed):
+    operator = make(seed=seed, term="thermal")
+    whole = operator.evaluate(first + second)
+    state = operator.initial_state().advance(first)
+    np.testing.assert_allclose(operator.evaluate(second, state), whole[len(first) :], atol=1e-9)
+    dense = operator.regressor(second, state).dense()
+    np.testing.assert_allclose(dense @ operator.coefficients + operator.bias, whole[len(first) :], atol=1e-9)
+
+
+@given(histories, st.integers(2, 40), seeds)
+def test_rate_independence(history, parts, seed):
+    operator = make(seed=seed, term="quadratic")
+    slow = np.interp(np.arange(0, len(history) - 1 + 1e-9, 1 / parts), np.arange(len(history)), history)
+    at_samples = operator.evaluate(slow)[::parts]
+    np.testing.assert_allclose(at_samples, operator.evaluate(history)[: at_samples.size], atol=1e-9)
+
+
+@given(histories, st.floats(0.0, 1.0), st.floats(0.0, 1.0), seeds)
+def test_wiping_out(history, a, b, seed):
+    operator = make(seed=seed)
+    state = operator.initial_state().advance([*history, 25.0, 65.0])
+    inner = [65.0 - 40.0 * a, 25.0 + 40.0 * b * (1 - a)]
+    inner = [min(inner), max(inner), 25.0]
+    direct = operator.evaluate([25.0, 75.0], state)
+    detour = operator.evaluate([*inner, 75.0], state)
+    assert direct[-1] == pytest.approx(detour[-1], abs=1e-9)
+    assert direct[0] == pytest.approx(detour[2], abs=1e-9)
+
+
+@given(histories, histories, st.floats(30.0, 50.0), st.floats(50.0, 70.0), seeds)
+def test_congruency_of_minor_loops(first, second, low, high, seed):
+    operator = make(seed=seed)
+    loop = [*np.linspace(low, high, 5), *np.linspace(high, low, 5)]
+    shapes = []
+    for history in (first, second):
+        state = operator.initial_state().advance([*history, low, high, low])
+        outputs = operator.evaluate(loop, state)
+        shapes.append(outputs - outputs[0])
+    np.testing.assert_allclose(shapes[0], shapes[1], atol=1e-8)
+
+
+@given(histories, st.lists(st.floats(22.0, 83.0), min_size=2, max_size=10), seeds)
+def test_nonnegative_density_is_monotone(history, then, seed):
+    operator = make(seed=seed, signed=False, zeros=0.5)
+    state = operator.initial_state().advance(history)
+    rising = operator.evaluate(sorted(v for v in [*then, 84.0] if v >= state.input), state)
+    falling = operator.evaluate(sorted((v for v in [*then, 21.0] if v <= state.input), reverse=True), state)
+    assert (np.diff(rising) >= -1e-9).all()
+    assert (np.diff(falling) <= 1e-9).all()
+
+
+@given(histories, seeds, st.sampled_from(list(TERMS)), st.booleans(), st.sampled_from([-1, 1]))
+def test_segments_are_exact(history, seed, term, on_a_level, direction):
+    operator = make(seed=seed, term=term)
+    state = operator.initial_state().advance(history)
+    if on_a_level:
+        state = state.step(operator.levels[seed % operator.levels.size])
+    here = operator.value(state)
+    segment = operator.segment(state, direction)
+    if segment is None:
+        assert state.input == (84.0 if direction > 0 else 21.0)
+        return
+    for part in (0.3, 0.7, 1.0):
+        d = part * segment.length
+        _, there = operator.step(state, state.input + direction * d)
+        assert there - here == pytest.approx(segment.quadratic * d * d + segment.linear * d, abs=1e-8)
+
+
+def test_zero_density_gives_exactly_flat_segments():
+    operator = make(seed=3, signed=False)
+    flat = operator.with_coefficients(np.zeros(55), 1.0)
+    state = flat.initial_state().advance([65.0, 41.3, 58.2, 47.9])
+    for direction in (-1, 1):
+        assert flat.segment(state, direction)[1:] == (0.0, 0.0)
+
+
+def test_saturates_beyond_the_plane_while_the_reversible_part_goes_on():
+    operator = make(term="thermal", signed=False)
+    y = operator.evaluate([21.0, 25.0, 30.0, 84.0, 77.0, 70.0])
+    assert np.diff(y[:3]) == pytest.approx([-2.8 * 4, -2.8 * 5])
+    assert np.diff(y[3:]) == pytest.approx([4.3 * 7, 4.3 * 7])
+
+
+def test_output_equals_the_paper_at_saturation():
+    # c0 = 1026.7, k0 = 2.8, k1 = 4.3 and an output of -20 at 30 °C imply about 1830 at 70 °C.
+    levels = uniform_levels(30.0, 70.0, 20)
+    density = np.full(210, 1.0)
+    operator = Preisach(levels, density, 1026.7, ThermalExpansion(2.8, 4.3), (21.0, 84.0))
+    total = float(operator.density @ operator.cell_areas())
+    operator = operator.with_coefficients([*(density * 1018.7 / total), 2.8, 4.3], 1026.7)
+    assert operator.evaluate([30.0, 70.0]) == pytest.approx([-20.0, 1830.4], abs=1e-9)
+
+
+@pytest.mark.parametrize("signed", [True, False])
+@pytest.mark.parametrize("term", ["none", "quadratic", "thermal"])
+@pytest.mark.parametrize("order", [3, 7])
+def test_output_range_bounds_and_is_reached(order, term, signed):
+    operator = make(order, seed=order, term=term, signed=signed, uniform=order == 3)
+    low, high = operator.output_range()
+    rng = np.random.default_rng(2)
+    least, greatest = math.inf, -math.inf
+    branch = np.linspace(21.0, 84.0, 4001)
+    parts = [branch, branch[::-1]]
+    for _ in range(6000):
+        # Corners on levels: that is where the extreme memory curves have theirs.
+        extrema = rng.choice(operator.levels, 6)
+        end = rng.uniform(21.0, 84.0)
+        parts.append(np.concatenate([[rng.choice([21.0, 84.0])], extrema, np.linspace(extrema[-1], end, 15)]))
+    outputs = operator.evaluate(np.concatenate(parts))
+    least, greatest = outputs.min(), outputs.max()
+    span = high - low
+    assert low - 1e-9 * span <= least <= low + (0.02 if signed else 1e-6) * span
+    assert high - (0.02 if signed else 1e-6) * span <= greatest <= high + 1e-9 * span
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_output_range_of_a_nonnegative_density_is_that_of_the_major_branches(seed):
+    operator = make(seed=seed, term="thermal", signed=False, uniform=bool(seed % 2))
+    values = []
+    for state, direction in ((operator.initial_state(), 1), (MemoryCurve((), 84.0, 1), -1)):
+        while (segment := operator.segment(state, direction)) is not None:
+            here = operator.value(state)
+            values.append(here)
+            if segment.quadratic:
+                vertex = -segment.linear / (2 * segment.quadratic)
+                if 0 < vertex < segment.length:
+                    values.append(here + vertex * (segment.linear + segment.quadratic * vertex))
+            state = state.step(state.input + direction * segment.length)
+        values.append(operator.value(state))
+    assert operator.output_range() == pytest.approx((min(values), max(values)), abs=1e-9)
+
+
+def test_output_range_of_a_signed_density_by_exhaustion():
+    operator = make(4, seed=11, term="none")
+    low, high = operator.output_range()
+    best = [math.inf, -math.inf]
+    # Every memory curve with corners on levels, then every end point between two levels.
+    for extrema in product(operator.levels, repeat=4):
+        state = operator.initial_state().advance(extrema)
+        for end in operator.levels:
+            y = operator.evaluate(np.linspace(extrema[-1], end, 9)[1:], state)
+            best = [min(best[0], y.min()), max(best[1], y.max())]
+    assert best[0] == pytest.approx(low, abs=0.01 * (high - low))
+    assert best[1] == pytest.approx(high, abs=0.01 * (high - low))
+    assert best[0] >= low - 1e-9
+    assert best[1] <= high + 1e-9
+
+
+@settings(max_examples=20)
+@given(seeds, st.sampled_from(list(TERMS)))
+def test_json_round_trip(seed, term):
+    operator = make(seed=seed, term=term)
+    copy = operator_from_json(json.loads(json.dumps(operator.to_json())))
+    assert copy.to_json() == operator.to_json()
+    inputs = np.random.default_rng(seed).uniform(21, 84, 30)
+    np.testing.assert_array_equal(copy.evaluate(inputs), operator.evaluate(inputs))
+
+
+def test_immutable():
+    operator = make()
+    with pytest.raises(AttributeError):
+        operator.bias = 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        operator.density[0] = 1.0
+
+
+def test_density_matrix_and_areas():
+    operator = make(4)
+    matrix = operator.density_matrix()
+    assert matrix[2, 1] == operator.density[2 * 3 // 2 + 1]
+    assert np.isnan(matrix[1, 2])
+    assert operator.cell_areas().sum() == pytest.approx(0.5 * 40.0**2)
+
+
+@pytest.mark.parametrize(
+    ("make_it", "message"),
+    [
+        (lambda: Preisach([0, 1, 1], np.zeros(3)), "levels: expected strictly increasing"),
+        (lambda: Preisach([0], np.zeros(0)), "levels: expected at least 2"),
+        (lambda: Preisach([0, 1, math.nan], np.zeros(3)), "levels: expected finite"),
+        (lambda: Preisach([0, 1, 2], np.zeros(4)), "density: expected 3 values"),
+        (lambda: Preisach([0, 1, 2], [1, math.inf, 0]), "density: expected finite"),
+        (lambda: Preisach([0, 1], [1.0], math.nan), "bias"),
+        (lambda: Preisach([0, 1], [1.0], input_range=(0.5, 2.0)), "input_range: expected it to contain"),
+        (lambda: make().evaluate([]), "inputs: expected at least one"),
+        (lambda: make().evaluate([[1.0]]), "inputs: expected one dimension"),
+        (lambda: make().evaluate(["x"]), "inputs: expected a sequence of numbers"),
+        (lambda: make().evaluate([1.0, math.nan]), "inputs: expected finite numbers, got nan at index 1"),
+        (lambda: make().with_coefficients([1.0], 0.0), "coefficients: expected 55"),
+        (lambda: make().segment(make().initial_state(), 0), "direction"),
+        (lambda: make().regressor([1.0]).product([1.0]), "coefficients: expected 55"),
+        (lambda: make().regressor([1.0]).transpose_product([1.0, 2.0]), "residuals: expected 1"),
+        (lambda: uniform_levels(1.0, 0.0, 3), "low, high"),
+        (lambda: uniform_levels(0.0, 1.0, 0), "intervals"),
+        (lambda: operator_from_json({"type": "spline"}), "operator: expected type"),
+        (lambda: operator_from_json({"type": "preisach"}), "levels"),
+        (lambda: ThermalExpansion(low=70.0, high=30.0), "low"),
+        (lambda: QuadraticTerm(math.nan), "linear"),
+        (lambda: Preisach.from_json({**make().to_json(), "reversible": {"type": "x"}}), "reversible"),
+        (
+            lambda: Preisach.from_json({**make().to_json(), "reversible": {"type": "quadratic", "b": 1}}),
+            "reversible",
+        ),
+    ],
+)
+def test_wrong_input_is_named(make_it, message):
+    with pytest.raises(ValueError, match=message):
+        make_it()
+
+
+def test_import_stays_light():
+    code = (
+        "import sys, bench.hysteresis, bench.identification; "
+        "print(sorted({'numba', 'scipy', 'threadpoolctl'} & sys.modules.keys()))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_one_cell():
+    operator = Preisach([0.0, 2.0], [0.5])
+    # Rising to u covers a triangle u²/2 of the cell's area 2.
+    assert operator.evaluate([0.0, 1.0, 2.0]) == pytest.approx([-1.0, -0.5, 1.0])
+    assert operator.evaluate([1.0], MemoryCurve.from_positive_saturation(2.0)) == pytest.approx([0.5])
