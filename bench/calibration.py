@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bench.devices import Signal
 from bench.errors import DeviceError
@@ -86,10 +86,23 @@ class CantileverCurvature(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    source_unit: ClassVar[str] = "m"
+    """Unit that the source has to have."""
+
     kind: Literal["cantilever-curvature"]
     source: str = Field(description="signal of the tip deflection, m")
     length: float = Field(gt=0, le=1, description="length of the beam, m")
     residual_curvature: float = Field(default=0.0, ge=-1e5, le=1e5, description="curvature of the beam at rest, 1/m")
+
+    @model_validator(mode="after")
+    def _rest_can_be_inverted(self) -> Self:
+        largest = _LARGEST_ANGLE / self.length
+        if not abs(self.residual_curvature) < largest:
+            raise ValueError(
+                f"residual_curvature = {self.residual_curvature:g} 1/m bends a beam of {self.length * 1e6:g} µm so "
+                f"far that one deflection has two curvatures; allowed is less than {largest:.5g} 1/m either way"
+            )
+        return self
 
     def signal(self, name: str) -> Signal:
         """Return the signal that this gives."""

@@ -357,6 +357,7 @@ class ExportFormat(StrEnum):
     CSV = "csv"
     PARQUET = "parquet"
     RRD = "rrd"
+    PNG = "png"
 
 
 @app.command()
@@ -370,7 +371,8 @@ def export(
 ) -> None:
     """Write a run's readings and telemetry for other programs, or rebuild its recording for the viewer.
 
-    csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers.
+    csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers. rrd: the
+    recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
     """
     from bench.report import export_run
 

@@ -1,14 +1,16 @@
 """The live view of a run and its .rrd file, both by Rerun, both derived from what the journal holds.
 
 The control thread only puts what happened into a queue. One thread takes it out about once a second and
-hands it to Rerun in columns, which costs a fiftieth of logging row by row; the same code rebuilds an .rrd
-from a journal. A viewer connects to a server of this process, bound to the loopback address. A viewer that
-hangs costs memory at the rate of the run's data (tens of MB an hour at most) and nothing else: neither the
-control thread nor the file waits for it.
+hands it to Rerun in columns, which costs a twentieth of logging row by row; the same code rebuilds an .rrd
+from a journal. A viewer connects to a server of this process, bound to the loopback address.
 
-The queue is bounded. If Rerun itself stands still, because a disk does, telemetry is dropped beyond
-`QUEUED_TICKS` entries and everything beyond `QUEUED_ENTRIES`; the loss is counted and said in the log of
-the dashboard. Nothing of the record is lost by that: `rebuild` makes the whole .rrd from the journal.
+File and live view are two streams of one recording, so that a viewer that hangs cannot delay the file.
+Rerun keeps what such a viewer does not take, some 8 kB for each batch of a quantity, until its channel is
+full; from then on the live view is left out until the viewer moves again, and the log says so.
+
+The queue is bounded, too. If Rerun itself stands still, because a disk does, telemetry is dropped beyond
+`QUEUED_TICKS` entries and everything beyond `QUEUED_ENTRIES`; the log says how much. Nothing of the record
+is lost by any of this: `rebuild` makes the whole .rrd from the journal.
 
 What is recorded, on the timelines `t` (laboratory time) and `step`
 --------------------------------------------------------------------
@@ -18,22 +20,20 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
     Output against input: the line from each step to the next, and the last point.
 `/plane/data/memory`, `/plane/data/input`, `/plane/density`
     The Preisach plane: the memory curve after each step, the input on the diagonal, the model's density.
-`/state/phase`, `/state/run`, `/state/settling`
-    Where the protocol stands, changes only.
+`/state/phase`, `/state/run`
+    Where the protocol stands: changes only.
 `/events`, `/card`
     What happened, and the run card.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import queue
 import socket
-import sqlite3
 import subprocess
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -62,10 +62,12 @@ QUEUED_ENTRIES = 60_000
 
 _BATCH_ROWS = 200
 _BATCH_SECONDS = 1.0
-_CLOSE_SECONDS = 10.0
+_CLOSE_SECONDS = 5.0
+_FLUSH_SECONDS = 0.5
+"""After which a viewer hangs; the twentieth of it is enough to see that it still does."""
 _PORTS_TRIED = 50
-_REBUILD_ROWS = 4096
-"""Rows of a chunk when a whole journal is at hand: fewer, larger chunks load faster."""
+_CHUNK_ROWS = 4096
+"""Most rows at once: the more, the faster a recording loads, but the longer they take to turn into columns."""
 
 _VIEWER_START_SECONDS = 30.0
 _VIEWER_SETTLE_SECONDS = 6.0
@@ -234,18 +236,16 @@ class Dashboard:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
         self._writer = _Writer(signals, layout, run_id)
-        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         self.uri: str | None = None
         """Address for a viewer, None without a live view."""
-        if path is not None:
-            sinks.append(_file_sink(path))
+        server = None
         if live:
             server = rr.GrpcServerSink(bind_ip=_LOOPBACK, port=_free_port(port), server_memory_limit="256MiB")
             self.uri = server.uri
-            sinks.append(server)
-        self._writer.open(sinks, title, card, properties)
-        self.dropped = 0
-        """Entries that the dashboard did not show because Rerun stood still."""
+        file = None if path is None else _file_sink(path)
+        self._writer.open(file, server, title, card, properties)
+        # One counter a thread, as adding is not atomic.
+        self._not_queued = self._not_written = self._reported = 0
         self._queue: queue.SimpleQueue[_Entry] = queue.SimpleQueue()
         self._wake = threading.Event()
         self._closing = False
@@ -254,21 +254,15 @@ class Dashboard:
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Show one tick of a hold: laboratory time in s, step number, one value a signal."""
-        waiting = self._queue.qsize()
-        if waiting >= QUEUED_TICKS:
-            self.dropped += 1
-            return
-        self._queue.put((t, step, tuple(values)))
-        if waiting == _BATCH_ROWS:
-            self._wake.set()
+        self._put((t, step, tuple(values)), QUEUED_TICKS)
 
     def step(self, record: StepRecord) -> None:
         """Show a finished step."""
-        self._put(record)
+        self._put(record, QUEUED_ENTRIES)
 
     def event(self, event: Event) -> None:
         """Show something that happened."""
-        self._put(event)
+        self._put(event, QUEUED_ENTRIES)
 
     def model(self, density: npt.ArrayLike, grid: npt.ArrayLike, name: str) -> None:
         """Show the density of a model under the memory curve, from now on.
@@ -283,17 +277,18 @@ class Dashboard:
         name : str
             Name of the model.
         """
-        self._put(_Model(name, np.array(density, dtype=np.float64), np.array(grid, dtype=np.float64)))
+        model = _Model(name, np.array(density, dtype=np.float64), np.array(grid, dtype=np.float64))
+        self._put(model, QUEUED_ENTRIES)
 
     def finish(self, status: str, reason: str) -> None:
         """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
-        self._put(_End(status, reason))
+        self._put(_End(status, reason), QUEUED_ENTRIES)
 
     def close(self) -> None:
         """Hand over what is queued and let go of file and viewers; waits a bounded time.
 
-        With a viewer that hangs, Rerun may take some 20 s to give it up. That is not waited for; the file
-        is complete before.
+        The file is complete first. Rerun takes some 30 s to give up a viewer that hangs; the thread that
+        waits for that ends by itself, later.
         """
         self._closing = True
         self._wake.set()
@@ -307,23 +302,47 @@ class Dashboard:
     ) -> None:
         self.close()
 
-    def _put(self, entry: _Entry) -> None:
-        if self._queue.qsize() >= QUEUED_ENTRIES:
-            self.dropped += 1
-        else:
-            self._queue.put(entry)
+    @property
+    def dropped(self) -> int:
+        """Number of entries that the dashboard does not show because Rerun stood still or refused them."""
+        return self._not_queued + self._not_written
+
+    @property
+    def viewer_keeps_up(self) -> bool:
+        """Whether the live view is told everything, as no viewer hangs; false without a live view."""
+        return self._writer.viewer_keeps_up
+
+    def _put(self, entry: _Entry, most: int) -> None:
+        waiting = self._queue.qsize()
+        if waiting >= most:
+            self._not_queued += 1
+            return
+        self._queue.put(entry)
+        if waiting >= _BATCH_ROWS and not self._wake.is_set():
+            self._wake.set()
 
     def _work(self) -> None:
-        reported = 0
-        while not self._closing or not self._queue.empty():
+        while not self._closing:
             self._wake.wait(_BATCH_SECONDS)
             self._wake.clear()
-            entries = [self._queue.get() for _ in range(self._queue.qsize())]
-            if self.dropped > reported:
-                lost, reported = self.dropped - reported, self.dropped
-                self._writer.report_loss(lost)
-            self._writer.write(entries)
+            self._hand_over()
+        # What came between the last look and the closing.
+        self._hand_over()
         self._writer.close()
+
+    def _hand_over(self) -> None:
+        # In portions, so that turning them into columns does not keep the interpreter from other threads.
+        while waiting := min(self._queue.qsize(), _CHUNK_ROWS):
+            entries = [self._queue.get() for _ in range(waiting)]
+            try:
+                self._writer.follow_viewer(len(entries))
+                self._writer.write(entries)
+                if (missing := self.dropped - self._reported) > 0:
+                    self._writer.warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
+                    self._reported += missing
+            # Whatever goes wrong with the view, the run goes on, and so does the rest of the view.
+            except Exception:
+                self._not_written += len(entries)
 
 
 def rebuild(record: Record, path: Path) -> None:
@@ -352,11 +371,11 @@ def rebuild(record: Record, path: Path) -> None:
         properties = {key: meta[key] for key in ("rig", "protocol", "seed")}
     except (ConfigurationError, KeyError, TypeError) as error:
         raise DataError(f"{record.path} does not say what its dashboard was: {error}") from error
-    writer.open([_file_sink(path)], title, card, properties)
+    writer.open(_file_sink(path), None, title, card, properties)
     try:
         telemetry = record.telemetry()
-        for start in range(0, len(telemetry), _REBUILD_ROWS):
-            rows = slice(start, start + _REBUILD_ROWS)
+        for start in range(0, len(telemetry), _CHUNK_ROWS):
+            rows = slice(start, start + _CHUNK_ROWS)
             writer.ticks(
                 telemetry["t"][rows],
                 telemetry["step"][rows].astype(np.int64),
@@ -366,8 +385,8 @@ def rebuild(record: Record, path: Path) -> None:
         entries: list[tuple[float, _Entry]] = [(step.finished, step) for step in record.step_records()]
         entries += [(event.t, event) for event in record.events()]
         entries.sort(key=lambda entry: entry[0])
-        for start in range(0, len(entries), _REBUILD_ROWS):
-            writer.write([entry for _, entry in entries[start : start + _REBUILD_ROWS]])
+        for start in range(0, len(entries), _CHUNK_ROWS):
+            writer.write([entry for _, entry in entries[start : start + _CHUNK_ROWS]])
         writer.write([_Model(name, *density) for name, density in _densities(record)])
         if "status" in meta:
             writer.write([_End(str(meta["status"]), str(meta.get("reason", "")))])
@@ -475,7 +494,10 @@ class _Writer:
         if layout is not None:
             ranges = {layout.input: layout.input_range, layout.output: layout.output_range}
         self._groups = _group_by_unit(self._signals, ranges)
-        self._stream = rr.RecordingStream("bench", recording_id=run_id)
+        self._run_id = run_id
+        self._streams: list[rr.RecordingStream] = []
+        self._live: rr.RecordingStream | None = None
+        self._unseen = 0
         self._memory: MemoryCurve | None = None
         self._point: tuple[float, float] | None = None
         self._states: dict[str, str] = {}
@@ -485,15 +507,27 @@ class _Writer:
 
     def open(
         self,
-        sinks: Sequence[rr.FileSink | rr.GrpcServerSink],
+        file: rr.FileSink | None,
+        server: rr.GrpcServerSink | None,
         title: str,
         card: str,
         properties: Mapping[str, Any],
     ) -> None:
         """Connect, and write everything that does not change."""
-        self._stream.set_sinks(*sinks, default_blueprint=self._blueprint())
-        self._stream.send_recording_name(title)
-        self._stream.send_property("bench", rr.AnyValues(**properties))
+        blueprint = self._blueprint()
+        for sink in (file, server):
+            if sink is None:
+                continue
+            stream = rr.RecordingStream("bench", recording_id=self._run_id)
+            try:
+                stream.set_sinks(sink, default_blueprint=blueprint)
+            except RuntimeError as error:
+                raise ConfigurationError(f"the recording cannot be made: {error}") from error
+            stream.send_recording_name(title)
+            self._streams.append(stream)
+            if sink is server:
+                self._live = stream
+        self._set_property("bench", properties)
         self._log("card", rr.TextDocument(card, media_type=rr.MediaType.MARKDOWN))
         for group in self._groups:
             for kind in ("signals", "readings"):
@@ -532,7 +566,7 @@ class _Writer:
             elif isinstance(entry, _Model):
                 self._draw_model(entry)
             elif isinstance(entry, _End):
-                self._stream.send_property("outcome", rr.AnyValues(status=entry.status, reason=entry.reason))
+                self._set_property("outcome", {"status": entry.status, "reason": entry.reason})
         self._write_steps(steps)
         self._write_events(events)
         self._write_changes(changes)
@@ -542,14 +576,39 @@ class _Writer:
         self._scalars("signals", _times(t, step), values)
         self._t = float(t[-1])
 
-    def report_loss(self, entries: int) -> None:
-        """Say in the log that entries are missing."""
-        text = f"Rerun stood still, {entries} entries are missing here; the journal has them"
-        self.write([Event(self._t, "WARN", "dashboard", text)])
+    def warn(self, text: str) -> None:
+        """Say in the log what the matter is with the dashboard itself."""
+        self._write_events([(self._step, Event(self._t, "WARN", "dashboard", text))])
+
+    @property
+    def viewer_keeps_up(self) -> bool:
+        """Whether the live view is not left out."""
+        return self._live in self._streams
+
+    def follow_viewer(self, entries: int) -> None:
+        """Leave the live view out of the next `entries` entries if its viewer hangs; never waits long."""
+        if self._live is None:
+            return
+        try:
+            # Waits for the server, which holds some thousand batches for each viewer, not for the viewer.
+            self._live.flush(timeout_sec=_FLUSH_SECONDS if self.viewer_keeps_up else 0.05 * _FLUSH_SECONDS)
+        except RuntimeError:
+            if self.viewer_keeps_up:
+                self._streams.remove(self._live)
+                self.warn("the viewer hangs; it is left out until it moves again")
+            self._unseen += entries
+            return
+        if not self.viewer_keeps_up:
+            self._streams.append(self._live)
+            self.warn(f"the viewer moves again; {self._unseen} entries are missing in the live view")
+            self._unseen = 0
 
     def close(self) -> None:
-        """Let go of file and viewers."""
-        self._stream.disconnect()
+        """Let go of the file, then of the viewers."""
+        for stream in self._streams:
+            stream.disconnect()
+        if self._live is not None:
+            self._live.disconnect()
 
     def _write_steps(self, steps: Sequence[StepRecord]) -> None:
         if not steps:
@@ -575,7 +634,7 @@ class _Writer:
             return
         times = _times([step.finished for step in drawn], [step.step for step in drawn])
         points = [segment[1] for segment in segments]
-        send = self._stream.send_columns
+        send = self._send
         send("loop/data/path", times, rr.LineStrips2D.columns(strips=segments, colors=colours))
         send("loop/data/now", times, rr.Points2D.columns(positions=points))
         send("plane/data/memory", times, rr.LineStrips2D.columns(strips=memories))
@@ -590,12 +649,12 @@ class _Writer:
             level=[event.level for _, event in events],
         )
         times = _times([event.t for _, event in events], [step for step, _ in events])
-        self._stream.send_columns("events", times, columns)
+        self._send("events", times, columns)
 
     def _write_changes(self, changes: Sequence[tuple[str, float, int, str]]) -> None:
         for lane in dict.fromkeys(change[0] for change in changes):
             _, t, step, state = zip(*(change for change in changes if change[0] == lane), strict=True)
-            self._stream.send_columns(f"state/{lane}", _times(t, step), rr.StateChange.columns(state=state))
+            self._send(f"state/{lane}", _times(t, step), rr.StateChange.columns(state=state))
 
     def _colour_phase(self, phase: str) -> None:
         if phase not in self._phases:
@@ -613,10 +672,20 @@ class _Writer:
         for group in self._groups:
             columns = rr.Scalars.columns(scalars=(values[:, group.columns] * group.factor).ravel())
             lengths = np.full(len(values), len(group.columns))
-            self._stream.send_columns(f"{kind}/{group.path}", times, columns.partition(lengths))
+            self._send(f"{kind}/{group.path}", times, columns.partition(lengths))
+
+    def _send(self, path: str, times: list[rr.TimeColumn], columns: Iterable[rr.ComponentColumn]) -> None:
+        columns = list(columns)
+        for stream in self._streams:
+            stream.send_columns(path, times, columns)
 
     def _log(self, path: str, *what: rr.AsComponents) -> None:
-        self._stream.log(path, *what, static=True)
+        for stream in self._streams:
+            stream.log(path, *what, static=True)
+
+    def _set_property(self, name: str, values: Mapping[str, Any]) -> None:
+        for stream in self._streams:
+            stream.send_property(name, rr.AnyValues(**values))
 
     def _draw_frame(self, path: str, frame: _Frame) -> None:
         """Draw axes, and give what is logged below `path`/data their units."""
@@ -706,7 +775,10 @@ class _Writer:
         log = rrb.TextLogView(
             origin="/events",
             name="Log",
-            columns=rrb.TextLogColumns(timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)], text_log_columns=["LogLevel", "Body"]),
+            columns=rrb.TextLogColumns(
+                timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
+                text_log_columns=["LogLevel", "Body"],
+            ),
         )
         card = rrb.TextDocumentView(origin="/card", name="Run card")
         below = rrb.Vertical(state, rrb.Horizontal(log, card, column_shares=[3, 2]), row_shares=[3, 5])
@@ -822,18 +894,8 @@ def _state_after(event: Event) -> str | None:
 
 def _densities(record: Record) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
     """Yield name, density and grid of the models that have a density, the newest last."""
-    database = sqlite3.connect(f"{record.path.absolute().as_uri()}?mode=ro", uri=True)
-    try:
-        rows = database.execute("SELECT name, model FROM models ORDER BY t").fetchall()
-    except sqlite3.DatabaseError as error:
-        raise DataError(f"{record.path} is damaged: {error}") from error
-    finally:
-        database.close()
-    for name, text in rows:
-        try:
-            operator = parse_model(json.loads(text), name).operator
-        except (DataError, json.JSONDecodeError):
-            continue
+    for name, content in record.models().items():
+        operator = parse_model(content, f"{record.path}: model {name}").operator
         if isinstance(operator, Preisach):
             yield name, (operator.density_matrix(), operator.levels)
 

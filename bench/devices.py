@@ -24,6 +24,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypedDict
@@ -178,12 +179,15 @@ class Status:
             if self._done:
                 return True
             try:
-                if self._arrived():
+                arrived = self._arrived()
+            # Whatever it is, whoever waits has to hear of it.
+            except Exception as error:
+                self._finish(error)
+            else:
+                if arrived:
                     self._finish(None)
                 elif self._clock.now() >= self._deadline:
                     self._finish(DeviceError(self._device, f"did not arrive within {self._timeout:g} s"))
-            except DeviceError as error:
-                self._finish(error)
             return self._done
 
     def wait(self) -> None:
@@ -222,8 +226,10 @@ class Status:
         self._exception = exception
         self._done = True
         callbacks, self._callbacks = self._callbacks, []
-        for callback in callbacks:
-            callback(self)
+        with ExitStack() as stack:
+            # Each is told, also after one that raises.
+            for callback in reversed(callbacks):
+                stack.callback(callback, self)
 
 
 class DriverSettings(BaseModel):
@@ -234,7 +240,7 @@ class DriverSettings(BaseModel):
     moves nothing. An unknown key is an error.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Device(ABC):

@@ -7,16 +7,29 @@ brought into its safe state, each by itself, and the journal says how that went.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-from bench.control.estimators import DriftEstimator
-from bench.errors import AbortError, BenchError, ConfigurationError, SettleTimeoutError
+from bench.control.estimators import DriftEstimator, agility_for, preload
+from bench.control.tracking import Command
+from bench.errors import (
+    AbortError,
+    BenchError,
+    ConfigurationError,
+    DeviceError,
+    InterlockError,
+    LimitError,
+    SettleTimeoutError,
+)
 from bench.interrupts import Interrupts
 from bench.journal import Event, Journal, StepRecord
 from bench.protocol import (
+    TRACES,
+    Control,
     Dwell,
     Note,
     Phase,
@@ -30,12 +43,14 @@ from bench.protocol import (
 from bench.rig import Rig
 from bench.safety import SAFE, InterlockWatch, make_safe
 
+TRACE_NAMES = tuple(signal.name for signal in TRACES)
+
 RESUME = "resume"
 ABORT = "abort"
 
 
 class Observer(Protocol):
-    """Watches a run: the dashboard, the progress display. No method may block or raise."""
+    """Watches a run: the dashboard, the progress display. No method may block; one that raises is told no more."""
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """See one tick of a hold; `values` in the order of the rig's signals."""
@@ -112,7 +127,8 @@ class Engine:
         self._observers = tuple(observers)
         self._interrupts = interrupts
         self._ask = ask
-        self._names = tuple(signal.name for signal in rig.signals)
+        self._names = tuple(signal.name for signal in journal.signals)
+        self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
         self._period = rig.file.telemetry.period
         self._watch = InterlockWatch(rig.file.interlocks, {signal.name: signal.unit for signal in rig.signals})
         self._phase = ""
@@ -143,49 +159,107 @@ class Engine:
     def _carry_out(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> None:
         self._watch.check(self._clock.now(), self._rig.glance())
         messages = definition.generator(parameters)
+        reading: Reading | None = None
         try:
-            message = next(messages)
             while True:
+                try:
+                    # The first `send` of a generator has to be that of None.
+                    message = messages.send(reading)  # type: ignore[arg-type]
+                except StopIteration:
+                    return
+                self._raise_if_aborted()
+                reading = None
                 if isinstance(message, Step):
                     self._pause_if_asked()
-                    message = messages.send(self._step(message))
+                    reading = self._step(message)
+                elif isinstance(message, Control):
+                    self._pause_if_asked()
+                    reading = self._control(message)
                 elif isinstance(message, Phase):
                     self._phase = message.name
                     self._event("INFO", "phase", message.name)
-                    message = next(messages)
                 elif isinstance(message, Note):
                     self._event("INFO", "note", message.text)
-                    message = next(messages)
                 else:
                     raise ConfigurationError(
-                        f"protocol {definition.name} yielded {message!r}; expected a Step, a Phase or a Note"
+                        f"protocol {definition.name} yielded {message!r}; "
+                        "expected a Step, a Control, a Phase or a Note"
                     )
-        except StopIteration:
-            pass
         finally:
-            messages.close()
+            # What a protocol does or raises while it is closed must not hide why the run ends.
+            with suppress(Exception):
+                messages.close()
 
     def _step(self, step: Step) -> Reading:
+        if isinstance(step.settle, UntilSteady) and step.settle.signal not in self._names:
+            raise ConfigurationError(
+                f"{step.settle.signal} is no signal of this rig; there are: {', '.join(self._names)}"
+            )
         started = self._clock.now()
         self._send(step.setpoints)
         self._settle(step.settle, started)
-        values = self._rig.measure()
+        values = self._values(self._rig.measure)
+        self._watch.check(self._clock.now(), values)
+        return self._finish_step(started, step.label, step.setpoints, values)
+
+    def _control(self, message: Control) -> Reading:
+        for name in (message.input, message.output):
+            if name not in self._names:
+                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+        started = self._clock.now()
+        latest = started + message.timeout
+        low, high = message.limits
+        command: Command | None = None
+        try:
+            while True:
+                values = self._values(self._rig.measure)
+                now = self._clock.now()
+                ask = message.loop.begin if command is None else message.loop.update
+                command = ask(now, values[message.input], values[message.output])
+                trace = message.loop.trace
+                self._trace = dict(
+                    zip(
+                        TRACE_NAMES,
+                        (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty),
+                        strict=True,
+                    )
+                )
+                values |= self._trace
+                self._record_tick(now, values)
+                if command.done:
+                    return self._finish_step(started, message.label, {message.actuator: command.setpoint}, values)
+                if not low <= command.setpoint <= high:
+                    raise LimitError(
+                        message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"
+                    )
+                self._send({message.actuator: command.setpoint})
+                end = now + command.wait
+                if end > latest:
+                    raise SettleTimeoutError(
+                        f"{message.output} did not reach its reference {trace.reference:g} "
+                        f"within {message.timeout:g} s"
+                    )
+                self._hold_until(end, now)
+        finally:
+            self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
+
+    def _finish_step(
+        self, started: float, label: str, setpoints: Mapping[str, float], values: Mapping[str, float]
+    ) -> Reading:
         finished = self._clock.now()
-        self._watch.check(finished, values)
         record = StepRecord(
             step=self._steps,
             started=started,
             finished=finished,
             phase=self._phase,
-            label=step.label,
+            label=label,
             settled=True,
-            setpoints=step.setpoints,
+            setpoints=setpoints,
             values=tuple(values[name] for name in self._names),
         )
         self._journal.step(record)
         self._steps += 1
-        for observer in self._observers:
-            observer.step(record)
+        self._tell(lambda observer: observer.step(record))
         return Reading(record.step, finished, record.settled, values)
 
     def _send(self, setpoints: Mapping[str, float]) -> None:
@@ -202,15 +276,17 @@ class Engine:
         if isinstance(settle, Dwell):
             self._hold_until(started + settle.seconds, started)
             return
-        if settle.signal not in self._names:
-            raise ConfigurationError(f"{settle.signal} is no signal of this rig; there are: {', '.join(self._names)}")
-        estimator = DriftEstimator(noise=settle.noise, agility=settle.drift)
+        agility = agility_for(drift=settle.drift, noise=settle.noise, period=self._period)
+        estimator = DriftEstimator(noise=settle.noise, agility=agility)
         earliest, latest = started + settle.minimum, started + settle.timeout
         while True:
             self._sleep_until(min(self._clock.now() + self._period, latest))
             values = self._tick()
             now = self._clock.now()
-            estimator.update(now, values[settle.signal])
+            value = values[settle.signal]
+            if not math.isfinite(value):
+                raise DeviceError(settle.signal, f"reads {value}, so it cannot become steady")
+            estimator.update(now, value)
             if now >= earliest and estimator.is_steady(settle.drift):
                 return
             if now >= latest:
@@ -222,7 +298,8 @@ class Engine:
 
     def _hold_until(self, end: float, started: float) -> None:
         tick = 1
-        while (instant := started + tick * self._period) < end:
+        # No tick closer to the end than rounding could bring it: the reading follows there.
+        while (instant := started + tick * self._period) < end - 1e-6 * self._period:
             self._sleep_until(instant)
             self._tick()
             tick += 1
@@ -234,14 +311,18 @@ class Engine:
         self._raise_if_aborted()
 
     def _tick(self) -> dict[str, float]:
-        values = self._rig.glance()
-        t = self._clock.now()
+        values = self._values(self._rig.glance)
+        self._record_tick(self._clock.now(), values)
+        return values
+
+    def _values(self, ask: Callable[[], dict[str, float]]) -> dict[str, float]:
+        return ask() | self._trace
+
+    def _record_tick(self, t: float, values: Mapping[str, float]) -> None:
         row = tuple(values[name] for name in self._names)
         self._journal.telemetry(t, self._steps, row)
-        for observer in self._observers:
-            observer.telemetry(t, self._steps, row)
+        self._tell(lambda observer: observer.telemetry(t, self._steps, row))
         self._watch.check(t, values)
-        return values
 
     def _raise_if_aborted(self) -> None:
         if self._interrupts.abort_reason is not None:
@@ -273,8 +354,17 @@ class Engine:
     def _event(self, level: str, kind: str, text: str) -> None:
         event = Event(self._clock.now(), level, kind, text)
         self._journal.event(event)
+        self._tell(lambda observer: observer.event(event))
+
+    def _tell(self, what: Callable[[Observer], None]) -> None:
         for observer in self._observers:
-            observer.event(event)
+            try:
+                what(observer)
+            # A terminal or a viewer that is gone must not end a run of hours.
+            except Exception as error:
+                self._observers = tuple(other for other in self._observers if other is not observer)
+                name = type(observer).__name__
+                self._event("WARN", "observer", f"{name} is told no more: {type(error).__name__}: {error}")
 
     def _finish(self, error: Exception | None, start: float, safe_state: Mapping[str, str]) -> Outcome:
         if error is None:
@@ -285,13 +375,18 @@ class Engine:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
         finished = self._clock.now()
-        if error is not None:
-            self._event("ERROR", "error", reason)
-        for name, state in safe_state.items():
-            ok = state == SAFE
-            self._event("INFO" if ok else "ERROR", "safe-state", f"{name}: {state}")
-        self._event("INFO" if error is None else "WARN", "end", status)
-        self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
+        try:
+            if error is not None:
+                self._event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)
+            for name, state in safe_state.items():
+                ok = state == SAFE
+                self._event("INFO" if ok else "ERROR", "safe-state", f"{name}: {state}")
+            self._event("INFO" if error is None else "WARN", "end", status)
+            self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
+        # A full disk must not hide whether the devices are safe.
+        except Exception as failure:
+            why = f"the journal could not be finished: {failure}"
+            status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
         return Outcome(status, reason, self._steps, finished - start, safe_state, error)
 
 
@@ -304,7 +399,11 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, parameters: Pr
         If the rig lacks something, or a set-point would leave a device's limits; nothing has moved.
     """
     rig.check_needs(definition.name, definition.needs)
-    for device, (low, high) in plan(definition, parameters).extremes.items():
+    expected = plan(definition, parameters)
+    rig.check_needs(definition.name, sorted(expected.watched))
+    if expected.watched:
+        preload()
+    for device, (low, high) in expected.extremes.items():
         if device not in rig.actuators:
             raise ConfigurationError(
                 f"protocol {definition.name} sets {device}, which rig {rig.file.name} cannot set"

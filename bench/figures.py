@@ -110,7 +110,7 @@ def plot_sequence_and_errors(
         for i, (title, error) in enumerate(errors.items()):
             bottom.plot(error, color=_COLORS[i], linewidth=0.8, label=title)
         bottom.set(xlabel="index of the set-point", ylabel=error_label)
-        bottom.legend(loc="best", ncols=len(errors), fontsize=7.5)
+        bottom.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(errors), fontsize=7.5)
         figure.savefig(path)
 
 

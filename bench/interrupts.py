@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Self
 
@@ -35,11 +36,11 @@ class Interrupts:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            self._former[signal.SIGINT] = signal.signal(signal.SIGINT, self._interrupt)
+            self._install(signal.SIGINT, self._interrupt)
             for name in _ABORTING:
                 number = getattr(signal, name, None)
                 if number is not None:
-                    self._former[number] = signal.signal(number, self._terminate)
+                    self._install(number, self._terminate)
         return self
 
     def __exit__(
@@ -48,6 +49,18 @@ class Interrupts:
         for number, handler in self._former.items():
             signal.signal(number, handler)  # type: ignore[arg-type]  # as signal.signal returned it
 
+    def _install(self, number: int, handler: Callable[[int, FrameType | None], None]) -> None:
+        former = signal.getsignal(number)
+        # What was told to be ignored stays so: `nohup bench run …` outlives its terminal.
+        if former is not signal.SIG_IGN:
+            signal.signal(number, handler)
+            self._former[number] = signal.SIG_DFL if former is None else former
+
+    def _tell(self, text: str) -> None:
+        # Nothing may be raised here, as this comes in the midst of whatever is going on.
+        with suppress(Exception):
+            self._notify(text)
+
     def abort_requested(self) -> bool:
         """Return whether the run has to end at once."""
         return self.abort_reason is not None
@@ -55,10 +68,10 @@ class Interrupts:
     def _interrupt(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
         if self.pause_requested:
             self.abort_reason = "Ctrl-C, twice"
-            self._notify("ending at once, in the safe state")
+            self._tell("ending at once, in the safe state")
         else:
             self.pause_requested = True
-            self._notify("pausing at the next step; Ctrl-C again ends at once")
+            self._tell("pausing at the next step; Ctrl-C again ends at once")
 
     def _terminate(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
         self.abort_reason = signal.Signals(number).name

@@ -2,7 +2,8 @@
 
 The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
 it is handed over; what `Journal` has returned from survives the death of the process and of the machine.
-Everything else (the .rrd, tables, figures) is derived from it and can be made again.
+Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
+becomes one self-contained file, which can be read where nothing can be written.
 
 Schema, version 1
 -----------------
@@ -31,6 +32,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -43,6 +45,8 @@ from bench.errors import ConfigurationError, DataError
 
 SCHEMA = 1
 FILE_NAME = "journal.sqlite"
+
+_OWN_COLUMNS = ("step", "started", "finished", "phase", "label", "settled", "setpoints", "tick", "t")
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -95,7 +99,7 @@ class Event:
     level : str
         `INFO`, `WARN` or `ERROR`.
     kind : str
-        `phase`, `note`, `pause`, `resume`, `interlock`, `error`, `safe-state`, `end`.
+        `phase`, `note`, `pause`, `resume`, `observer`, `interlock`, `error`, `safe-state`, `end`.
     text : str
         One sentence.
     """
@@ -121,12 +125,14 @@ class Journal:
     Raises
     ------
     ConfigurationError
-        If the file exists already: a record is never overwritten.
+        If the file exists already: a record is never overwritten. If two signals have one name, or a signal
+        has that of a column which the journal itself needs; case does not count.
     """
 
     def __init__(self, path: Path, signals: Sequence[Signal], meta: Mapping[str, Any]) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
+        check_names([signal.name for signal in signals])
         self.path = path
         self.signals = tuple(signals)
         self._db = sqlite3.connect(path, isolation_level=None)
@@ -156,7 +162,7 @@ class Journal:
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Record one tick of a hold: laboratory time in s, step number, one value a signal."""
-        self._db.execute(self._insert_tick, (t, step, *values))
+        self._db.execute(self._insert_tick, (t, step, *map(float, values)))
 
     def step(self, record: StepRecord) -> None:
         """Record a finished step."""
@@ -169,8 +175,8 @@ class Journal:
                 record.phase,
                 record.label,
                 int(record.settled),
-                json.dumps(dict(record.setpoints)),
-                *record.values,
+                json.dumps({name: float(value) for name, value in record.setpoints.items()}),
+                *map(float, record.values),
             ),
         )
 
@@ -190,13 +196,17 @@ class Journal:
 
     def close(self) -> None:
         """Close the file; what was recorded stays."""
+        # Out of WAL mode, as a reader of a WAL file leaves companions beside it; while one reads, it cannot be.
+        with suppress(sqlite3.OperationalError):
+            self._db.execute("PRAGMA busy_timeout=0")
+            self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
 
     def _put_meta(self, key: str, value: object) -> None:
-        self._db.execute(
-            "INSERT OR REPLACE INTO meta VALUES (?, ?)",
-            (key, json.dumps(value, ensure_ascii=False, default=str)),
-        )
+        text = json.dumps(value, ensure_ascii=False, default=str)
+        # What no encoding holds, such as a file name of another system, becomes an escape, as JSON has it.
+        text = text.encode("utf-8", "backslashreplace").decode("utf-8")
+        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
 
     def _transaction(self) -> _Transaction:
         return _Transaction(self._db)
@@ -251,14 +261,17 @@ class Record:
         if not self.path.is_file():
             raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
         # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
-        self._db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
+        try:
+            self._db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
+        except sqlite3.DatabaseError as error:
+            raise DataError(f"{self.path} cannot be read: {error}") from error
         try:
             self.meta: dict[str, Any] = {
                 key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM meta")
             }
             rows = self._db.execute("SELECT name, unit, description, precision FROM signals ORDER BY position")
             self.signals = tuple(Signal(*row) for row in rows)
-        except (sqlite3.DatabaseError, json.JSONDecodeError) as error:
+        except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             self._db.close()
             raise DataError(f"{self.path} is not a readable journal: {error}") from error
         if self.meta.get("schema") != SCHEMA:
@@ -279,8 +292,9 @@ class Record:
         return str(self.meta.get("status", "unfinished"))
 
     def unit(self, signal: str) -> str:
-        """Return the unit of a signal; that of times is s."""
-        return next((s.unit for s in self.signals if s.name == signal), "s")
+        """Return the unit of a column: a signal's own, s for times, 1 for counts."""
+        others = "1" if signal in ("step", "tick", "settled") else "s"
+        return next((s.unit for s in self.signals if s.name == signal), others)
 
     def steps(self) -> Table:
         """Return the readings: columns `step`, `started`, `finished`, `settled`, and one a signal."""
@@ -290,16 +304,20 @@ class Record:
         """Yield the finished steps one by one."""
         for row in self._query("SELECT * FROM steps ORDER BY step"):
             step, started, finished, phase, label, settled, setpoints, *values = row
-            yield StepRecord(
-                step,
-                started,
-                finished,
-                phase,
-                label,
-                bool(settled),
-                json.loads(setpoints),
-                tuple(map(_number, values)),
-            )
+            try:
+                record = StepRecord(
+                    step,
+                    started,
+                    finished,
+                    phase,
+                    label,
+                    bool(settled),
+                    json.loads(setpoints),
+                    tuple(map(_number, values)),
+                )
+            except (ValueError, TypeError) as error:
+                raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
+            yield record
 
     def telemetry(self) -> Table:
         """Return the ticks: columns `t`, `step`, and one a signal."""
@@ -310,11 +328,11 @@ class Record:
         return [Event(*row) for row in self._query("SELECT t, level, kind, text FROM events ORDER BY event")]
 
     def models(self) -> dict[str, Any]:
-        """Return the content of the model files that were identified from this run, by name."""
-        rows = self._query("SELECT name, model FROM models ORDER BY name").fetchall()
+        """Return the content of the model files that were identified from this run, by name, the newest last."""
+        rows = self._query("SELECT name, model FROM models ORDER BY rowid")
         try:
             return {name: json.loads(model) for name, model in rows}
-        except json.JSONDecodeError as error:
+        except (ValueError, TypeError) as error:
             raise DataError(f"{self.path} is damaged: {error}") from error
 
     def close(self) -> None:
@@ -324,13 +342,17 @@ class Record:
     def _table(self, table: str, leading: tuple[str, ...]) -> Table:
         names = leading + tuple(signal.name for signal in self.signals)
         columns = ", ".join(_quoted(name) for name in names)
-        rows = self._query(f"SELECT {columns} FROM {table} ORDER BY 1").fetchall()  # noqa: S608 - own names
-        data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+        rows = self._query(f"SELECT {columns} FROM {table} ORDER BY 1")  # noqa: S608 - own names
+        try:
+            data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+        except (ValueError, TypeError) as error:
+            raise DataError(f"{self.path} is damaged: table {table}: {error}") from error
         return Table({name: data[:, i].copy() for i, name in enumerate(names)})
 
-    def _query(self, statement: str) -> sqlite3.Cursor:
+    def _query(self, statement: str) -> list[tuple[Any, ...]]:
+        # All at once: damage may show at any row.
         try:
-            return self._db.execute(statement)
+            return self._db.execute(statement).fetchall()
         except sqlite3.DatabaseError as error:
             raise DataError(f"{self.path} is damaged: {error}") from error
 
@@ -359,6 +381,23 @@ def add_model(path: Path, name: str, t: float, model: Mapping[str, Any]) -> None
         raise DataError(f"{file} is damaged: {error}") from error
     finally:
         db.close()
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Check that signals can be columns of a journal.
+
+    Raises
+    ------
+    ConfigurationError
+        If two have one name, or one has that of a column which the journal itself needs; case does not count.
+    """
+    seen = dict.fromkeys(_OWN_COLUMNS, "is the name of a column of the journal")
+    for name in names:
+        if "\0" in name:
+            raise ConfigurationError(f"signal {name!r}: a name may not have a null character")
+        if (folded := name.lower()) in seen:
+            raise ConfigurationError(f"signal {name!r}: {seen[folded]}; choose another")
+        seen[folded] = "is the name of two signals (case does not count)"
 
 
 def _quoted(name: str) -> str:

@@ -180,7 +180,8 @@ def _cell(path: Path, row: Sequence[str], number: int, name: str, place: int) ->
     if place >= len(row) or not row[place].strip():
         raise DataError(f"{where}: is empty; expected a number")
     try:
-        value = float(row[place])
+        # Python reads 1_000 as a number; no measuring program writes one so.
+        value = float(row[place].replace("_", "?"))
     except ValueError:
         raise DataError(f"{where}: {row[place].strip()!r} is not a number") from None
     if not np.isfinite(value):

@@ -89,7 +89,8 @@ def load_model(path: Path) -> ModelFile:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
+    except (ValueError, RecursionError) as error:
         raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
     return parse_model(content, str(path))
 
@@ -110,13 +111,17 @@ def parse_model(content: object, source: str) -> ModelFile:
         )
     try:
         memory = content["memory"]
+        operator = operator_from_json(content["operator"])
+        for key in ("input_unit", "output_unit"):
+            if not isinstance(getattr(operator, key), str):
+                raise TypeError(f"operator: expected a text for {key}, got {getattr(operator, key)!r}")
         return ModelFile(
             name=str(content["name"]),
-            operator=operator_from_json(content["operator"]),
+            operator=operator,
             memory=None if memory is None else MemoryCurve.from_json(memory),
             provenance=dict(content["provenance"]),
         )
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None

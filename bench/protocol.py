@@ -22,8 +22,10 @@ import importlib
 import importlib.util
 import inspect
 import math
+import numbers
 import pkgutil
 import sys
+import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +35,8 @@ from typing import Any, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticUndefined
 
+from bench.control.loops import Loop
+from bench.devices import Signal
 from bench.errors import ConfigurationError
 
 PROTOCOL_PACKAGE = "protocols"
@@ -112,6 +116,37 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Control:
+    """Let a controller move one actuator, reading by reading, until it is done; then take a reading.
+
+    Attributes
+    ----------
+    loop : Loop
+        The controller at work; it sees numbers only.
+    actuator : str
+        Device that takes the set-points.
+    input : str
+        Signal that says what the actuator did.
+    output : str
+        Signal that is controlled.
+    limits : (float, float)
+        Set-points that the controller may ask for, in the actuator's unit.
+    timeout : float
+        Seconds after which the step has failed and the run ends in the safe state.
+    label : str
+        A few words for the record.
+    """
+
+    loop: Loop
+    actuator: str
+    input: str
+    output: str
+    limits: tuple[float, float]
+    timeout: float
+    label: str = ""
+
+
+@dataclass(frozen=True)
 class Phase:
     """A part of the protocol begins; shown live and kept in the record."""
 
@@ -125,7 +160,7 @@ class Note:
     text: str
 
 
-Message = Step | Phase | Note
+Message = Step | Control | Phase | Note
 
 
 @dataclass(frozen=True)
@@ -155,11 +190,19 @@ class Reading:
 
 Messages = Generator[Message, Reading, None]
 
+TRACES = (
+    Signal("reference", "", "reference", 2),
+    Signal("predicted", "", "output that the model predicts", 2),
+    Signal("disturbance", "", "estimated disturbance of the output", 2),
+    Signal("disturbance_uncertainty", "", "standard deviation of the estimated disturbance", 2),
+)
+"""What is recorded of a controller, in the unit of the signal that it controls; nan while none is at work."""
+
 
 class ProtocolParameters(BaseModel):
     """Base of a protocol's parameters; declare each with `parameter`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def parameter(
@@ -205,6 +248,7 @@ class ProtocolDefinition:
     summary: str
     description: str
     needs: tuple[str, ...]
+    controls: str
     parameters: type[ProtocolParameters]
     generator: Callable[[Any], Messages]
 
@@ -260,7 +304,9 @@ class ProtocolDefinition:
                 yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
 
 
-def protocol(*, needs: Sequence[str]) -> Callable[[Callable[[Any], Messages]], ProtocolDefinition]:
+def protocol(
+    *, needs: Sequence[str], controls: str = ""
+) -> Callable[[Callable[[Any], Messages]], ProtocolDefinition]:
     """Make a generator function a protocol.
 
     Its name is the function's, with dashes; its one argument is annotated with its parameters' class; its
@@ -270,16 +316,27 @@ def protocol(*, needs: Sequence[str]) -> Callable[[Callable[[Any], Messages]], P
     ----------
     needs : sequence of str
         Devices and signals that the rig must have, by name.
+    controls : str
+        Signal that the protocol's controllers control, if it has any: what they think of it (`TRACES`) is then
+        recorded beside the rig's signals.
 
     Raises
     ------
     TypeError
         If the function is not of this form.
     """
+    if isinstance(needs, str):
+        raise TypeError(f"needs: expected a sequence of names, such as ({needs!r},), got the text {needs!r}")
 
     def define(function: Callable[[Any], Messages]) -> ProtocolDefinition:
+        if not inspect.isgeneratorfunction(function):
+            raise TypeError(f"{function.__qualname__}: a protocol is a generator, and this function yields nothing")
         hints = [hint for name, hint in get_type_hints(function).items() if name != "return"]
-        if len(hints) != 1 or not (isinstance(hints[0], type) and issubclass(hints[0], ProtocolParameters)):
+        if (
+            len(inspect.signature(function).parameters) != 1
+            or len(hints) != 1
+            or not (isinstance(hints[0], type) and issubclass(hints[0], ProtocolParameters))
+        ):
             raise TypeError(
                 f"{function.__qualname__}: a protocol takes one argument, annotated with a ProtocolParameters"
             )
@@ -291,6 +348,7 @@ def protocol(*, needs: Sequence[str]) -> Callable[[Callable[[Any], Messages]], P
             summary=description.splitlines()[0].rstrip("."),
             description=description,
             needs=tuple(needs),
+            controls=controls,
             parameters=hints[0],
             generator=function,
         )
@@ -307,17 +365,20 @@ class Plan:
     steps : int
         Number of steps.
     seconds : float
-        Laboratory time in s, steps that settle until steady counted with their minimum.
+        Laboratory time in s, steps that settle until steady counted with their minimum, controllers not at all.
     at_most : float
         The same, counted with their timeouts.
     extremes : mapping of str to (float, float)
         Smallest and largest set-point by device.
+    watched : frozenset of str
+        Signals that have to become steady or are controlled.
     """
 
     steps: int
     seconds: float
     at_most: float
     extremes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    watched: frozenset[str] = frozenset()
 
 
 def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan:
@@ -328,9 +389,10 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
     Raises
     ------
     ConfigurationError
-        If the protocol does not end within a million steps, or its parameters do not fit together.
+        If the protocol does not end within a million steps, its parameters do not fit together, or it fails.
     """
-    steps, seconds, at_most = 0, 0.0, 0.0
+    steps, others, seconds, at_most = 0, 0, 0.0, 0.0
+    watched: set[str] = set()
     extremes: dict[str, tuple[float, float]] = {}
     echo = _Echo()
     try:
@@ -339,9 +401,15 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
         while True:
             if isinstance(message, Step):
                 for device, value in message.setpoints.items():
+                    if not _is_number(value):
+                        raise ConfigurationError(
+                            f"protocol {definition.name} sets {device} to {value!r}; expected a finite number"
+                        )
                     low, high = extremes.get(device, (value, value))
                     extremes[device] = (min(low, value), max(high, value))
                     echo.setpoints[device] = value
+                if isinstance(message.settle, UntilSteady):
+                    watched.add(message.settle.signal)
                 shortest, longest = _durations(message.settle)
                 seconds, at_most = seconds + shortest, at_most + longest
                 reading = Reading(steps, seconds, True, echo)
@@ -349,12 +417,35 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 if steps > _LONGEST_PLAN:
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
-            else:
+            elif isinstance(message, Control):
+                low, high = extremes.get(message.actuator, message.limits)
+                extremes[message.actuator] = (min(low, message.limits[0]), max(high, message.limits[1]))
+                watched |= {message.input, message.output}
+                at_most += message.timeout
+                reading = Reading(steps, seconds, True, echo)
+                steps += 1
+                message = messages.send(reading)
+            elif isinstance(message, Phase | Note):
+                others += 1
+                if others > _LONGEST_PLAN:
+                    raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} notes")
                 message = next(messages)
+            else:
+                raise ConfigurationError(
+                    f"protocol {definition.name} yielded {message!r}; expected a Step, a Control, a Phase or a Note"
+                )
     except StopIteration:
-        return Plan(steps, seconds, at_most, extremes)
+        return Plan(steps, seconds, at_most, extremes, frozenset(watched))
+    except ConfigurationError:
+        raise
     except ValueError as error:
         raise ConfigurationError(f"protocol {definition.name}: {error}") from error
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise ConfigurationError(
+            f"protocol {definition.name} failed in its dry run: {type(error).__name__}: {error} "
+            f"({place.filename}, line {place.lineno})"
+        ) from error
 
 
 class _Echo(dict[str, float]):
@@ -363,7 +454,15 @@ class _Echo(dict[str, float]):
         self.setpoints: dict[str, float] = {}
 
     def __missing__(self, signal: str) -> float:
-        return self.setpoints.get(signal.partition("_")[0], 0.0)
+        # The longest name that fits: beside `tec` there may be `tec_two`.
+        device = signal
+        while device and device not in self.setpoints:
+            device = device.rpartition("_")[0]
+        return self.setpoints.get(device, 0.0)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, numbers.Real) and math.isfinite(value)
 
 
 def _durations(settle: Settle) -> tuple[float, float]:
@@ -398,7 +497,7 @@ def find_protocol(name: str) -> ProtocolDefinition:
     ConfigurationError
         If there is none, or the file cannot be loaded or holds several.
     """
-    path, _, wanted = name.partition(":")
+    path, _, wanted = (name, "", "") if name.endswith(".py") else name.rpartition(":")
     if path.endswith(".py"):
         return _protocol_from_file(Path(path), wanted)
     protocols = packaged_protocols()
@@ -420,7 +519,9 @@ def _protocol_from_file(path: Path, wanted: str) -> ProtocolDefinition:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except (SyntaxError, ImportError, NameError, TypeError) as error:
+    # A file of the operator's may fail in any way, and may even leave by sys.exit.
+    except (Exception, SystemExit) as error:
+        del sys.modules[spec.name]
         raise ConfigurationError(f"protocol file {path}: {type(error).__name__}: {error}") from error
     found = {definition.name: definition for definition in _definitions(module)}
     names = ", ".join(found) or "none"

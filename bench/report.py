@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
 
 
 def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
-    """Write a run's readings and telemetry as `csv` or `parquet`, or rebuild its `rrd`.
+    """Write a run's readings and telemetry as `csv` or `parquet`, rebuild its `rrd`, or picture it as `png`.
 
     Returns
     -------
@@ -98,10 +99,12 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
                 raise ConfigurationError(f"{path} exists already; choose another folder by --out")
             rebuild(record, path)
             return [path]
+        if format_ == "png":
+            return [_picture(record, folder)]
         tables = {"readings": record.steps(), "telemetry": record.telemetry()}
         headers = {name: _headers(record, table) for name, table in tables.items()}
     if format_ not in ("csv", "parquet"):
-        raise ConfigurationError(f"format {format_!r} is unknown; allowed are csv, parquet and rrd")
+        raise ConfigurationError(f"format {format_!r} is unknown; allowed are csv, parquet, rrd and png")
     paths = []
     for name, table in tables.items():
         path = folder / f"{name}.{format_}"
@@ -111,6 +114,19 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
             _write_parquet(path, headers[name], table)
         paths.append(path)
     return paths
+
+
+def _picture(record: Record, folder: Path) -> Path:
+    from bench.dashboard import picture, rebuild
+
+    path = folder / "dashboard.png"
+    with tempfile.TemporaryDirectory() as scratch:
+        recording = Path(scratch) / RECORDING_NAME
+        rebuild(record, recording)
+        complaints = picture(recording, path)
+    if complaints:
+        raise DataError(f"{path}: the viewer complains: {'; '.join(complaints)}")
+    return path
 
 
 def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:

@@ -40,25 +40,26 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from bench.calibration import DerivedSignal
 from bench.clock import Clock
 from bench.devices import Actuator, Device, DriverSettings, Signal, role_of
 from bench.errors import ConfigurationError
+from bench.journal import check_names
 from bench.safety import Interlock
 from bench.validation import problems
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class RigTable(_Table):
@@ -84,6 +85,13 @@ class DashboardTable(_Table):
     plane: tuple[float, float] = Field(description="ends of both axes of the Preisach plane")
     levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
 
+    @field_validator("input_range", "output_range", "plane")
+    @classmethod
+    def _range_is_not_empty(cls, ends: tuple[float, float]) -> tuple[float, float]:
+        if not ends[0] < ends[1]:
+            raise ValueError("expected two numbers, the lower one first")
+        return ends
+
 
 class _RigFileContent(_Table):
     rig: RigTable
@@ -98,7 +106,7 @@ class _RigFileContent(_Table):
 class LaboratorySettings(BaseModel):
     """Base of what the table `[emulation]` may say; a laboratory extends it with its own keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Laboratory(Protocol):
@@ -200,7 +208,7 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
 class Rig:
     """Connected devices, and the signals that they give.
 
-    Use it as a context manager: leaving it closes every line. It does not bring the devices into their safe
+    Use it as a context manager: leaving it closes every line that still can be closed. It does not bring the devices into their safe
     state; whoever moves them does (the engine, always).
 
     Parameters
@@ -231,7 +239,7 @@ class Rig:
             for entry in file.devices:
                 settings = _wired(entry, ports, file.path)
                 device: Device = entry.driver.connect(entry.name, settings, clock)
-                stack.callback(device.close)
+                stack.callback(_close, device)
                 self.devices[entry.name] = device
             self.signals = self._signals()
             self._check_references()
@@ -295,9 +303,12 @@ class Rig:
 
     def _check_references(self) -> None:
         names = [signal.name for signal in self.signals]
+        try:
+            check_names(names)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{self.file.path}: {error}") from None
         known = ", ".join(names)
         used = [(f"interlocks.{i}.signal", lock.signal) for i, lock in enumerate(self.file.interlocks)]
-        used += [(f"derived.{name}.source", derived.source) for name, derived in self.file.derived.items()]
         if self.file.dashboard is not None:
             used += [
                 ("dashboard.input", self.file.dashboard.input),
@@ -308,15 +319,25 @@ class Rig:
                 raise ConfigurationError(
                     f"{self.file.path}: {key} = {signal!r}: there is no such signal; there are: {known}"
                 )
-        double = {name for name in names if names.count(name) > 1}
-        if double:
-            raise ConfigurationError(f"{self.file.path}: two signals are named {', '.join(sorted(double))}")
+        # They are computed in their order in the file, each from what is there by then.
+        units = {signal.name: signal.unit for signal in self.signals if signal.name not in self.file.derived}
+        for name, derived in self.file.derived.items():
+            key = f"{self.file.path}: derived.{name}.source = {derived.source!r}"
+            if derived.source not in units:
+                raise ConfigurationError(
+                    f"{key}: there is no such signal, or it is derived further down; there are: {', '.join(units)}"
+                )
+            if units[derived.source] != derived.source_unit:
+                raise ConfigurationError(
+                    f"{key}: is in {units[derived.source]}; a {derived.kind} is computed from {derived.source_unit}"
+                )
+            units[name] = derived.signal(name).unit
 
 
 def _read(name: str) -> tuple[str, str]:
     if name.endswith(".toml"):
         try:
-            return name, Path(name).read_text(encoding="utf-8")
+            return name, Path(name).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigurationError(f"rig file {name} cannot be read: {error}") from None
     if name not in packaged_rigs():
@@ -350,19 +371,22 @@ def _validate(name: str, path: str, text: str, content: Mapping[str, Any]) -> Ri
     for device, table in tables.devices.items():
         options = dict(table)
         try:
-            driver = _load(options.pop("driver", None), f"devices.{device}.driver")
-            role_of(driver)
+            driver = _load(options.pop("driver", None), f"devices.{device}.driver", DriverSettings, "connect")
+            try:
+                role_of(driver)
+            except TypeError as error:
+                raise ConfigurationError(f"devices.{device}.driver = {table['driver']!r}: {error}") from None
             entries.append(DeviceEntry(device, driver, driver.Settings.model_validate(options)))
         except ValidationError as error:
             found.extend(problems(error, driver.Settings, f"devices.{device}."))
-        except (ConfigurationError, TypeError) as error:
+        except ConfigurationError as error:
             found.append(str(error))
     laboratory: Any = None
     settings: LaboratorySettings | None = None
     if tables.emulation is not None:
         options = dict(tables.emulation)
         try:
-            laboratory = _load(options.pop("laboratory", None), "emulation.laboratory")
+            laboratory = _load(options.pop("laboratory", None), "emulation.laboratory", LaboratorySettings, "open")
             settings = laboratory.Settings.model_validate(options)
         except ValidationError as error:
             found.extend(problems(error, laboratory.Settings, "emulation."))
@@ -385,21 +409,37 @@ def _validate(name: str, path: str, text: str, content: Mapping[str, Any]) -> Ri
     )
 
 
-def _load(reference: object, key: str) -> Any:  # noqa: ANN401 - a class of any kind
+def _load(reference: object, key: str, settings: type[BaseModel], method: str) -> Any:  # noqa: ANN401 - any class
     if not isinstance(reference, str) or reference.count(":") != 1:
         raise ConfigurationError(
             f"{key} = {reference!r}: expected module:class, such as drivers.meerstetter:MeerstetterTEC"
         )
     module, _, name = reference.partition(":")
     try:
-        loaded = getattr(importlib.import_module(module), name)
-    except ImportError as error:
-        raise ConfigurationError(f"{key} = {reference!r}: the module cannot be loaded: {error}") from None
-    except AttributeError:
-        raise ConfigurationError(f"{key} = {reference!r}: module {module} has no {name}") from None
-    if not (isinstance(loaded, type) and hasattr(loaded, "Settings")):
-        raise ConfigurationError(f"{key} = {reference!r}: is not a class with Settings, so a rig file cannot use it")
+        imported = importlib.import_module(module)
+    # A module of the user's own may fail in any way.
+    except Exception as error:
+        raise ConfigurationError(
+            f"{key} = {reference!r}: the module cannot be loaded: {type(error).__name__}: {error}"
+        ) from error
+    loaded = getattr(imported, name, None)
+    if loaded is None:
+        raise ConfigurationError(f"{key} = {reference!r}: module {module} has no {name}")
+    kind = getattr(loaded, "Settings", None)
+    if not (isinstance(loaded, type) and isinstance(kind, type) and issubclass(kind, settings)):
+        raise ConfigurationError(
+            f"{key} = {reference!r}: is not a class with Settings that extend {settings.__name__}, "
+            "so a rig file cannot use it"
+        )
+    if not callable(getattr(loaded, method, None)):
+        raise ConfigurationError(f"{key} = {reference!r}: class {name} has no method {method}")
     return loaded
+
+
+def _close(device: Device) -> None:
+    # A line that is gone cannot be closed either; that must not hide how the run ended.
+    with suppress(Exception):
+        device.close()
 
 
 def _wired(entry: DeviceEntry, ports: Mapping[str, str], path: str) -> DriverSettings:

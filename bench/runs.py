@@ -8,20 +8,21 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from bench.clock import Stopwatch, make_clock, room_date
+from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
-from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.protocol import TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, load_rig
 from bench.terminal import ProgressDisplay, ask_operator
 
@@ -113,21 +114,26 @@ def carry_out(run: Run, console: Console) -> RunResult:
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = _metadata(run, rig, expected, folder.name)
-        journal = Journal(folder / FILE_NAME, rig.signals, meta)
+        signals = rig.signals + trace_signals(run.protocol, rig)
+        journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
         observers: list[Any] = []
-        if run.live or run.recording:
-            dashboard = stack.enter_context(_dashboard(run, rig, meta, folder))
+        dashboard = (
+            stack.enter_context(_dashboard(run, rig, signals, meta, folder)) if run.live or run.recording else None
+        )
+        if dashboard is not None:
             observers.append(dashboard)
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
         shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in rig.signals[:2])
-        progress = ProgressDisplay(console, run.protocol.name, rig.signals, shown, expected.steps)
+        progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
         observers.append(stack.enter_context(progress))
         interrupts = stack.enter_context(Interrupts(lambda text: console.print(text, style="yellow")))
-        ask = (lambda: ask_operator(console)) if sys.stdin.isatty() else None
+        ask = (lambda: ask_operator(console)) if sys.stdin is not None and sys.stdin.isatty() else None
         outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, run.parameters)
+        if dashboard is not None:
+            dashboard.finish(outcome.status, outcome.reason)
     return RunResult(folder, outcome, stopwatch.seconds())
 
 
@@ -155,13 +161,13 @@ def run_card(meta: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _dashboard(run: Run, rig: Rig, meta: Mapping[str, Any], folder: Path) -> Any:  # noqa: ANN401 - see below
+def _dashboard(run: Run, rig: Rig, signals: Sequence[Signal], meta: Mapping[str, Any], folder: Path) -> Any:  # noqa: ANN401 - see below
     # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
     from bench.dashboard import Dashboard, DashboardLayout
 
     layout = DashboardLayout(title=rig.file.rig.title, **meta["dashboard"]) if meta["dashboard"] else None
     return Dashboard(
-        rig.signals,
+        signals,
         layout,
         run_id=str(meta["run"]),
         title=f"{rig.file.rig.title}: {run.protocol.name}",
@@ -170,6 +176,15 @@ def _dashboard(run: Run, rig: Rig, meta: Mapping[str, Any], folder: Path) -> Any
         card=run_card(meta),
         properties={"rig": rig.file.name, "protocol": run.protocol.name, "seed": run.seed},
     )
+
+
+def trace_signals(protocol: ProtocolDefinition, rig: Rig) -> tuple[Signal, ...]:
+    """Return the signals that a protocol's controllers add to the rig's."""
+    if not protocol.controls:
+        return ()
+    rig.check_needs(protocol.name, [protocol.controls])
+    unit = next(signal.unit for signal in rig.signals if signal.name == protocol.controls)
+    return tuple(replace(signal, unit=unit) for signal in TRACES)
 
 
 def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -29,6 +30,8 @@ class Interlock(BaseModel):
     def _range_is_not_empty(self) -> Interlock:
         if not self.low < self.high:
             raise ValueError(f"low must be below high, got low = {self.low} and high = {self.high}")
+        if math.isinf(self.low) and math.isinf(self.high):
+            raise ValueError("low or high, or both, must be given")
         return self
 
 
@@ -92,6 +95,7 @@ def make_safe(devices: Iterable[Device]) -> dict[str, str]:
         try:
             device.safe()
             outcome[device.name] = SAFE
-        except Exception as error:
+        # Nothing may keep the next device from being tried, an impatient Ctrl-C included.
+        except BaseException as error:
             outcome[device.name] = f"{type(error).__name__}: {error}"
     return outcome

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -71,8 +72,10 @@ class ProgressDisplay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._progress.refresh()
-        self._progress.stop()
+        # The terminal may be gone by now.
+        with suppress(OSError):
+            self._progress.refresh()
+            self._progress.stop()
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Show the readings of a tick, at most ten times a second."""

@@ -22,7 +22,7 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
         Key under which the model stands in the file, with its final point.
     """
     for problem in error.errors():
-        location = [part for part in problem["loc"] if not (isinstance(part, str) and "-" in part)]
+        location = problem["loc"]
         key = prefix + ".".join(str(part) for part in location)
         owner, field = _find(model, location)
         message = problem["msg"].removeprefix("Value error, ")

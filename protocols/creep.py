@@ -28,8 +28,8 @@ def creep(parameters: Parameters) -> Messages:
     temperature. A specimen without creep shows no more than what the temperature control leaves over
     (Zhang et al. 2013, Fig. 4).
     """
-    if parameters.settling >= parameters.duration:
-        raise ValueError("settling must be shorter than duration")
+    if parameters.settling + 2 * parameters.interval > parameters.duration:
+        raise ValueError("settling must leave two intervals of the duration")
     yield Phase("start")
     yield Step({"tec": parameters.start}, UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0))
     for name, temperature in (("hot", parameters.hot), ("cool", parameters.cool)):

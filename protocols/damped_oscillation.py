@@ -41,12 +41,10 @@ def damped_oscillation(parameters: Parameters) -> Messages:
     )
     yield Phase("rise")
     direction = 1.0
-    half_cycle = 0
     for previous, target in pairwise(setpoints.tolist()):
-        label = ""
-        if (target - previous) * direction < 0:
+        reversal = (target - previous) * direction < 0
+        if reversal and previous == setpoints.max():
+            yield Phase("damped oscillation")
+        if reversal:
             direction = -direction
-            half_cycle += 1
-            label = "reversal"
-            yield Phase(f"half-cycle {half_cycle}")
-        yield Step({"tec": target}, Dwell(parameters.dwell), label=label)
+        yield Step({"tec": target}, Dwell(parameters.dwell), label="reversal" if reversal else "")

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import numpy as np
+
+
+def preload() -> None:
+    """Import what a `DriftEstimator` needs, so that making one later takes no time.
+
+    That import takes half a second and more, which only those who settle until steady shall pay, and not while
+    a device is on and its watchdog waits for the next word.
+    """
+    importlib.import_module("filterpy.kalman")
 
 
 def agility_for(*, drift: float, noise: float, period: float) -> float:
@@ -61,7 +71,6 @@ class DriftEstimator:
     def __init__(self, *, noise: float, agility: float) -> None:
         if not (0 < noise < math.inf and 0 < agility < math.inf):
             raise ValueError(f"noise, agility: expected positive numbers, got {noise} and {agility}")
-        # Half a second of import that only those who settle until steady shall pay.
         from filterpy.kalman import KalmanFilter
 
         self._filter = KalmanFilter(dim_x=2, dim_z=1)
@@ -120,3 +129,104 @@ class DriftEstimator:
     def is_steady(self, limit: float) -> bool:
         """Return whether drift and uncertainty together are within `limit` (units/s)."""
         return self._readings >= 2 and abs(self.drift) + self.uncertainty <= limit
+
+
+class DisturbanceEstimator:
+    """Estimates the slowly changing difference between a measured and a predicted output.
+
+    Parameters
+    ----------
+    walk_variance : float
+        Variance q by which the disturbance may change between two updates, output units squared; larger
+        than the sensor's part where the model's error changes from place to place.
+    reading_variance : float
+        Variance r of one update's value, output units squared; of a mean of n readings 1/n of a reading's.
+    initial_variance : float or None
+        Variance of the disturbance before the first reading, about 0. By default so large that the first
+        reading fixes the value.
+
+    Raises
+    ------
+    ValueError
+        If a variance is not a positive finite number.
+
+    Notes
+    -----
+    A Kalman filter of a random walk, carried out by filterpy: P⁻ = P + q, K = P⁻ / (P⁻ + r),
+    d += K (z - d), P = (1 - K) P⁻, with the steady state P⁻ = (q + √(q² + 4 q r)) / 2 (Bar-Shalom, Li,
+    Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 5.2). Where a
+    controller takes the estimate away from its next target, and the true local gain is g times the
+    model's, the error goes on by the factor 1 - K g: stable for 0 < K g < 2.
+    """
+
+    def __init__(
+        self, *, walk_variance: float, reading_variance: float, initial_variance: float | None = None
+    ) -> None:
+        if not (0 < walk_variance < math.inf and 0 < reading_variance < math.inf):
+            raise ValueError(
+                "walk_variance, reading_variance: expected positive numbers, "
+                f"got {walk_variance} and {reading_variance}"
+            )
+        first = 1e9 * (walk_variance + reading_variance) if initial_variance is None else initial_variance
+        if not 0 < first < math.inf:
+            raise ValueError(f"initial_variance: expected a positive number, got {initial_variance}")
+        # Half a second of import that only those who estimate shall pay.
+        from filterpy.kalman import KalmanFilter
+
+        self._filter = KalmanFilter(dim_x=1, dim_z=1)
+        self._filter.x = np.zeros(1)
+        self._filter.F = np.eye(1)
+        self._filter.H = np.eye(1)
+        self._filter.Q = np.array([[walk_variance]])
+        self._filter.R = np.array([[reading_variance]])
+        self._filter.P = np.array([[first]])
+        self._first = first
+
+    def update(self, value: float | None) -> float:
+        """Take in one measured disturbance and return the estimate.
+
+        Parameters
+        ----------
+        value : float or None
+            Measured minus predicted output, output units; None for a missing reading, of which only the
+            uncertainty takes note.
+
+        Raises
+        ------
+        ValueError
+            If the value is not finite.
+        """
+        # filterpy would take a nan silently and never recover.
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number or None, got {value}")
+        self._filter.predict()
+        self._filter.update(None if value is None else np.array([value]))
+        return self.value
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._filter.x = np.zeros(1)
+        self._filter.P = np.array([[self._first]])
+
+    @property
+    def value(self) -> float:
+        """The estimated disturbance, output units; 0 before the first reading."""
+        return float(self._filter.x[0])
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard deviation of the estimate, output units."""
+        return math.sqrt(float(self._filter.P[0, 0]))
+
+    @property
+    def gain(self) -> float:
+        """The part K, 0 to 1, that the next value will have in the estimate."""
+        predicted = float(self._filter.P[0, 0] + self._filter.Q[0, 0])
+        return predicted / (predicted + float(self._filter.R[0, 0]))
+
+    @property
+    def steady_gain(self) -> float:
+        """The gain K that many readings lead to."""
+        q, r = float(self._filter.Q[0, 0]), float(self._filter.R[0, 0])
+        predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
+        return predicted / (predicted + r)

@@ -44,10 +44,12 @@ def increasing(name: str, values: ArrayLike, least: int = 2) -> Floats:
 
 
 def number(name: str, value: float) -> float:
-    """Return `value` as a finite float."""
+    """Return `value` as a finite float; a text is none, whatever it says."""
     try:
+        if isinstance(value, str):
+            raise TypeError
         result = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected a number, got {value!r}") from None
     if not math.isfinite(result):
         raise ValueError(f"{name}: expected a finite number, got {result}")

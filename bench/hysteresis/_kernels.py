@@ -620,3 +620,29 @@ def best_staircases(columns: Floats, widths: Floats) -> Floats:
             running = max(running, best[j, i] + widths[j] * columns[i, j])
             best[j + 1, i] = running
     return best
+
+
+@njit(cache=True)
+def plays(drive: Floats, thresholds: Floats, state: Floats) -> Floats:
+    """Step the plays through `drive`; return their states sample by sample. `state` is changed."""
+    result = np.empty((drive.size, state.size))
+    for t in range(drive.size):
+        x = drive[t]
+        for i in range(state.size):
+            state[i] = max(x - thresholds[i], min(x + thresholds[i], state[i]))
+            result[t, i] = state[i]
+    return result
+
+
+@njit(cache=True)
+def weighted_plays(drive: Floats, thresholds: Floats, weights: Floats, state: Floats) -> Floats:
+    """Step the plays through `drive`; return their weighted sum. `state` is changed."""
+    result = np.empty(drive.size)
+    for t in range(drive.size):
+        x = drive[t]
+        total = 0.0
+        for i in range(state.size):
+            state[i] = max(x - thresholds[i], min(x + thresholds[i], state[i]))
+            total += weights[i] * state[i]
+        result[t] = total
+    return result

@@ -183,6 +183,78 @@ class MemoryCurve:
         distinct = [vertex for n, vertex in enumerate(vertices) if n == 0 or vertex != vertices[n - 1]]
         return np.array(distinct, dtype=np.float64)
 
+    def _turns(self, low: float, high: float) -> list[float]:
+        """Return the shortest set-points that make this curve, clipped to [low, high], from negative saturation."""
+        lefts, heights, present = self.staircase(low, high)
+        if not heights:
+            return []
+        turns = [heights[0]]
+        for left, height in zip(lefts[1:], heights[1:], strict=True):
+            turns += [left, height]
+        return turns if present == heights[-1] else [*turns, present]
+
+    def priming(self, low: float, high: float, present: MemoryCurve | None = None) -> tuple[float, ...]:
+        """Return the fewest set-points within [low, high] that bring a specimen to this memory.
+
+        An extremum that is not wanted is wiped out only by going back to the extremum before it, or beyond, and
+        each wanted extremum that is missing must be visited. So the longest outer part that the present memory
+        shares is kept; the sequence begins at the first difference, one extremum earlier if the present one there
+        is the more extreme.
+
+        Parameters
+        ----------
+        low, high : float
+            Range of the set-points, input units, low < high; outside of it every hysteron is saturated. Both
+            memories count only as far as they lie in the plane of this range.
+        present : MemoryCurve or None
+            The memory of the specimen now; None if it is unknown.
+
+        Returns
+        -------
+        tuple of float
+            Set-points, each reached monotonically from the one before; empty if nothing is to be done.
+
+        Raises
+        ------
+        ValueError
+            If low >= high or a bound is not finite.
+        """
+        low, high = _checks.increasing("low, high", [low, high]).tolist()
+        wanted = self._turns(low, high)
+        if present is None:
+            # Both ends wipe everything out.
+            return tuple(wanted) if wanted and wanted[0] == high else (low, *wanted)
+        here = present._turns(low, high)
+        shared = 0
+        while shared < min(len(wanted), len(here)) and wanted[shared] == here[shared]:
+            shared += 1
+        if shared < len(here):
+            # Even places are maxima, odd ones minima.
+            beyond = shared < len(wanted) and (wanted[shared] > here[shared]) == (shared % 2 == 0)
+            if not beyond:
+                return (wanted[shared - 1] if shared else low, *wanted[shared:])
+        return tuple(wanted[shared:])
+
+    def describe(self, unit: str = "") -> str:
+        """Return the memory in words, for people: present branch, input, and the reversals it remembers."""
+        suffix = f" {unit}" if unit else ""
+        branch = "rising" if self.rising else "falling"
+        ends = {-1: "negative", 1: "positive"}
+        lines = [f"{branch} at {self.input:g}{suffix}, from {ends[self.saturation]} saturation"]
+        if not self.extrema:
+            lines.append("no reversal remembered: on a major branch")
+            return "\n".join(lines)
+        count = len(self.extrema)
+        lines.append(f"{count} reversal{'s' if count > 1 else ''} remembered, outermost first:")
+        maximum = self.saturation < 0
+        for value in self.extrema:
+            lines.append(f"  {'maximum' if maximum else 'minimum'} {value:g}{suffix}")
+            maximum = not maximum
+        if count > 1:
+            last, before = self.extrema[-1], self.extrema[-2]
+            lines.append(f"the innermost loop closes at {before:g}{suffix}, {abs(before - last):g}{suffix} wide")
+        return "\n".join(lines)
+
     def to_json(self) -> dict[str, Any]:
         """Return the memory as a JSON object."""
         return {"saturation": int(self.saturation), "extrema": list(self.extrema), "input": self.input}

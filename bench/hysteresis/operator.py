@@ -88,9 +88,14 @@ def operator_from_json(document: Mapping[str, Any]) -> Operator[Any]:
         If the type is unknown or the object is not what that type expects.
     """
     from bench.hysteresis.polynomial import Polynomial
+    from bench.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
     from bench.hysteresis.preisach import Preisach
 
-    kinds: dict[str, type[Preisach] | type[Polynomial]] = {"preisach": Preisach, "polynomial": Polynomial}
+    kinds: dict[str, type[Preisach] | type[Polynomial] | type[PrandtlIshlinskii]] = {
+        "preisach": Preisach,
+        "polynomial": Polynomial,
+        "prandtl-ishlinskii": PrandtlIshlinskii,
+    }
     kind = _checks.json_field(document, "type", "operator")
     if kind not in kinds:
         raise ValueError(f"operator: expected type {' or '.join(map(repr, kinds))}, got {kind!r}")

@@ -15,6 +15,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Rows = NDArray[np.int32]
 
+# Columns that `gram_rows` forms at a time.
+_BLOCK = 8
+
 
 @njit(cache=True)
 def moments(starts: Integers, rows: Rows, values: Floats, base: Floats, remaining: Floats) -> tuple[Floats, Floats]:
@@ -102,37 +105,104 @@ def gram_rows(
     """
     sparse = base.size
     samples = weights.size
-    dense = np.empty(samples)
-    tail = np.empty(samples)
-    for k in range(new.size):
-        b = new[k]
-        if b >= sparse:
-            for n in range(samples):
-                dense[n] = weights[n] * extra[n, b - sparse]
-        else:
-            level = (base[b] - means[b]) / norms[b]
-            scale = 1.0 / norms[b]
-            n = 0
-            for e in range(starts[b], starts[b + 1]):
-                while n < rows[e]:
-                    dense[n] = weights[n] * level
+    # Several new columns at a time: one look-up of a row then serves them all.
+    dense = np.zeros((samples, _BLOCK))
+    tail = np.zeros((samples, _BLOCK))
+    products = np.empty(_BLOCK)
+    for first in range(0, new.size, _BLOCK):
+        count = min(_BLOCK, new.size - first)
+        for k in range(count):
+            b = new[first + k]
+            if b >= sparse:
+                for n in range(samples):
+                    dense[n, k] = weights[n] * extra[n, b - sparse]
+            else:
+                level = (base[b] - means[b]) / norms[b]
+                scale = 1.0 / norms[b]
+                n = 0
+                for e in range(starts[b], starts[b + 1]):
+                    while n < rows[e]:
+                        dense[n, k] = weights[n] * level
+                        n += 1
+                    level += values[e] * scale
+                while n < samples:
+                    dense[n, k] = weights[n] * level
                     n += 1
-                level += values[e] * scale
-            while n < samples:
-                dense[n] = weights[n] * level
-                n += 1
-        total = 0.0
+        products[:] = 0.0
         for n in range(samples - 1, -1, -1):
-            total += dense[n]
-            tail[n] = total
+            for k in range(_BLOCK):
+                products[k] += dense[n, k]
+                tail[n, k] = products[k]
         for m in range(known.size):
             a = known[m]
-            product = 0.0
+            products[:] = 0.0
             if a >= sparse:
                 for n in range(samples):
-                    product += dense[n] * extra[n, a - sparse]
+                    factor = extra[n, a - sparse]
+                    for k in range(_BLOCK):
+                        products[k] += dense[n, k] * factor
             else:
                 for e in range(starts[a], starts[a + 1]):
-                    product += values[e] * tail[rows[e]]
-                product /= norms[a]
-            result[k, m] = product
+                    change, n = values[e], rows[e]
+                    for k in range(_BLOCK):
+                        products[k] += change * tail[n, k]
+                for k in range(_BLOCK):
+                    products[k] /= norms[a]
+            for k in range(count):
+                result[first + k, m] = products[k]
+
+
+@njit(cache=True)
+def delete_column(upper: Floats, size: int, k: int) -> None:
+    """Remove column k of the triangular factor U = upper[:size, :size] of a Gram matrix UᵀU, by rotations.
+
+    The factor of what remains is upper[: size - 1, : size - 1].
+    """
+    for i in range(k):
+        row = upper[i]
+        for c in range(k + 1, size):
+            row[c - 1] = row[c]
+    for j in range(k, size - 1):
+        this, following = upper[j], upper[j + 1]
+        a, b = this[j + 1], following[j + 1]
+        radius = np.hypot(a, b)
+        cosine, sine = a / radius, b / radius
+        this[j] = radius
+        for c in range(j + 2, size):
+            a, b = this[c], following[c]
+            this[c - 1] = cosine * a + sine * b
+            following[c] = cosine * b - sine * a
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def solve_factored(upper: Floats, size: int, right: Floats) -> Floats:
+    """Return the solution of UᵀU x = right with U = upper[:size, :size]."""
+    x = right.copy()
+    for j in range(size):
+        row = upper[j]
+        x[j] /= row[j]
+        value = x[j]
+        for c in range(j + 1, size):
+            x[c] -= value * row[c]
+    for j in range(size - 1, -1, -1):
+        row = upper[j]
+        total = 0.0
+        for c in range(j + 1, size):
+            total += row[c] * x[c]
+        x[j] = (x[j] - total) / row[j]
+    return x
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def factored_lengths(upper: Floats, size: int, first: Floats, second: Floats) -> tuple[float, float]:
+    """Return the norms of U @ first and U @ second with U = upper[:size, :size]."""
+    one, two = 0.0, 0.0
+    for j in range(size):
+        row = upper[j]
+        a, b = 0.0, 0.0
+        for c in range(j, size):
+            a += row[c] * first[c]
+            b += row[c] * second[c]
+        one += a * a
+        two += b * b
+    return float(np.sqrt(one)), float(np.sqrt(two))

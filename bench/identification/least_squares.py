@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +25,8 @@ _DEPENDENT = (1e-12, 1e-13, 1e-14)
 _TOLERANCE = 1e-12
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.5
+# A smooth fit of at least this order starts from one of half the order.
+_COARSEST = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +81,11 @@ class Fit:
         Output units.
     uncertainties : ndarray, shape (K + q,)
         Standard uncertainties from the residual variance with the passive set taken as known; 0 for
-        coefficients held at zero, NaN where there are no degrees of freedom or smoothing or a minimum norm
-        makes the estimate biased.
+        coefficients held at zero, NaN where there are no degrees of freedom or a minimum norm is taken.
+        With smoothing they are the square roots of the diagonal of variance * (RᵀWR + penalty)⁻¹ on the passive
+        set: what is left of the uncertainty if the penalty is taken as prior knowledge (Bayesian posterior), so
+        they contain the smoothing's bias as far as the density is as smooth as the weight says. The variance
+        is the residual sum over (samples - effective coefficients - 1).
     certificate : Certificate
         Evidence of optimality, conditioning and coverage.
     """
@@ -121,7 +125,8 @@ def fit(
         Number of first samples left out of the cost; they still drive the memory.
     smoothing : float
         Weight >= 0 of a roughness penalty: smoothing * (mean squared column norm) * |discrete Laplacian of
-        the density on the plane|². Every cell then counts, so keep to M of some tens.
+        the density on the plane|². Cells never swept then follow their neighbours. The fit starts from that on
+        a plane of half the order. See `cross_validate` for a choice of the weight.
 
     Returns
     -------
@@ -138,7 +143,7 @@ def fit(
     if not smoothing >= 0.0 or not np.isfinite(smoothing):
         raise ValueError(f"smoothing: expected a finite number >= 0, got {smoothing}")
     with _one_thread():
-        return _ActiveSet(regressor, y, w, constrained, smoothing).solve()
+        return _ActiveSet(regressor, y, w, constrained, Layout.of(regressor.base.size), smoothing).solve()
 
 
 def fit_minimum_norm(
@@ -235,58 +240,75 @@ def _one_thread() -> Any:  # noqa: ANN401
 
 
 class _Factor:
-    """The Cholesky factor of the passive Gram block, redone only from the first changed column."""
+    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go."""
 
     def __init__(self) -> None:
-        self.lower = np.zeros((0, 0), order="F")
+        self.upper = np.zeros((0, 0))
+        self.size = 0
         self.threshold = _DEPENDENT[0]
 
-    def refresh(self, tail: Floats, keep: int) -> int | None:
-        """Factor anew from row `keep` on, given these rows of the Gram block, shape (size - keep, size).
+    @property
+    def compact(self) -> Floats:
+        """Lower factor, a copy as LAPACK wants it."""
+        return np.array(self.upper[: self.size, : self.size], order="C").T
 
-        Return None, or the first column that depends on those before it.
+    def append(self, cross: Floats, square: Floats) -> int | None:
+        """Add columns, given their products with the present ones, shape (size, p), and with each other.
+
+        Return None, or the first that depends on those before it; the ones before that are added then.
         """
         from scipy.linalg.blas import dsyrk, dtrsm
         from scipy.linalg.lapack import dpotrf
 
-        size = tail.shape[1]
-        lower = np.zeros((size, size), order="F")
-        lower[:keep, :keep] = self.lower[:keep, :keep]
-        rest = np.asfortranarray(tail[:, keep:])
-        if keep and keep < size:
-            side = dtrsm(1.0, self.lower[:keep, :keep], tail[:, :keep], side=1, lower=1, trans_a=1)
-            rest = dsyrk(-1.0, side, beta=1.0, c=rest, lower=1)
-            lower[keep:, :keep] = side
-        bad: int | None = None
-        if keep < size:
-            block, info = dpotrf(rest, lower=1, clean=1)
-            good = size - keep if info == 0 else info - 1
-            # Pivots below the threshold would pass as rounding noise.
-            small = np.flatnonzero(np.diag(block)[:good] ** 2 < self.threshold * np.diag(tail, keep)[:good])
-            if small.size:
-                good = int(small[0])
-            lower[keep : keep + good, keep : keep + good] = block[:good, :good]
-            if good < size - keep:
-                bad = keep + good
-        self.lower = lower
-        return bad
+        old, more = cross.shape
+        if old + more > self.upper.shape[0]:
+            room = max(64, old + more + (old + more) // 2)
+            grown = np.zeros((room, room))
+            grown[:old, :old] = self.upper[:old, :old]
+            self.upper = grown
+        rest = np.asfortranarray(square)
+        if old:
+            side = dtrsm(1.0, self.compact, np.asfortranarray(cross), lower=1, overwrite_b=1)
+            rest = dsyrk(-1.0, side, beta=1.0, c=rest, trans=1, lower=1)
+            self.upper[:old, old : old + more] = side
+        block, info = dpotrf(rest, lower=1, clean=1)
+        good = more if info == 0 else info - 1
+        # Pivots below the threshold would pass as rounding noise.
+        small = np.flatnonzero(np.diag(block)[:good] ** 2 < self.threshold * np.diag(square)[:good])
+        if small.size:
+            good = int(small[0])
+        self.upper[old : old + good, old : old + good] = block[:good, :good].T
+        self.size = old + good
+        return None if good == more else good
+
+    def truncate(self, size: int) -> None:
+        """Keep the first columns only."""
+        self.size = size
+
+    def delete(self, places: Indices) -> None:
+        """Remove the columns at increasing places."""
+        from bench.identification import _kernels
+
+        for place in places[::-1]:
+            _kernels.delete_column(self.upper, self.size, place)
+            self.size -= 1
 
     def solve(self, right: Floats) -> Floats:
-        from scipy.linalg.lapack import dpotrs
+        from bench.identification import _kernels
 
-        solution, _ = dpotrs(self.lower, right, lower=1)
-        return np.asarray(solution)
+        return np.asarray(_kernels.solve_factored(self.upper, self.size, right))
 
-    def length(self, step: Floats) -> float:
-        """Return the norm of a step in the outputs it causes."""
-        from scipy.linalg.blas import dtrmv
+    def lengths(self, first: Floats, second: Floats) -> tuple[float, float]:
+        """Return the norms of two steps in the outputs they cause."""
+        from bench.identification import _kernels
 
-        return float(np.linalg.norm(dtrmv(self.lower, step, lower=1, trans=1))) if step.size else 0.0
+        one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
+        return float(one), float(two)
 
     def inverse_diagonal(self) -> Floats:
         from scipy.linalg.lapack import dtrtri
 
-        inverse, _ = dtrtri(self.lower, lower=1)
+        inverse, _ = dtrtri(self.compact, lower=1)
         return np.asarray((inverse**2).sum(axis=0))
 
     def condition(self, gram: Floats) -> float:
@@ -294,18 +316,28 @@ class _Factor:
 
         if not gram.size:
             return 1.0
-        reciprocal, _ = dpocon(self.lower, np.abs(gram).sum(axis=0).max(), uplo="L")
+        reciprocal, _ = dpocon(self.compact, np.abs(gram).sum(axis=0).max(), uplo="L")
         return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))
 
 
 class _ActiveSet:
     """The working state of one constrained fit, in centred and scaled columns."""
 
-    def __init__(self, regressor: Regressor, y: Floats, w: Floats, constrained: Flags, smoothing: float) -> None:
+    def __init__(
+        self,
+        regressor: Regressor,
+        y: Floats,
+        w: Floats,
+        constrained: Flags,
+        layout: Layout,
+        smoothing: float,
+        *,
+        absolute: bool = False,
+    ) -> None:
         from bench.hysteresis import _kernels as lists
         from bench.identification import _kernels
 
-        self.regressor, self.y, self.w, self.constrained = regressor, y, w, constrained
+        self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
         self.cells = regressor.base.size
         count = regressor.shape[1]
         self.columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
@@ -325,9 +357,13 @@ class _ActiveSet:
         self.extra = np.ascontiguousarray(centred / self.norms[self.cells :])
         self.usable = self.swept.copy()
         self.penalty: csr_array | None = None
-        if smoothing > 0.0 and self.cells:
-            self.penalty = _roughness(self.cells, self.norms[: self.cells], smoothing * mean_square)
-            self.usable[: self.cells] = True
+        self.smoothing = smoothing if absolute else smoothing * mean_square
+        if self.smoothing > 0.0 and layout.order:
+            from scipy.sparse import csr_array, diags_array
+
+            scaling = diags_array(1.0 / self.norms[: self.cells])
+            self.penalty = csr_array(self.smoothing * (scaling @ layout.roughness() @ scaling))
+            self.usable[: self.cells] |= layout.layers == 0
 
         self.mean = float(w @ y / self.total)
         self.centred = y - self.mean
@@ -338,7 +374,7 @@ class _ActiveSet:
         self.place = np.full(count, -1, dtype=np.int64)
         self.gram = np.zeros((0, 0))
         self.factor = _Factor()
-        self.factored = np.empty(0, dtype=np.int64)
+        self.passive = np.empty(0, dtype=np.int64)
         self.iterations = 0
 
     def products(self, residual: Floats) -> Floats:
@@ -404,44 +440,61 @@ class _ActiveSet:
         self.gram[old:size, :size] = rows
         self.gram[:size, old:size] = rows.T
 
-    def block(self, passive: Indices, start: int = 0) -> Floats:
-        """Return the passive Gram block from row `start` on."""
-        at = self.place[passive]
-        return np.asarray(self.gram[at[start:, None], at])
+    def products_of(self, first: Indices, second: Indices) -> Floats:
+        """Return the Gram entries of two sets of known columns."""
+        return np.asarray(self.gram[self.place[first][:, None], self.place[second]])
 
-    def factorise(self, passive: Indices) -> tuple[Indices, Indices]:
-        """Factor the passive block; return the set kept and the dependent columns."""
+    def enter(self, columns: Indices) -> Indices:
+        """Add columns to the passive set; return those left out because they depend on it."""
         dropped: list[int] = []
-        while True:
+        while columns.size:
             self.iterations += 1
-            shared = min(passive.size, self.factored.size)
-            differ = np.flatnonzero(passive[:shared] != self.factored[:shared])
-            keep = int(differ[0]) if differ.size else shared
-            bad = self.factor.refresh(self.block(passive, keep), keep)
+            bad = self.factor.append(self.products_of(self.passive, columns), self.products_of(columns, columns))
+            good = columns.size if bad is None else bad
+            self.passive = np.concatenate([self.passive, columns[:good]])
             if bad is None:
-                self.factored = passive
-                return passive, np.array(dropped, dtype=np.int64)
-            self.factored = passive[:bad]
-            dropped.append(int(passive[bad]))
-            self.x[passive[bad]] = 0.0
-            passive = np.delete(passive, bad)
+                break
+            dropped.append(int(columns[bad]))
+            self.x[columns[bad]] = 0.0
+            columns = columns[bad + 1 :]
+        return np.array(dropped, dtype=np.int64)
 
-    def settle(self, passive: Indices) -> tuple[Indices, Indices]:
-        """Minimise over the passive set, shrinking it until the signs hold; return it and what depends."""
+    def leave(self, gone: Flags) -> Indices:
+        """Take columns out of the passive set; return those that turn out dependent on the way."""
+        places = np.flatnonzero(gone)
+        size, first = self.passive.size, int(places[0])
+        self.iterations += 1
+        # Rotations take about 1 ns an element, factoring anew 0.1 ns an operation.
+        rotations = float(((size - places) ** 2).sum())
+        if rotations <= 100.0 + 0.1 / 3.0 * (size - first) ** 3:
+            self.factor.delete(places)
+            self.passive = self.passive[~gone]
+            return np.empty(0, dtype=np.int64)
+        again = self.passive[first:][~gone[first:]]
+        self.passive = self.passive[:first]
+        self.factor.truncate(first)
+        return self.enter(again)
+
+    def settle(self, bold: bool) -> Indices:
+        """Minimise over the passive set, shrinking it until the signs hold; return what turned out dependent.
+
+        If bold, all that turns negative leaves at once, whether or not that lowers the cost.
+        """
         barred = [np.empty(0, dtype=np.int64)]
         while True:
-            passive, dropped = self.factorise(passive)
-            barred.append(dropped)
+            passive = self.passive
             old = self.x[passive]
             signed = self.constrained[passive]
             new = self.factor.solve(self.right[passive])
             negative = signed & (new <= 0.0)
             if not negative.any():
                 self.x[passive] = new
-                return passive, np.concatenate(barred)
+                return np.concatenate(barred)
             # Cutting off all negative parts at once is allowed if that lowers the cost ...
             cut = np.where(negative, 0.0, new)
-            if self.factor.length(cut - new) < self.factor.length(old - new):
+            if not bold:
+                after, before = self.factor.lengths(cut - new, old - new)
+            if bold or after < before:
                 moved, leave = cut, negative
             else:
                 # ... otherwise go as far as the first one allows.
@@ -451,24 +504,24 @@ class _ActiveSet:
                 leave = negative & (reach <= step * (1.0 + 1e-12))
                 moved[leave] = 0.0
             self.x[passive] = moved
-            passive = passive[~leave]
+            barred.append(self.leave(leave))
 
     def solve(self) -> Fit:
         free = np.flatnonzero(~self.constrained & self.usable)
-        passive = np.concatenate([free[free >= self.cells], free[free < self.cells]])
+        first = np.concatenate([free[free >= self.cells], free[free < self.cells]])
         if self.penalty is not None:
-            passive = np.concatenate([passive, np.flatnonzero(self.constrained & self.usable)])
+            first = np.concatenate([first, self.promising()])
         barred = np.zeros(self.x.size, dtype=bool)
-        crests = _crests(self.cells)
         tolerance = _TOLERANCE * self.size
-        if passive.size:
-            self.learn(passive)
-            passive, dependent = self.settle(passive)
-            barred[dependent] = True
+        if first.size:
+            self.learn(first)
+            barred[self.enter(first)] = True
+            barred[self.settle(bold=True)] = True
+        bold, gain = True, self.gain()
         stricter = iter(_DEPENDENT[1:])
         for _ in range(100 + 3 * self.x.size):
-            g = self.refine(passive)
-            g[passive] = 0.0
+            g = self.refine()
+            g[self.passive] = 0.0
             g[~self.constrained] = 0.0
             if g.max(initial=0.0) <= tolerance:
                 break
@@ -480,21 +533,67 @@ class _ActiveSet:
                 barred[:] = False
             g[barred] = 0.0
             top = float(g.max())
-            entering = crests(g, max(_ENTRY * top, tolerance))
-            room = max(10, passive.size // 3)
+            entering = self.candidates(g, max(_ENTRY * top, tolerance))
+            room = max(10, self.passive.size // 3)
             if entering.size > room:
                 entering = entering[np.argpartition(-g[entering], room)[:room]]
             self.learn(entering)
-            before = passive.size
-            passive, dependent = self.settle(np.concatenate([passive, entering]))
+            before = self.passive.size
+            dependent = self.enter(entering)
+            entered = self.passive.size
+            dependent = np.concatenate([dependent, self.settle(bold)])
+            bold, gain = bold and self.gain() > gain, self.gain()
             # A column depends on a certain passive set only.
-            if passive.size + dependent.size < before + entering.size:
+            if self.passive.size < entered or entered < before:
                 barred[:] = False
             barred[dependent] = True
-        return self.result(passive)
+        return self.result()
 
-    def refine(self, passive: Indices) -> Floats:
+    def gain(self) -> float:
+        """Return by how much the settled passive set lowers the cost, doubled."""
+        return float(self.right[self.passive] @ self.x[self.passive])
+
+    def candidates(self, g: Floats, threshold: float) -> Indices:
+        """Return the columns to enter next."""
+        dense = np.flatnonzero(g[self.cells :] >= threshold) + self.cells
+        if self.penalty is not None:
+            # Roughness tells neighbours apart.
+            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.1 * threshold)])
+        return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
+
+    def promising(self) -> Indices:
+        """Return the constrained columns that are likely to be passive in a smooth solution, and set their values.
+
+        They come from the solution on a plane of half the order, whose cost is that of the same density.
+        """
+        signed = self.constrained & self.usable
+        if self.layout.order < _COARSEST:
+            return np.flatnonzero(signed)
+        layout, parents = self.layout.coarser()
+        count, r = layout.cells.size, self.regressor
+        merged = Regressor(
+            base=np.bincount(parents, r.base, minlength=count),
+            starts=r.starts,
+            cells=parents[r.cells].astype(np.int32),
+            changes=r.changes,
+            extra=r.extra,
+        )
+        constrained = np.ones(count + r.extra.shape[1], dtype=bool)
+        constrained[parents[~self.constrained[: self.cells]]] = False
+        constrained[count:] = self.constrained[self.cells :]
+        # A Laplacian of twice the step is four times as great, on a quarter of the cells.
+        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, 0.25 * self.smoothing, absolute=True)
+        coarse.solve()
+        values = (coarse.x / coarse.norms)[:count]
+        chosen = signed.copy()
+        chosen[: self.cells] &= self.layout.around(values[parents] > 0.0)
+        self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
+        self.x *= self.norms
+        return np.flatnonzero(chosen)
+
+    def refine(self) -> Floats:
         """Correct the passive coefficients by the true residual; return the slope."""
+        passive = self.passive
         g = self.slope()
         for _ in range(3):
             worst = np.abs(g[passive]).max(initial=0.0)
@@ -512,7 +611,23 @@ class _ActiveSet:
             g = better
         return g
 
-    def result(self, passive: Indices) -> Fit:
+    def effective(self) -> float:
+        """Return the number of coefficients that the data determine: the passive ones less what smoothness does."""
+        if self.penalty is None or not self.passive.size:
+            return float(self.passive.size)
+        from scipy.linalg.lapack import dpotri
+
+        inverse, _ = dpotri(self.factor.compact, lower=1)
+        inside = np.flatnonzero(self.passive < self.cells)
+        cells = self.passive[inside]
+        block = self.penalty[cells][:, cells].tocoo()
+        rows, columns = inside[block.row], inside[block.col]
+        # Only the lower half of the inverse is there.
+        entries = inverse[np.maximum(rows, columns), np.minimum(rows, columns)]
+        return float(self.passive.size - block.data @ entries)
+
+    def result(self) -> Fit:
+        passive = self.passive
         g = self.slope()
         held = self.constrained.copy()
         held[passive] = False
@@ -520,9 +635,9 @@ class _ActiveSet:
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         weighted = self.w > 0.0
-        spare = int(weighted.sum()) - passive.size - 1
+        spare = int(weighted.sum()) - 1.0 - self.effective()
         uncertainties = np.full(self.x.size, np.nan)
-        if self.penalty is None and spare > 0:
+        if spare > 0.5:
             variance = float(self.w @ self.residual() ** 2) / spare
             uncertainties[:] = 0.0
             if passive.size:
@@ -532,7 +647,7 @@ class _ActiveSet:
             kkt_residual=kkt,
             passive=passive.size,
             active=self.x.size - passive.size,
-            condition=self.factor.condition(self.block(passive)),
+            condition=self.factor.condition(self.products_of(passive, passive)),
             swept=self.swept,
             iterations=self.iterations,
             converged=kkt <= 1e-10,
@@ -540,44 +655,91 @@ class _ActiveSet:
         return Fit(coefficients, self.mean - float(self.means @ coefficients), uncertainties, certificate)
 
 
-def _crests(cells: int) -> Callable[[Floats, float], Indices]:
-    """Return a function that finds the columns above a threshold, of neighbouring cells only the best.
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the sparse columns of a regressor lie in the Preisach plane.
 
-    Neighbours are nearly collinear: entering together they would only push each other out again.
+    Parameters
+    ----------
+    order : int
+        Number of intervals M of the plane, 0 if the columns have no place.
+    cells : ndarray of int64, shape (columns,)
+        Cell of each sparse column. A cell may have a second column, that of its relays which were on before the
+        first sample; its density then is the sum of the two coefficients.
+    layers : ndarray of int64, shape (columns,)
+        0 for the first column of a cell, 1 for the second.
     """
-    order = (round((8 * cells + 1) ** 0.5) - 1) // 2
-    return partial(_find_crests, order, cells, np.tril_indices(order))
 
+    order: int
+    cells: Indices
+    layers: Indices
 
-def _find_crests(order: int, cells: int, lower: tuple[Indices, Indices], g: Floats, threshold: float) -> Indices:
-    plane = np.full((order + 2, order + 2), -np.inf)
-    rows, columns = lower
-    plane[rows + 1, columns + 1] = g[:cells]
-    inner = plane[1:-1, 1:-1]
-    crest = inner >= threshold
-    for neighbour in (plane[:-2, 1:-1], plane[2:, 1:-1], plane[1:-1, :-2], plane[1:-1, 2:]):
-        crest &= inner >= neighbour
-    found = np.flatnonzero(crest[rows, columns])
-    return np.concatenate([np.flatnonzero(g[cells:] >= threshold) + cells, found])
+    @classmethod
+    def of(cls, columns: int) -> Layout:
+        """Return the layout of one column a cell, if their number is that of a plane."""
+        order = (round((8 * columns + 1) ** 0.5) - 1) // 2
+        if order * (order + 1) // 2 != columns:
+            order = 0
+        return cls(order, np.arange(columns), np.zeros(columns, dtype=np.int64))
 
+    def grid(self, values: Floats) -> Floats:
+        """Return values by layer, row and column of the plane, with a border; -inf where there is no column."""
+        result = np.full((2, self.order + 2, self.order + 2), -np.inf)
+        result[self._places()] = values
+        return result
 
-def _roughness(cells: int, norms: Floats, weight: float) -> csr_array:
-    """Return weight * LᵀL of the discrete Laplacian L on the triangle of cells, in scaled columns."""
-    from scipy.sparse import coo_array, csr_array, diags_array
+    def _places(self) -> tuple[Indices, Indices, Indices]:
+        rows, columns = np.tril_indices(self.order)
+        return self.layers, rows[self.cells] + 1, columns[self.cells] + 1
 
-    order = (round((8 * cells + 1) ** 0.5) - 1) // 2
-    rows, columns = np.tril_indices(order)
-    index = np.full((order + 1, order + 1), -1, dtype=np.int64)
-    index[rows, columns] = np.arange(cells)
-    here: list[Indices] = []
-    there: list[Indices] = []
-    for i, j in ((rows + 1, columns), (rows - 1, columns), (rows, columns + 1), (rows, columns - 1)):
-        other = index[i, j]
-        inside = np.flatnonzero((other >= 0) & (i >= 0) & (j >= 0))
-        here.append(inside)
-        there.append(other[inside])
-    a, b = np.concatenate(here), np.concatenate(there)
-    data = np.concatenate([np.ones(a.size), -np.ones(a.size)])
-    laplacian = coo_array((data, (np.concatenate([a, a]), np.concatenate([b, a]))), shape=(cells, cells))
-    scaled = csr_array(laplacian) @ diags_array(1.0 / norms)
-    return csr_array(weight * (scaled.T @ scaled))
+    def crests(self, g: Floats, threshold: float) -> Indices:
+        """Return the columns of at least a threshold, of neighbouring cells only the best.
+
+        Neighbours are nearly collinear: entering together they would only push each other out again.
+        """
+        if not self.order:
+            return np.flatnonzero(g >= threshold)
+        plane = self.grid(g)
+        inner = plane[:, 1:-1, 1:-1]
+        crest = inner >= threshold
+        for neighbour in (plane[:, :-2, 1:-1], plane[:, 2:, 1:-1], plane[:, 1:-1, :-2], plane[:, 1:-1, 2:]):
+            crest &= inner >= neighbour
+        layer, row, column = self._places()
+        return np.flatnonzero(crest[layer, row - 1, column - 1])
+
+    def coarser(self) -> tuple[Layout, Indices]:
+        """Return the layout of the plane with cells merged two by two, and the column of each column there."""
+        rows, columns = np.tril_indices(self.order)
+        i, j = rows[self.cells] // 2, columns[self.cells] // 2
+        merged, parents = np.unique(np.column_stack([self.layers, i * (i + 1) // 2 + j]), axis=0, return_inverse=True)
+        return Layout((self.order + 1) // 2, merged[:, 1], merged[:, 0]), parents.ravel()
+
+    def around(self, chosen: Flags) -> Flags:
+        """Return the chosen columns and their neighbours in the plane."""
+        plane = self.grid(chosen.astype(np.float64)) > 0.0
+        wide = plane.copy()
+        wide[:, 1:] |= plane[:, :-1]
+        wide[:, :-1] |= plane[:, 1:]
+        wide[:, :, 1:] |= plane[:, :, :-1]
+        wide[:, :, :-1] |= plane[:, :, 1:]
+        return wide[self._places()]
+
+    def roughness(self) -> csr_array:
+        """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""
+        from scipy.sparse import coo_array, csr_array
+
+        rows, columns = np.tril_indices(self.order)
+        index = np.full((self.order + 1, self.order + 1), -1, dtype=np.int64)
+        index[rows, columns] = np.arange(rows.size)
+        here: list[Indices] = []
+        there: list[Indices] = []
+        for i, j in ((rows + 1, columns), (rows - 1, columns), (rows, columns + 1), (rows, columns - 1)):
+            other = index[i, j]
+            inside = np.flatnonzero((other >= 0) & (i >= 0) & (j >= 0))
+            here.append(inside)
+            there.append(other[inside])
+        a, b = np.concatenate(here), np.concatenate(there)
+        data = np.concatenate([np.ones(a.size), -np.ones(a.size)])
+        laplacian = coo_array((data, (np.concatenate([a, a]), np.concatenate([b, a]))), shape=(rows.size, rows.size))
+        spread = csr_array(laplacian)[:, self.cells]
+        return csr_array(spread.T @ spread)

@@ -124,9 +124,10 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
 
     figures = _draw(models, inputs, outputs, predictions, folder / "figures")
     for run in (characterization, validation):
-        for model in models.values():
-            with Record(run.folder) as record:
-                finished = float(record.meta["finished"])
+        with Record(run.folder) as record:
+            finished = float(record.meta["finished"])
+        # The proposed model last: the recording shows the density of the newest.
+        for model in reversed(models.values()):
             add_model(run.folder, model.file.name, finished, model.file.to_json())
     recordings = [export_run(run.folder, "rrd", None)[0] for run in (characterization, validation)]
 
@@ -273,25 +274,24 @@ def _print_errors(
     offset: float,
     console: Console,
 ) -> None:
-    table = Table(title="modelling errors, 1/m (paper: sections IV-B, Figs. 5, 7, 9, 10)", title_justify="left")
-    table.add_column("model")
-    for column in ("paper max", "bench max", "bench RMS", "KKT residual", "paper max", "bench max", "bench RMS"):
-        table.add_column(column, justify="right")
-    table.add_section()
-    table.add_row("", "identification", "", "", "", f"validation, session offset {offset:+g} K", "", "", style="dim")
-    for entry in MODELS:
-        fit, test = identified[entry.key], validated[entry.key]
-        table.add_row(
-            entry.title,
-            f"{entry.identification:g}",
-            f"{fit['max']:.1f}",
-            f"{fit['rms']:.1f}",
-            f"{kkt[entry.key]:.0e}",
-            f"{entry.validation:g}",
-            f"{test['max']:.1f}",
-            f"{test['rms']:.1f}",
-        )
-    console.print(table)
+    for title, measured, paper in (
+        ("identification, errors in 1/m (Figs. 5, 7 and 9)", identified, {m.key: m.identification for m in MODELS}),
+        (
+            f"validation, errors in 1/m (Fig. 10; session offset {offset:+g} K)",
+            validated,
+            {m.key: m.validation for m in MODELS},
+        ),
+    ):
+        table = Table("model", title=title, title_justify="left")
+        for column in ("paper max", "bench max", "bench RMS", "KKT"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for entry in MODELS:
+            errors = measured[entry.key]
+            certificate = f"{kkt[entry.key]:.0e}" if measured is identified else "–"
+            table.add_row(
+                entry.title, f"{paper[entry.key]:g}", f"{errors['max']:.1f}", f"{errors['rms']:.1f}", certificate
+            )
+        console.print(table)
 
 
 def _print_parameters(parameters: Mapping[str, float], console: Console) -> None:

@@ -1,0 +1,213 @@
+"""Followers: controllers for a reference that moves, called at a fixed rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from bench.control.estimators import DisturbanceEstimator
+from bench.control.inverse import Inverse, Reach
+from bench.control.tracking import Actuator, IntegralParameters, Trace, check_positive, saturation
+from bench.hysteresis import MemoryCurve, _checks
+
+
+@dataclass(frozen=True)
+class FollowingParameters:
+    """Numbers of the followers with an inverse.
+
+    Parameters
+    ----------
+    lead : float
+        Time by which the reference is extrapolated beyond the end of the coming period, in periods: the
+        input's lag behind its set-point, less the half period that a held set-point stands for. The default
+        is for 0.5 s and a plate of 2.2 rad/s and damping 0.9, that is a lag of 2 * 0.9 / 2.2 = 0.82 s.
+    walk_variance : float
+        Variance by which the model's error changes within one period, output units squared. Large against
+        the reading's, as model error and not sensor noise dominates: the gain then is near 1.
+    reading_variance : float
+        Variance of one reading, and of what the input wanders unseen, output units squared.
+    """
+
+    lead: float = 1.14
+    walk_variance: float = 30.0
+    reading_variance: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "walk_variance", "reading_variance")
+        if not 0.0 <= self.lead < math.inf:
+            raise ValueError(f"lead: expected a number of periods, at least 0, got {self.lead}")
+
+
+class _Follower(Actuator):
+    """What the followers share: the last reference and what was made of it."""
+
+    def __init__(
+        self,
+        input_range: tuple[float, float],
+        limits: tuple[float, float] | None,
+        state: MemoryCurve | None,
+    ) -> None:
+        super().__init__(input_range, limits, state)
+        self._reference = math.nan
+
+    def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
+        """Take in a reading and return the set-point for the coming period.
+
+        Parameters
+        ----------
+        t : float
+            Time, s.
+        measured_input : float
+            What the input's own sensor says, input units; nan if missing.
+        output : float
+            One reading of the output; nan if missing.
+        reference : float
+            Wanted output at the end of the coming period.
+
+        Raises
+        ------
+        ValueError
+            If the reference is not finite.
+        """
+        before, self._reference = self._reference, _checks.number("reference", reference)
+        step = 0.0 if math.isnan(before) else reference - before
+        if self._observe(measured_input):
+            setpoint = self._answer_to(step, output)
+            if math.isfinite(setpoint):
+                self._setpoint = self._clip(setpoint)
+        return self._setpoint
+
+    def _answer_to(self, step: float, output: float) -> float:
+        """Return the wanted set-point; `step` is what the reference has moved in one period."""
+        raise NotImplementedError
+
+
+class OpenLoopFollower(_Follower):
+    """Sets what the exact inverse says of the reference, ahead by the input's lag.
+
+    Parameters
+    ----------
+    inverse : Inverse
+        Exact inverse of the identified model. Of an answer with two elements the first is set; the next
+        period is asked anew, so that the second follows when the actuator has come there.
+    state : MemoryCurve or None
+        Memory of the actuator at the first reading; default negative saturation.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the operating range of the model.
+    parameters : FollowingParameters
+        Numbers of the follower; only `lead` is used.
+    """
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None = None,
+        limits: tuple[float, float] | None = None,
+        parameters: FollowingParameters | None = None,
+    ) -> None:
+        operator = inverse.operator
+        super().__init__(operator.input_range, limits, operator.initial_state() if state is None else state)
+        self._inverse = inverse
+        self._parameters = parameters or FollowingParameters()
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        assert self._state is not None
+        return Trace(reference=self._reference, predicted=self._inverse.operator.value(self._state))
+
+    def _answer_to(self, step: float, output: float) -> float:  # noqa: ARG002
+        return self._inverted(step, 0.0)
+
+    def _inverted(self, step: float, disturbance: float) -> float:
+        assert self._state is not None
+        target = self._reference - disturbance
+        wished = target + self._parameters.lead * step
+        found = self._inverse.invert(self._state, wished)
+        if found.reach is not Reach.MET or len(found.setpoints) > 1:
+            # Not for the sake of an extrapolation: a passage through saturation is far, and may be needless.
+            wished = target
+            found = self._inverse.invert(self._state, wished)
+        return self._answer(self._inverse.operator, found, wished)[0]
+
+
+class ClosedLoopFollower(OpenLoopFollower):
+    """The exact inverse of the reference less the disturbance that was measured.
+
+    The disturbance z = y - Ω(ψ), measured output less that of the model, goes into a Kalman filter of a random
+    walk in every period, a missing output as a missing value. As the memory ψ is that of the measured input,
+    the lag of the input is no part of it.
+
+    Parameters
+    ----------
+    inverse : Inverse
+        Exact inverse of the identified model; see `OpenLoopFollower` for answers with two elements.
+    state : MemoryCurve or None
+        Memory of the actuator at the first reading; default negative saturation.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the operating range of the model.
+    parameters : FollowingParameters
+        Numbers of the follower.
+    """
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None = None,
+        limits: tuple[float, float] | None = None,
+        parameters: FollowingParameters | None = None,
+    ) -> None:
+        super().__init__(inverse, state, limits, parameters)
+        self._estimator = DisturbanceEstimator(
+            walk_variance=self._parameters.walk_variance, reading_variance=self._parameters.reading_variance
+        )
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        assert self._state is not None
+        disturbance = self._estimator.value
+        return Trace(
+            reference=self._reference,
+            predicted=self._inverse.operator.value(self._state) + disturbance,
+            disturbance=disturbance,
+            uncertainty=self._estimator.uncertainty,
+        )
+
+    def _answer_to(self, step: float, output: float) -> float:
+        assert self._state is not None
+        known = math.isfinite(output)
+        self._estimator.update(output - self._inverse.operator.value(self._state) if known else None)
+        return self._inverted(step, self._estimator.value)
+
+
+class IntegralFollower(_Follower):
+    """Integral action without a model: the comparison for what the inverse is worth.
+
+    The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
+    error turns: it cannot wind up.
+
+    Parameters
+    ----------
+    limits : tuple of float
+        Least and greatest set-point, input units.
+    parameters : IntegralParameters
+        Gain and period; the error is that against the reference which was for now.
+    """
+
+    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
+        super().__init__(tuple(_checks.increasing("limits", limits).tolist()), None, None)
+        self._parameters = parameters or IntegralParameters()
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        return Trace(reference=self._reference)
+
+    def _answer_to(self, step: float, output: float) -> float:
+        if not math.isfinite(output):
+            return self._setpoint
+        error = self._reference - step - output
+        wished = self._setpoint + self._parameters.gain * self._parameters.period * error
+        self._reach = saturation(wished, *self.limits, error)
+        return wished

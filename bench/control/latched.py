@@ -1,0 +1,336 @@
+"""Tracking to the sensor's noise, by turning back a little at the target: the hysteresis then holds it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bench.control.estimators import DisturbanceEstimator
+from bench.control.inverse import Inverse
+from bench.control.tracking import (
+    Arrival,
+    Command,
+    Correcting,
+    CorrectionParameters,
+    Reading,
+    Script,
+    check_positive,
+)
+from bench.hysteresis import MemoryCurve, Preisach
+
+Direction = Literal[-1, 1]
+
+
+@dataclass(frozen=True)
+class LatchParameters:
+    """Numbers of the latched controller; defaults for a VO2 film (input in °C, output in 1/m).
+
+    Parameters
+    ----------
+    approach : float
+        How far before the target, in output units, the approach by the model ends.
+    approach_done : float
+        The approach is over at this multiple of `approach` before the target.
+    approach_corrections : int
+        Greatest number of corrections of an approach.
+    arrival : Arrival
+        When the actuator has arrived after a move of the approach.
+    creep_least, creep_most : float
+        Slowest and fastest creep, input units per second.
+    creep_gain : float
+        Creep per output unit of the error that is left, input units per second and output unit.
+    creep_offset : float
+        Error at which the creep would be slowest, output units: what stepping back will take away.
+    creep_until : float
+        Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on.
+    creep_limit : float
+        Longest creep, s.
+    step_back : float
+        Move back from the extreme, input units.
+    nearest, farthest : float
+        Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what
+        the input wanders unseen would move the extreme; farther, hysterons switch back, the slope of the
+        output changes its sign, and the loop would run away.
+    lock_within : float
+        Error after stepping back with which the fine loop can deal, output units.
+    tries : int
+        Greatest number of approaches, each from the other side, before falling back.
+    settle : float
+        Time after stepping back before locking is decided, s.
+    fine_moves : int
+        Number of moves of the fine loop.
+    fine_period : float
+        Time between them, s.
+    fine_gain : float
+        Part of the estimated error that one move takes away, 0 to 2.
+    accept : float
+        Error that may be left after the fine loop, output units; with more the lock has been lost.
+    walk_variance, reading_variance : float
+        Of the estimate of the locked output, for each reading, output units squared: what the input wanders
+        unseen, by the small slope; noise of one reading.
+    end_margin : float
+        Within this distance of the outputs at saturation, in output units, the slope is small and the loop
+        is wide: there the incremental inverse alone is used.
+    """
+
+    approach: float = 25.0
+    approach_done: float = 1.8
+    approach_corrections: int = 8
+    arrival: Arrival = Arrival(tolerance=0.1, hold=0.2)
+    creep_least: float = 0.015
+    creep_most: float = 0.12
+    creep_fast: float = 0.3
+    creep_horizon: float = 4.0
+    creep_gain: float = 0.003
+    creep_offset: float = 1.8
+    creep_until: float = 3.3
+    creep_limit: float = 60.0
+    step_back: float = 0.5
+    nearest: float = 0.08
+    farthest: float = 1.1
+    lock_within: float = 4.5
+    tries: int = 10
+    settle: float = 1.0
+    fine_moves: int = 5
+    fine_period: float = 1.0
+    fine_gain: float = 1.0
+    accept: float = 1.5
+    walk_variance: float = 1e-2
+    reading_variance: float = 0.14
+    end_margin: float = 5.0
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+        if not self.nearest <= self.step_back <= self.farthest:
+            raise ValueError(
+                f"step_back: expected a value within nearest = {self.nearest} and farthest = {self.farthest}, "
+                f"got {self.step_back}"
+            )
+        if self.creep_least > self.creep_most:
+            raise ValueError(f"creep_least: expected at most creep_most = {self.creep_most}, got {self.creep_least}")
+        if self.fine_gain >= 2.0:
+            raise ValueError(f"fine_gain: expected less than 2, where the loop is unstable, got {self.fine_gain}")
+
+
+class Latched(Correcting):
+    """The closed-loop inverse, and then a lock: accurate to the sensor's noise where others wander.
+
+    On a branch where hysterons switch, an unseen wander of the input moves the output by the branch's steep
+    slope (280 (1/m)/K of a VO2 film). Just behind a reversal nothing switches: the output has the small slope
+    of the reversible part alone, and holds. So the controller
+
+    1. approaches the target from one side, by the model, to a little before it;
+    2. creeps on until little is left;
+    3. steps back. If the error is small it is locked, otherwise it approaches from the other side;
+    4. corrects by the small slope, never leaving the stretch behind the extreme where that holds.
+
+    After too many tries, and near saturation, it is the incremental inverse of `ClosedLoopInverse`.
+
+    Parameters
+    ----------
+    inverse : Inverse
+        Exact inverse of the identified model, which must have a reversible part: its slope is what a
+        locked actuator answers with.
+    state : MemoryCurve or None
+        Memory of the actuator at the first reading; default negative saturation.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the operating range of the model.
+    parameters : LatchParameters
+        Numbers of the lock.
+    correction : CorrectionParameters
+        Numbers of the incremental inverse, where that is used.
+
+    Raises
+    ------
+    ValueError
+        If the model has no reversible part.
+    """
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None = None,
+        limits: tuple[float, float] | None = None,
+        parameters: LatchParameters | None = None,
+        correction: CorrectionParameters | None = None,
+    ) -> None:
+        if inverse.operator.reversible is None:
+            raise ValueError("inverse: expected a model with a reversible part, by which a locked output is moved")
+        super().__init__(inverse, state, limits, correction or CorrectionParameters(corrections=9, close_enough=2.0))
+        self._parameters = parameters or LatchParameters()
+        low, high = float(inverse.operator.levels[0]), float(inverse.operator.levels[-1])
+        self._ends = sorted(inverse.operator.evaluate([low, high]).tolist())
+        self._extreme: float | None = None
+        self._direction: Direction = 1
+        self._tries = 0
+        self._locked = False
+
+    @property
+    def locked(self) -> bool:
+        """Whether the present target is held by the lock."""
+        return self._locked
+
+    @property
+    def tries(self) -> int:
+        """Number of approaches to the present target."""
+        return self._tries
+
+    @property
+    def extreme(self) -> float | None:
+        """The input behind which the output is locked, input units; None while it is not."""
+        return self._extreme
+
+    def _observe(self, measured_input: float) -> bool:
+        known = super()._observe(measured_input)
+        if known and self._extreme is not None:
+            # A plate that runs on takes the extreme with it.
+            self._extreme = max(self._direction * self._extreme, self._direction * measured_input) * self._direction
+        return known
+
+    def _run(self, target: float, reading: Reading) -> Script:
+        p = self._parameters
+        self._extreme, self._locked, self._tries = None, False, 0
+        minus, plus = self._ends
+        if minus + p.end_margin <= target <= plus - p.end_margin:
+            self._direction = 1 if target > reading.output else -1
+            while self._tries < p.tries:
+                self._tries += 1
+                reading = yield from self._latch(target, reading)
+                if self._locked:
+                    break
+                self._extreme = None
+                self._direction = 1 if self._direction < 0 else -1
+        if not self._locked:
+            yield from self._correct(target, self._correction.corrections)
+        yield from self._hold(self._poll)
+
+    def _latch(self, target: float, reading: Reading) -> Generator[Command, Reading, Reading]:
+        """Try to lock from one side; return the last reading."""
+        p = self._parameters
+        direction = self._direction
+
+        def left(reading: Reading) -> float:
+            """Return the part of the way that is left, output units; negative beyond the target."""
+            return direction * (target - reading.output)
+
+        for _ in range(p.approach_corrections):
+            if left(reading) <= p.approach_done * p.approach:
+                break
+            setpoint = self._ahead(target - direction * p.approach - self._estimator.value)
+            (*_, reading) = yield from self._arrive(setpoint, p.arrival)
+            self._estimator.update(reading.output - self._model())
+
+        spent = 0.0
+        while left(reading) > p.creep_until:
+            ahead = self._ahead(self._model() + direction * left(reading))
+            if spent >= p.creep_limit or ahead == (self._low if direction < 0 else self._high):
+                return reading
+            rate = min(
+                max(p.creep_least + p.creep_gain * (left(reading) - p.creep_offset), p.creep_least), p.creep_most
+            )
+            # Where the model says that the way is long, as after a turn, there is no need to crawl.
+            rate = max(rate, min(abs(ahead - reading.input) / p.creep_horizon, p.creep_fast))
+            reading = yield self._command(self._setpoint + direction * rate * self._poll, self._poll)
+            spent += self._poll
+        if left(reading) < -p.lock_within:
+            return reading
+
+        self._extreme = reading.input
+        return (yield from self._fine_loop(target))
+
+    def _fine_loop(self, target: float) -> Generator[Command, Reading, Reading]:
+        """Step back and move the locked output to the target; return the last reading."""
+        p = self._parameters
+        locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
+        setpoint = self._behind(-math.inf if self._direction < 0 else math.inf, p.step_back)
+        slope = reversible_slope(self._inverse.operator, setpoint)
+        origin = setpoint
+        for move in range(p.fine_moves + 1):
+            for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
+                reading = yield self._command(setpoint, self._poll)
+                # Where the input still is on its way, what it has to go is known.
+                locked.update(reading.output - slope * (reading.input - origin))
+                setpoint = self._behind(setpoint, p.nearest)
+            error = target - locked.value - slope * (setpoint - origin)
+            if abs(error) > p.lock_within:
+                return reading
+            if move < p.fine_moves:
+                setpoint = self._behind(setpoint + p.fine_gain * error / slope, p.nearest)
+        self._locked = abs(error) <= p.accept
+        return reading
+
+    def _behind(self, setpoint: float, nearest: float) -> float:
+        """Return the set-point moved to where the output is locked, at least `nearest` behind the extreme."""
+        assert self._extreme is not None
+        distance = self._direction * (self._extreme - setpoint)
+        distance = min(max(distance, nearest), self._parameters.farthest)
+        return self._clip(self._extreme - self._direction * distance)
+
+    def _ahead(self, target: float) -> float:
+        """Return the input of the model's output `target` in the present direction, else its end."""
+        assert self._state is not None
+        return self._clip(walk(self._inverse.operator, self._state, self._direction, target))
+
+
+def reversible_slope(operator: Preisach, value: float) -> float:
+    """Return the slope of the output behind a reversal, where no hysteron switches.
+
+    Parameters
+    ----------
+    operator : Preisach
+        The model.
+    value : float
+        Input.
+
+    Returns
+    -------
+    float
+        Output units per input unit; 0 without reversible part.
+    """
+    if operator.reversible is None:
+        return 0.0
+    breaks, quadratics = operator.reversible.pieces()
+    _, linear, quadratic = quadratics[int((breaks < value).sum())].tolist()
+    return float(linear + 2.0 * quadratic * value)
+
+
+def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: float) -> float:
+    """Return the first input in one direction at which the output has come to the target.
+
+    Parameters
+    ----------
+    operator : Preisach
+        The model.
+    state : MemoryCurve
+        Memory to start from.
+    direction : {-1, 1}
+        Downwards or upwards.
+    target : float
+        Output; upwards it is met by any output not below it, downwards by any not above it.
+
+    Returns
+    -------
+    float
+        Input; the end of the operating range if the target is not met on the way.
+    """
+    end = operator.input_range[0 if direction < 0 else 1]
+    missing = direction * (target - operator.value(state))
+    while missing > 0.0:
+        segment = operator.segment(state, direction)
+        if segment is None:
+            return end
+        quadratic, linear = direction * segment.quadratic, direction * segment.linear
+        roots = np.roots([quadratic, linear, -missing]) if quadratic or linear else np.empty(0)
+        inside = [float(d.real) for d in roots if abs(d.imag) == 0.0 and 0.0 <= d.real <= segment.length]
+        if inside:
+            return state.input + direction * min(inside)
+        missing -= segment.length * (linear + segment.length * quadratic)
+        following = state.step(state.input + direction * segment.length)
+        if following.input == state.input:
+            return end
+        state = following
+    return state.input

@@ -1,0 +1,106 @@
+"""Loops: what a bench carries out sample by sample, made of a controller and what it has to reach or follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from bench.control.tracking import Command, Follower, TargetController, Trace
+
+
+class Loop(Protocol):
+    """A controller at work: asked for a command at its beginning and after each reading, until it is done."""
+
+    def begin(self, t: float, measured_input: float, output: float) -> Command:
+        """Take the first reading (s, input units, output units); say what to do."""
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Take the next reading, `wait` seconds after the last command; say what to do."""
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks."""
+
+
+class Reach:
+    """Bring the output to one target.
+
+    Parameters
+    ----------
+    controller : TargetController
+        Keeps its state from one target to the next.
+    target : float
+        Output units.
+    """
+
+    def __init__(self, controller: TargetController, target: float) -> None:
+        self._controller = controller
+        self._target = target
+
+    def begin(self, t: float, measured_input: float, output: float) -> Command:
+        """Aim at the target."""
+        return self._controller.aim(self._target, t, measured_input, output)
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Go on towards it."""
+        return self._controller.update(t, measured_input, output)
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks."""
+        return self._controller.trace
+
+
+class Follow:
+    """Make the output follow a reference at a fixed rate.
+
+    Parameters
+    ----------
+    follower : Follower
+        The controller.
+    reference : callable
+        Reference in output units at a time in s from the beginning of the loop.
+    period : float
+        Seconds between two set-points.
+    duration : float
+        Seconds to follow.
+
+    Raises
+    ------
+    ValueError
+        If period or duration is not positive.
+    """
+
+    def __init__(
+        self, follower: Follower, reference: Callable[[float], float], period: float, duration: float
+    ) -> None:
+        if not (period > 0 and duration > 0):
+            raise ValueError(f"period, duration: expected positive numbers of s, got {period} and {duration}")
+        self._follower = follower
+        self._reference = reference
+        self._period = period
+        self._samples = max(1, round(duration / period))
+        self._sample = 0
+        self._start = 0.0
+        self._setpoint = 0.0
+
+    def begin(self, t: float, measured_input: float, output: float) -> Command:
+        """Set the first set-point."""
+        self._start = t
+        self._sample = 0
+        return self.update(t, measured_input, output)
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Set the next one, for the reference at the end of the period."""
+        if self._sample == self._samples:
+            return Command(self._setpoint, 0.0, done=True)
+        self._sample += 1
+        end = self._sample * self._period
+        self._setpoint = self._follower.update(t, measured_input, output, self._reference(end))
+        # Counted from the beginning, so that what a reading takes does not add up.
+        return Command(self._setpoint, max(0.0, self._start + end - t))
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks."""
+        return self._follower.trace

@@ -1,0 +1,658 @@
+"""Tracking controllers: readings in, the next set-point out; no device, no clock.
+
+Two kinds share one vocabulary. A `TargetController` is given one target after another: `aim` at it, then
+`update` with every reading until the `Command` says done, and further while it holds. A `Follower` is called at
+a fixed rate with a reference that moves.
+
+Rules for all of them:
+
+* Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
+* The memory of the hysteresis is moved by what the actuator did, the measured input of every call, not by
+  what was wished (`state`).
+* A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
+  next complete reading, estimators take no value in. A missing output does not keep the memory from following
+  the measured input. How long to put up with missing readings is for the caller to say.
+* A target that cannot be met is replaced by the closest output, and `reach` says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from bench.control.estimators import DisturbanceEstimator
+from bench.control.inverse import Inverse, Inversion, Reach
+from bench.hysteresis import MemoryCurve, Polynomial, Preisach, _checks
+
+# Part of the output at stake within which a clipped answer still counts as met.
+_CLOSE = 1e-9
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a controller wants next.
+
+    Parameters
+    ----------
+    setpoint : float
+        Input to set now, input units.
+    wait : float
+        Time until the next reading, s.
+    done : bool
+        The target is reached as well as this controller can; the set-point is held from now on.
+    """
+
+    setpoint: float
+    wait: float
+    done: bool = False
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a controller thinks, for the record and the live view; nan where it has no opinion.
+
+    Parameters
+    ----------
+    reference : float
+        Output it is to reach, output units.
+    predicted : float
+        Output that it believes to have, output units: model and estimated disturbance.
+    disturbance : float
+        Estimated difference of actuator and model, output units.
+    uncertainty : float
+        Standard deviation of that estimate, output units.
+    """
+
+    reference: float = math.nan
+    predicted: float = math.nan
+    disturbance: float = math.nan
+    uncertainty: float = math.nan
+
+
+class TargetController(Protocol):
+    """Brings the output to one target after another.
+
+    `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
+    """
+
+    def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
+        """Start towards a new target and return the first command."""
+        ...
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Take in a reading, `Command.wait` after the last or later, and return the next command."""
+        ...
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        ...
+
+    @property
+    def state(self) -> MemoryCurve | None:
+        """Memory of the actuator as the controller knows it; None if it keeps none."""
+        ...
+
+    @property
+    def reach(self) -> Reach:
+        """Whether the present target can be met."""
+        ...
+
+
+class Follower(Protocol):
+    """Makes the output follow a reference that moves; called at a fixed rate."""
+
+    def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
+        """Take in a reading and return the set-point for the coming period.
+
+        Parameters
+        ----------
+        t : float
+            Time, s.
+        measured_input : float
+            What the input's own sensor says, input units.
+        output : float
+            One reading of the output.
+        reference : float
+            Wanted output at the end of the coming period.
+        """
+        ...
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        ...
+
+    @property
+    def state(self) -> MemoryCurve | None:
+        """Memory of the actuator as the controller knows it; None if it keeps none."""
+        ...
+
+    @property
+    def reach(self) -> Reach:
+        """Whether the present reference can be met."""
+        ...
+
+
+class Reading(NamedTuple):
+    """One complete reading: time in s, measured input, output."""
+
+    time: float
+    input: float
+    output: float
+
+
+Script = Generator[Command, Reading, None]
+"""What a controller does for one target: yields commands, is sent readings, goes on holding for ever."""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """When an input has arrived at its set-point.
+
+    Parameters
+    ----------
+    tolerance : float
+        Greatest difference between measured input and set-point, input units.
+    hold : float
+        Time for which the difference must stay within the tolerance, s.
+    poll : float
+        Time between two readings, s.
+    patience : float
+        Time after which to go on without arrival, s. The estimators need none: they go by the measured input.
+    """
+
+    tolerance: float = 0.03
+    hold: float = 0.4
+    poll: float = 0.1
+    patience: float = 15.0
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+
+
+def check_positive(parameters: object, *names: str) -> None:
+    """Raise a ValueError that names a field (all number fields, or `names`) that is not positive and finite."""
+    for name in names or [field.name for field in fields(parameters)]:  # type: ignore[arg-type]
+        value = getattr(parameters, name)
+        if isinstance(value, int | float) and not 0.0 < value < math.inf:
+            raise ValueError(f"{name}: expected a positive number, got {value}")
+
+
+class Actuator:
+    """What every controller keeps: limits, memory, the last set-point, whether the target can be met."""
+
+    def __init__(
+        self,
+        input_range: tuple[float, float],
+        limits: tuple[float, float] | None,
+        state: MemoryCurve | None,
+    ) -> None:
+        low, high = input_range
+        if limits is not None:
+            least, greatest = _checks.increasing("limits", limits).tolist()
+            low, high = max(low, least), min(high, greatest)
+            if low >= high:
+                raise ValueError(f"limits: expected an overlap with the model's range {input_range}, got {limits}")
+        self._low, self._high = low, high
+        self._state = state
+        self._setpoint = self._clip(0.5 * (low + high) if state is None else state.input)
+        self._started = state is not None
+        self._reach = Reach.MET
+
+    @property
+    def state(self) -> MemoryCurve | None:
+        """Memory of the actuator as the controller knows it; None if it keeps none."""
+        return self._state
+
+    @property
+    def reach(self) -> Reach:
+        """Whether the present target can be met."""
+        return self._reach
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Least and greatest set-point, input units."""
+        return self._low, self._high
+
+    def _clip(self, setpoint: float) -> float:
+        return min(max(setpoint, self._low), self._high)
+
+    def _observe(self, measured_input: float) -> bool:
+        """Move the memory by what the actuator did; return whether there is something to go by."""
+        if not math.isfinite(measured_input):
+            return False
+        if self._state is not None:
+            self._state = self._state.step(measured_input)
+        if not self._started:
+            # Without a memory, the first reading says where the actuator is.
+            self._setpoint, self._started = self._clip(measured_input), True
+        return True
+
+    def _answer(self, operator: Preisach, found: Inversion, target: float) -> tuple[float, ...]:
+        """Return the set-points of an inversion within the limits, and note whether they meet the target."""
+        setpoints = tuple(self._clip(value) for value in found.setpoints)
+        self._reach = found.reach
+        if setpoints != found.setpoints and self._state is not None:
+            short = target - float(operator.evaluate(setpoints, self._state)[-1])
+            if abs(short) > _CLOSE * (abs(target) + 1.0):
+                self._reach = Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
+        return setpoints
+
+
+class Scripted(Actuator):
+    """A target controller as a script: a generator that yields commands and is sent readings."""
+
+    _poll = 0.1
+    _needs_output = True
+
+    def __init__(
+        self,
+        input_range: tuple[float, float],
+        limits: tuple[float, float] | None,
+        state: MemoryCurve | None,
+    ) -> None:
+        super().__init__(input_range, limits, state)
+        self._target = math.nan
+        self._script: Script | None = None
+        self._done = False
+
+    def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
+        """Start towards a new target and return the first command.
+
+        Parameters
+        ----------
+        target : float
+            Wanted output, output units.
+        t : float
+            Time, s.
+        measured_input : float
+            What the input's own sensor says, input units; nan if missing.
+        output : float
+            One reading of the output; nan if missing.
+
+        Raises
+        ------
+        ValueError
+            If the target is not finite.
+        """
+        self._target = _checks.number("target", target)
+        self._script, self._done = None, False
+        return self.update(t, measured_input, output)
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Take in a reading and return the next command.
+
+        Raises
+        ------
+        RuntimeError
+            If there is no target yet.
+        """
+        if math.isnan(self._target):
+            raise RuntimeError("update: expected a target first, by aim")
+        known = self._observe(measured_input)
+        if not known or (self._needs_output and not math.isfinite(output)):
+            return Command(self._setpoint, self._poll, self._done)
+        reading = Reading(t, measured_input, output)
+        if self._script is None:
+            self._script = self._run(self._target, reading)
+            command = next(self._script)
+        else:
+            command = self._script.send(reading)
+        self._done = command.done
+        return command
+
+    def _run(self, target: float, reading: Reading) -> Script:
+        raise NotImplementedError
+
+    def _command(self, setpoint: float, wait: float, done: bool = False) -> Command:
+        """Return a command whose set-point is within the limits."""
+        if math.isfinite(setpoint):
+            self._setpoint = self._clip(setpoint)
+        return Command(self._setpoint, wait, done)
+
+    def _hold(self, wait: float) -> Script:
+        """Hold the set-point for ever."""
+        while True:
+            yield Command(self._setpoint, wait, done=True)
+
+    def _arrive(self, setpoint: float, arrival: Arrival) -> Generator[Command, Reading, list[Reading]]:
+        """Go to a set-point and return the readings since the actuator came there."""
+        inside: list[Reading] = []
+        started: float | None = None
+        while True:
+            reading = yield self._command(setpoint, arrival.poll)
+            # The clock starts with the first reading: until then readings may have been missing.
+            started = reading.time - arrival.poll if started is None else started
+            if abs(reading.input - self._setpoint) < arrival.tolerance:
+                inside.append(reading)
+                # Times are sums of floats.
+                if reading.time - inside[0].time >= arrival.hold - 1e-9:
+                    return inside
+            else:
+                inside.clear()
+                if reading.time - started >= arrival.patience:
+                    return [reading]
+
+
+class OpenLoopInverse(Scripted):
+    """Sets what the exact inverse says, and waits (Zhang et al. 2013, section IV).
+
+    Where the inverse has two elements the actuator is sent to the first, an end of the transition, waits
+    there, and then goes to the second, found again from what the actuator really did.
+
+    Parameters
+    ----------
+    inverse : Inverse
+        Exact inverse of the identified model; its `policy` says which answer is taken.
+    state : MemoryCurve or None
+        Memory of the actuator at the first reading; default negative saturation.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the operating range of the model.
+    wait : float
+        Time for the actuator to settle after each set-point, s.
+    """
+
+    _needs_output = False
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None = None,
+        limits: tuple[float, float] | None = None,
+        *,
+        wait: float = 8.0,
+    ) -> None:
+        if not 0.0 < wait < math.inf:
+            raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
+        super().__init__(
+            inverse.operator.input_range, limits, inverse.operator.initial_state() if state is None else state
+        )
+        self._inverse = inverse
+        self._wait = wait
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        assert self._state is not None
+        return Trace(reference=self._target, predicted=self._inverse.operator.value(self._state))
+
+    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
+        operator = self._inverse.operator
+        assert self._state is not None
+        first, *rest = self._answer(operator, self._inverse.invert(self._state, target), target)
+        yield self._command(first, self._wait)
+        if rest:
+            (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
+            yield self._command(second, self._wait)
+        yield from self._hold(self._poll)
+
+
+class LookUp(Scripted):
+    """Sets what the single-valued inverse of a polynomial says: the model without hysteresis, for comparison.
+
+    A polynomial need not be monotone. The table is its running maximum from the lowest point of the range up
+    to the highest one (running minimum, if the lowest comes after the highest), which has one input for each
+    output. Targets beyond are given the input of the lowest or highest point, and `reach` says so.
+
+    Parameters
+    ----------
+    polynomial : Polynomial
+        The model.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the range of the model. The table spans no more.
+    wait : float
+        Time for the actuator to settle, s.
+    points : int
+        Number of points of the table.
+    """
+
+    _needs_output = False
+
+    def __init__(
+        self,
+        polynomial: Polynomial,
+        limits: tuple[float, float] | None = None,
+        *,
+        wait: float = 8.0,
+        points: int = 4001,
+    ) -> None:
+        if not 0.0 < wait < math.inf:
+            raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
+        if points < 2:
+            raise ValueError(f"points: expected at least 2, got {points}")
+        super().__init__(polynomial.input_range, limits, None)
+        self._polynomial = polynomial
+        self._wait = wait
+        inputs = np.linspace(*self.limits, points)
+        outputs = polynomial.evaluate(inputs)
+        lowest, highest = int(outputs.argmin()), int(outputs.argmax())
+        step = 1 if lowest <= highest else -1
+        rising = slice(lowest, highest + step if highest + step >= 0 else None, step)
+        envelope = np.maximum.accumulate(outputs[rising])
+        # Of a level stretch only the first input: one input for each output.
+        new = np.concatenate([[True], np.diff(envelope) > 0.0])
+        self._outputs, self._inputs = envelope[new], inputs[rising][new]
+        self._measured = math.nan
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        predicted = self._polynomial.evaluate([self._measured]).item() if self._started else math.nan
+        return Trace(reference=self._target, predicted=predicted)
+
+    def _observe(self, measured_input: float) -> bool:
+        known = super()._observe(measured_input)
+        if known:
+            self._measured = measured_input
+        return known
+
+    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
+        self._reach = Reach.MET
+        if target > self._outputs[-1]:
+            self._reach = Reach.TOO_HIGH
+        elif target < self._outputs[0]:
+            self._reach = Reach.TOO_LOW
+        yield self._command(float(np.interp(target, self._outputs, self._inputs)), self._wait)
+        yield from self._hold(self._poll)
+
+
+@dataclass(frozen=True)
+class IntegralParameters:
+    """Numbers of the integral controllers.
+
+    Parameters
+    ----------
+    gain : float
+        Input units per second for one output unit of error; negative for an actuator whose output falls.
+        On a branch of slope s the closed loop has the time constant 1 / (gain s), which should not be
+        shorter than the input takes to settle: the default gives 1.4 s at 280 (1/m)/K, the steepest of a
+        VO2 film, and 14 s where it is a tenth of that.
+    period : float
+        Time between two corrections, s.
+    duration : float
+        Time for each target, s; not used where the reference moves.
+    """
+
+    gain: float = 0.0025
+    period: float = 0.5
+    duration: float = 8.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "period", "duration")
+        if not math.isfinite(self.gain) or self.gain == 0.0:
+            raise ValueError(f"gain: expected a number other than 0, got {self.gain}")
+
+
+class IntegralControl(Scripted):
+    """Integral action without a model: the comparison for what the inverse is worth.
+
+    The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
+    error turns: it cannot wind up.
+
+    Parameters
+    ----------
+    limits : tuple of float
+        Least and greatest set-point, input units.
+    parameters : IntegralParameters
+        Gain and times.
+    """
+
+    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
+        super().__init__(tuple(_checks.increasing("limits", limits).tolist()), None, None)
+        self._parameters = parameters or IntegralParameters()
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        return Trace(reference=self._target)
+
+    def _run(self, target: float, reading: Reading) -> Script:
+        p = self._parameters
+        for _ in range(max(1, round(p.duration / p.period))):
+            error = target - reading.output
+            wished = self._setpoint + p.gain * p.period * error
+            self._reach = saturation(wished, self._low, self._high, error)
+            reading = yield self._command(wished, p.period)
+        yield from self._hold(self._poll)
+
+
+def saturation(wished: float, low: float, high: float, error: float) -> Reach:
+    """Return what a wish beyond the limits says of the target."""
+    if low <= wished <= high:
+        return Reach.MET
+    return Reach.TOO_HIGH if error > 0.0 else Reach.TOO_LOW
+
+
+@dataclass(frozen=True)
+class CorrectionParameters:
+    """Numbers of the closed-loop inverse.
+
+    Parameters
+    ----------
+    corrections : int
+        Greatest number of corrections after the first move.
+    close_enough : float
+        Error below which no further correction is made, output units: a correction that must turn back
+        crosses a loop of the hysteresis, and then may well end further off.
+    walk_variance : float
+        Variance by which the model's error changes between two corrections, output units squared. With the
+        default the gain settles at 0.8; results change little over a decade.
+    reading_variance : float
+        Variance of one value of the disturbance, output units squared: noise of the sensor, and what the
+        input wanders unseen while it is read.
+    arrival : Arrival
+        When the actuator has arrived at a set-point.
+    """
+
+    corrections: int = 4
+    close_enough: float = 5.0
+    walk_variance: float = 3.0
+    reading_variance: float = 1.0
+    arrival: Arrival = Arrival()
+
+    def __post_init__(self) -> None:
+        check_positive(self, "close_enough", "walk_variance", "reading_variance")
+        if self.corrections < 0:
+            raise ValueError(f"corrections: expected at least 0, got {self.corrections}")
+
+
+class Correcting(Scripted):
+    """The closed loop that `ClosedLoopInverse` is and others fall back to.
+
+    Parameters as of `ClosedLoopInverse`.
+    """
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None,
+        limits: tuple[float, float] | None,
+        parameters: CorrectionParameters,
+    ) -> None:
+        super().__init__(
+            inverse.operator.input_range, limits, inverse.operator.initial_state() if state is None else state
+        )
+        self._inverse = inverse
+        self._correction = parameters
+        self._poll = parameters.arrival.poll
+        self._estimator = DisturbanceEstimator(
+            walk_variance=parameters.walk_variance, reading_variance=parameters.reading_variance
+        )
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks at present."""
+        assert self._state is not None
+        disturbance = self._estimator.value
+        return Trace(
+            reference=self._target,
+            predicted=self._inverse.operator.value(self._state) + disturbance,
+            disturbance=disturbance,
+            uncertainty=self._estimator.uncertainty,
+        )
+
+    def _model(self) -> float:
+        """Return the model's output after what the actuator did."""
+        assert self._state is not None
+        return self._inverse.operator.value(self._state)
+
+    def _towards(self, target: float) -> Generator[Command, Reading, list[Reading]]:
+        """Go where the model has the output at `target`, through saturation if need be; return readings there."""
+        assert self._state is not None
+        operator = self._inverse.operator
+        arrival = self._correction.arrival
+        first, *rest = self._answer(operator, self._inverse.invert(self._state, target), target)
+        readings = yield from self._arrive(first, arrival)
+        if rest:
+            (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
+            readings = yield from self._arrive(second, arrival)
+        return readings
+
+    def _correct(self, target: float, corrections: int) -> Generator[Command, Reading, None]:
+        """Correct by the disturbance that is measured where the actuator has come to."""
+        readings = yield from self._towards(target - self._estimator.value)
+        for _ in range(corrections):
+            output = readings[-1].output
+            self._estimator.update(output - self._model())
+            if abs(target - output) <= self._correction.close_enough:
+                break
+            readings = yield from self._towards(target - self._estimator.value)
+
+
+class ClosedLoopInverse(Correcting):
+    """Feedforward by the exact inverse, feedback by the disturbance that it is found to have.
+
+    The disturbance z = y - Ω(ψ) of the measured output y against the model's output Ω of the memory ψ goes
+    into a Kalman filter of a random walk, d; each set-point is the inverse at target - d. This is an
+    integrator in terms of the model's output, of gain K: with a true local gain of g times the model's the
+    error goes on by 1 - K g. As d is measured and not summed up, it cannot wind up at a limit.
+
+    Parameters
+    ----------
+    inverse : Inverse
+        Exact inverse of the identified model.
+    state : MemoryCurve or None
+        Memory of the actuator at the first reading; default negative saturation.
+    limits : tuple of float or None
+        Least and greatest set-point, input units; default the operating range of the model.
+    parameters : CorrectionParameters
+        Numbers of the loop.
+    """
+
+    def __init__(
+        self,
+        inverse: Inverse,
+        state: MemoryCurve | None = None,
+        limits: tuple[float, float] | None = None,
+        parameters: CorrectionParameters | None = None,
+    ) -> None:
+        super().__init__(inverse, state, limits, parameters or CorrectionParameters())
+
+    def _run(self, target: float, reading: Reading) -> Script:
+        yield from self._correct(target, self._correction.corrections)
+        yield from self._hold(self._poll)

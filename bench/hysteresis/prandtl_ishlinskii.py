@@ -1,0 +1,439 @@
+"""The Prandtl-Ishlinskii operator: weighted plays between two single-valued maps, and its exact inverse."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.regressor import Regressor
+
+PlayState: TypeAlias = tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DeadZones:
+    """A rising piecewise linear map with S(0) = 0, the superposition of one-sided dead zones.
+
+    Kuhnen 2003 (European Journal of Control 9, section 3) writes it as a sum of weights times
+    max(x - r, 0) for thresholds r > 0, min(x - r, 0) for r < 0, and x. The slope between two thresholds is the
+    sum of the weights that are active there, and the slopes are what is kept here: the map rises if and only
+    if none is negative, and its inverse is again such a map.
+
+    Parameters
+    ----------
+    thresholds : array_like, shape (m,)
+        Increasing points at which the slope changes, units of the argument, m >= 1.
+    slopes : array_like, shape (m + 1,)
+        Slope below the first threshold, between thresholds, and above the last one, >= 0.
+
+    Raises
+    ------
+    ValueError
+        If the thresholds do not increase, a slope is negative, a number is not finite or a length is wrong.
+    """
+
+    thresholds: Floats
+    slopes: Floats
+
+    def __post_init__(self) -> None:
+        thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
+        slopes = _checks.samples("slopes", self.slopes)
+        if slopes.size != thresholds.size + 1:
+            raise ValueError(
+                f"slopes: expected {thresholds.size + 1} values for {thresholds.size} thresholds, got {slopes.size}"
+            )
+        if (slopes < 0.0).any():
+            raise ValueError(f"slopes: expected values >= 0, got {slopes.min()}")
+        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
+        object.__setattr__(self, "slopes", _checks.frozen(slopes))
+
+    def columns(self, values: ArrayLike) -> Floats:
+        """Return, for each value and each interval, the signed length between 0 and the value in it.
+
+        The map is these columns times the slopes; shape (N, m + 1).
+        """
+        x = np.asarray(values, dtype=np.float64)[:, None]
+        low = np.append(-np.inf, self.thresholds)
+        high = np.append(self.thresholds, np.inf)
+        result: Floats = np.clip(x, low, high) - np.clip(0.0, low, high)
+        return result
+
+    def __call__(self, values: ArrayLike) -> Floats:
+        """Return the map of each value, shape (N,)."""
+        return np.asarray(self.columns(values) @ self.slopes)
+
+    def value(self, x: float) -> float:
+        """Return the map of one value."""
+        thresholds, intercepts, slopes = self._lines
+        k = 0
+        while k < len(thresholds) and x > thresholds[k]:
+            k += 1
+        return intercepts[k] + slopes[k] * x
+
+    @cached_property
+    def _lines(self) -> tuple[list[float], list[float], list[float]]:
+        """Thresholds, and intercept and slope of the line on each interval."""
+        # A point inside or at the border of each interval, the nearest to zero: there rounding is least.
+        low = np.append(-np.inf, self.thresholds)
+        points = np.clip(0.0, low, np.append(self.thresholds, np.inf))
+        intercepts = self(points) - self.slopes * points
+        return self.thresholds.tolist(), intercepts.tolist(), self.slopes.tolist()
+
+    def inverse(self) -> DeadZones:
+        """Return the inverse map.
+
+        Raises
+        ------
+        ValueError
+            If a slope is zero.
+        """
+        if (self.slopes <= 0.0).any():
+            raise ValueError(f"slopes: expected values > 0 for an inverse, got {self.slopes.min()}")
+        return DeadZones(self(self.thresholds), 1.0 / self.slopes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the map as a JSON object."""
+        return {"thresholds": self.thresholds.tolist(), "slopes": self.slopes.tolist()}
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> DeadZones:
+        """Return the map that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        return cls(
+            _checks.json_field(document, "thresholds", "dead zones"),
+            _checks.json_field(document, "slopes", "dead zones"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PrandtlIshlinskii:
+    """A weighted sum of play operators, with dead zones before or after it where wanted.
+
+    With x = before(input - origin), each play keeps a state z = max(x - r, min(x + r, z before)), and
+    output = bias + after(sum of weight * z). `after` adds saturation and asymmetry (Kuhnen 2003). The output
+    never falls while the input rises. The state is the tuple of play states, in the units of x, outermost
+    last; the first one, of threshold 0, is x itself.
+
+    Parameters
+    ----------
+    thresholds : array_like, shape (n,)
+        Increasing, from 0 on, in the units of x.
+    weights : array_like, shape (n,)
+        Output per unit of x, of either sign, every running sum >= 0 (for instance all >= 0).
+    bias : float
+        Constant, output units.
+    origin : float
+        Input of x = 0, input units.
+    before, after : DeadZones or None
+        The single-valued maps; None is the identity.
+    input_range : tuple of float or None
+        Operating range of the input. Default: origin ± the last threshold (± 1 if that is zero).
+    input_unit, output_unit : str
+        Units, for labels.
+
+    Raises
+    ------
+    ValueError
+        If the thresholds do not increase from 0, there are not as many weights, a running sum of the weights
+        is negative, a number is not finite, or the range does not increase.
+    """
+
+    thresholds: Floats
+    weights: Floats
+    bias: float = 0.0
+    origin: float = 0.0
+    before: DeadZones | None = None
+    after: DeadZones | None = None
+    input_range: tuple[float, float] = None  # type: ignore[assignment]
+    input_unit: str = ""
+    output_unit: str = ""
+
+    def __post_init__(self) -> None:
+        thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
+        if thresholds[0] != 0.0:
+            raise ValueError(f"thresholds: expected the first to be 0, got {thresholds[0]}")
+        weights = _checks.samples("weights", self.weights)
+        if weights.size != thresholds.size:
+            raise ValueError(f"weights: expected {thresholds.size} values, one for each play, got {weights.size}")
+        sums = np.cumsum(weights)
+        if sums.min() < -1e-12 * np.abs(weights).max():
+            raise ValueError(f"weights: expected running sums >= 0, got {sums.min()}")
+        origin = _checks.number("origin", self.origin)
+        reach = float(thresholds[-1]) or 1.0
+        span = (origin - reach, origin + reach) if self.input_range is None else self.input_range
+        low, high = _checks.increasing("input_range", span).tolist()
+        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
+        object.__setattr__(self, "weights", _checks.frozen(weights))
+        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "input_range", (low, high))
+
+    @property
+    def coefficients(self) -> Floats:
+        """The weights, shape (n,); with dead zones after the plays their slopes, shape (m + 1,)."""
+        return self.weights if self.after is None else self.after.slopes
+
+    def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PrandtlIshlinskii:
+        """Return the same operator with other coefficients and bias.
+
+        Raises
+        ------
+        ValueError
+            If their number is wrong, one is not finite, or the output would fall with a rising input.
+        """
+        values = _checks.samples("coefficients", coefficients)
+        if values.size != self.coefficients.size:
+            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        if self.after is None:
+            return replace(self, weights=values, bias=bias)
+        return replace(self, after=DeadZones(self.after.thresholds, values), bias=bias)
+
+    def initial_state(self) -> PlayState:
+        """Return the relaxed state: every play at zero, the input at the origin."""
+        return (0.0,) * self.thresholds.size
+
+    def saturated_state(self, direction: int) -> PlayState:
+        """Return the state at the low (-1) or high (1) end of the operating range, entered from far beyond the other.
+
+        Every play then is dragged: at the low end z = x + r, at the high end z = x - r.
+
+        Raises
+        ------
+        ValueError
+            If `direction` is neither -1 nor 1.
+        """
+        if direction not in (-1, 1):
+            raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
+        end = self._inner(self.input_range[0 if direction < 0 else 1])
+        return tuple([end - direction * r for r in self._lists[0]])
+
+    def _inner(self, value: float) -> float:
+        x = value - self.origin
+        return x if self.before is None else self.before.value(x)
+
+    def _checked(self, state: PlayState | None) -> Floats:
+        if state is None:
+            return np.zeros(self.thresholds.size)
+        plays = _checks.samples("state", state)
+        if plays.size != self.thresholds.size:
+            raise ValueError(f"state: expected {self.thresholds.size} play states, got {plays.size}")
+        return plays
+
+    def _drive(self, inputs: ArrayLike) -> Floats:
+        x = _checks.samples("inputs", inputs) - self.origin
+        return x if self.before is None else self.before(x)
+
+    def _plays(self, inputs: ArrayLike, state: PlayState | None) -> Floats:
+        from bench.hysteresis import _kernels
+
+        return np.asarray(_kernels.plays(self._drive(inputs), self.thresholds, self._checked(state).copy()))
+
+    def evaluate(self, inputs: ArrayLike, state: PlayState | None = None) -> Floats:
+        """Return the outputs of a sequence, shape (N,), from `state` (default: relaxed).
+
+        Raises
+        ------
+        ValueError
+            If `inputs` is empty, not one-dimensional or not finite, or `state` has the wrong length.
+        """
+        from bench.hysteresis import _kernels
+
+        total = _kernels.weighted_plays(
+            self._drive(inputs), self.thresholds, self.weights, self._checked(state).copy()
+        )
+        return self.bias + (total if self.after is None else self.after(total))
+
+    def advance(self, state: PlayState, inputs: ArrayLike) -> PlayState:
+        """Return the state after a sequence of inputs, shape (N,).
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        from bench.hysteresis import _kernels
+
+        plays = self._checked(state).copy()
+        _kernels.weighted_plays(self._drive(inputs), self.thresholds, self.weights, plays)
+        return tuple(plays.tolist())
+
+    @cached_property
+    def _lists(self) -> tuple[list[float], list[float]]:
+        return self.thresholds.tolist(), self.weights.tolist()
+
+    def step(self, state: PlayState, value: float) -> tuple[PlayState, float]:
+        """Return state and output after the input moved monotonically to `value`.
+
+        Raises
+        ------
+        ValueError
+            If `value` is not finite or the state has the wrong length.
+        """
+        if not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number, got {value}")
+        thresholds, weights = self._lists
+        if len(state) != len(thresholds):
+            raise ValueError(f"state: expected {len(thresholds)} play states, got {len(state)}")
+        x = self._inner(value)
+        after = tuple([max(x - r, min(x + r, z)) for r, z in zip(thresholds, state, strict=True)])
+        return after, self._output(after)
+
+    def value(self, state: PlayState) -> float:
+        """Return the output of a state.
+
+        Raises
+        ------
+        ValueError
+            If the state has the wrong length or is not finite.
+        """
+        return self._output(tuple(self._checked(state).tolist()))
+
+    def _output(self, state: PlayState) -> float:
+        total = 0.0
+        for weight, z in zip(self._lists[1], state, strict=True):
+            total += weight * z
+        return self.bias + (total if self.after is None else self.after.value(total))
+
+    def regressor(self, inputs: ArrayLike, state: PlayState | None = None) -> Regressor:
+        """Return the dense columns that the coefficients multiply.
+
+        evaluate(inputs) = bias + regressor @ coefficients: the play states, or, with dead zones after the
+        plays, what `DeadZones.columns` makes of the weighted sum.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        columns = self._plays(inputs, state)
+        if self.after is not None:
+            columns = self.after.columns(columns @ self.weights)
+        return Regressor(
+            base=np.empty(0),
+            starts=np.zeros(columns.shape[0] + 1, dtype=np.int64),
+            cells=np.empty(0, dtype=np.int32),
+            changes=np.empty(0),
+            extra=np.ascontiguousarray(columns),
+        )
+
+    def output_range(self) -> tuple[float, float]:
+        """Return the least and greatest output that the operating range can produce from the relaxed state.
+
+        The output rises with the input, so both are at the ends of the range. There a play too wide to
+        follow still depends on how far the input had been the other way; the output is piecewise linear in that
+        distance and is tested at every break.
+        """
+        low, high = (self._inner(end) for end in self.input_range)
+        ends = -self._highest(-high, -low), self._highest(low, high)
+        if self.after is not None:
+            ends = self.after.value(ends[0]), self.after.value(ends[1])
+        return self.bias + ends[0], self.bias + ends[1]
+
+    def _highest(self, low: float, high: float) -> float:
+        """Return the greatest sum of weighted plays for x from low to high, reached at high."""
+        r = self.thresholds
+        turns = np.clip(np.concatenate([[low, high, 0.0], -r, high - 2.0 * r]), low, high)
+        states = np.maximum(high - r, np.minimum(0.0, turns[:, None] + r))
+        return float((states @ self.weights).max())
+
+    @cached_property
+    def _sums(self) -> Floats:
+        return np.asarray(np.cumsum(self.weights))
+
+    def inverse(self) -> PrandtlIshlinskii:
+        """Return the operator that gives the input back: itself a Prandtl-Ishlinskii operator.
+
+        Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the
+        running sums W (Kuhnen 2003, eqs. 13 to 16). Its states come from `inverse_state`; its operating range is
+        this operator's `output_range`.
+
+        Raises
+        ------
+        ValueError
+            If a running sum of the weights or a slope of the dead zones is zero: a plateau has no inverse.
+        """
+        w, r, sums = self.weights, self.thresholds, self._sums
+        if not (sums > 0.0).all():
+            at = int(np.argmax(sums <= 0.0))
+            raise ValueError(f"weights: expected running sums > 0 for an inverse, got {sums[at]} at play {at}")
+        thresholds = np.append(0.0, np.cumsum(sums[:-1] * np.diff(r)))
+        weights = np.append(1.0 / w[0], -w[1:] / (sums[1:] * sums[:-1]))
+        return PrandtlIshlinskii(
+            thresholds,
+            weights,
+            bias=self.origin,
+            origin=self.bias,
+            before=None if self.after is None else self.after.inverse(),
+            after=None if self.before is None else self.before.inverse(),
+            input_range=self.output_range(),
+            input_unit=self.output_unit,
+            output_unit=self.input_unit,
+        )
+
+    def inverse_state(self, state: PlayState) -> PlayState:
+        """Return the state of `inverse()` that belongs to a state of this operator.
+
+        z'_i = W_i z_i + sum over j > i of w_j z_j.
+
+        Raises
+        ------
+        ValueError
+            If the state has the wrong length or is not finite.
+        """
+        z = self._checked(state)
+        weighted = self.weights * z
+        beyond = np.append(np.cumsum(weighted[:0:-1])[::-1], 0.0)
+        return tuple((self._sums * z + beyond).tolist())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the operator as a JSON object."""
+        return {
+            "type": "prandtl-ishlinskii",
+            "thresholds": self.thresholds.tolist(),
+            "weights": self.weights.tolist(),
+            "bias": self.bias,
+            "origin": self.origin,
+            "before": None if self.before is None else self.before.to_json(),
+            "after": None if self.after is None else self.after.to_json(),
+            "input_range": list(self.input_range),
+            "input_unit": self.input_unit,
+            "output_unit": self.output_unit,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> PrandtlIshlinskii:
+        """Return the operator that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        kind = "prandtl-ishlinskii"
+        thresholds = _checks.json_field(document, "thresholds", kind)
+        maps = [document.get(key) for key in ("before", "after")]
+        before, after = (None if m is None else DeadZones.from_json(m) for m in maps)
+        return cls(
+            thresholds,
+            _checks.json_field(document, "weights", kind),
+            _checks.json_field(document, "bias", kind),
+            document.get("origin", 0.0),
+            before,
+            after,
+            document.get("input_range"),  # type: ignore[arg-type]
+            document.get("input_unit", ""),
+            document.get("output_unit", ""),
+        )

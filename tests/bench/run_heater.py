@@ -1,0 +1,29 @@
+"""A command like `bench run`, for the heater: run_heater.py FOLDER RIG CLOCK PROTOCOL [NAME=VALUE…]."""
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from bench.protocol import find_protocol
+from bench.runs import Run, carry_out
+
+
+def main() -> int:
+    folder, rig, clock, protocol, *settings = sys.argv[1:]
+    definition = find_protocol(protocol)
+    run = Run(
+        protocol=definition,
+        parameters=definition.parse(dict(setting.split("=") for setting in settings)),
+        rig=rig,
+        folder=Path(folder),
+        clock=clock,
+        recording=False,
+    )
+    outcome = carry_out(run, Console(width=200)).outcome
+    print("OUTCOME", outcome.status, outcome.steps, outcome.is_safe, outcome.reason, flush=True)
+    return 0 if outcome.error is None else getattr(outcome.error, "exit_code", 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,94 @@
+"""A bluesky RunEngine drives the bench's devices as it stands: over the wire, on the virtual clock."""
+
+import pytest
+from heater_protocols import stairs
+
+from bench.clock import VIRTUAL_EPOCH, VirtualClock
+from bench.engine import check_before_moving
+from bench.errors import DeviceError, LimitError
+from bench.rig import Rig, load_rig
+
+bluesky = pytest.importorskip("bluesky")
+plans = pytest.importorskip("bluesky.plans")
+plan_stubs = pytest.importorskip("bluesky.plan_stubs")
+
+
+@pytest.fixture
+def engine():
+    # No context managers: the handlers of signals are not the tests' to replace.
+    return bluesky.RunEngine({}, context_managers=[])
+
+
+@pytest.fixture
+def rig():
+    with Rig(load_rig("vo2", {"emulation.disturbances": "false"}), VirtualClock(), seed=1) as rig:
+        yield rig
+
+
+def run(engine, plan):
+    documents = {}
+    engine(plan, lambda name, document: documents.setdefault(name, []).append(document))
+    return documents
+
+
+@pytest.mark.timeout(120)
+class TestScan:
+    @pytest.fixture
+    def documents(self, engine, rig):
+        return run(engine, plans.scan([rig.devices["psd"]], rig.devices["tec"], 40.0, 60.0, 5))
+
+    def test_documents_come_in_full(self, documents):
+        assert {name: len(entries) for name, entries in documents.items()} == {
+            "start": 1,
+            "descriptor": 1,
+            "event": 5,
+            "stop": 1,
+        }
+        assert documents["stop"][0]["exit_status"] == "success"
+        assert documents["start"][0]["motors"] == ("tec",)
+
+    def test_units(self, documents):
+        keys = documents["descriptor"][0]["data_keys"]
+        assert {name: key["units"] for name, key in keys.items()} == {
+            "psd_position": "m",
+            "tec_temperature": "°C",
+            "tec_sink_temperature": "°C",
+            "tec_current": "A",
+            "tec_voltage": "V",
+        }
+        assert all(key["dtype"] == "number" and key["shape"] == [] for key in keys.values())
+
+    def test_values(self, documents, rig):
+        data = [event["data"] for event in documents["event"]]
+        temperatures = [entry["tec_temperature"] for entry in data]
+        assert temperatures == pytest.approx([40.0, 45.0, 50.0, 55.0, 60.0], abs=0.1)
+        # Below the transition the film expands, above 55 °C it begins to bend the other way.
+        positions = [entry["psd_position"] for entry in data]
+        assert positions[:4] == sorted(positions[:4], reverse=True)
+        assert positions[4] > positions[3]
+        assert all(-6e-6 < position < 100e-6 for position in positions)
+        assert data[-1]["tec_current"] > data[0]["tec_current"] > 0
+
+    def test_times_are_those_of_the_laboratory(self, documents, rig):
+        stamps = [event["timestamps"]["tec_temperature"] for event in documents["event"]]
+        assert stamps == sorted(stamps)
+        assert VIRTUAL_EPOCH.timestamp() < stamps[0] < stamps[-1] <= VIRTUAL_EPOCH.timestamp() + rig.clock.now()
+        assert rig.clock.now() < 200.0
+
+
+@pytest.mark.timeout(120)
+class TestFailures:
+    def test_a_setpoint_outside_of_the_limits_ends_the_plan(self, engine, rig):
+        with pytest.raises(LimitError, match=r"tec: set-point 99 °C is outside of 15 to 95 °C"):
+            engine(plan_stubs.mv(rig.devices["tec"], 99.0))
+        assert not rig.devices["tec"].output_enabled
+
+    def test_a_fault_on_the_way_ends_the_plan(self, engine, rig):
+        rig.laboratory.tec.unplug()
+        with pytest.raises(DeviceError, match="tec"):
+            engine(plan_stubs.mv(rig.devices["tec"], 50.0))
+
+
+def test_the_rig_of_a_scan_runs_protocols_too(rig):
+    with pytest.raises(Exception, match="probe_temperature"):
+        check_before_moving(rig, stairs, stairs.parameters())

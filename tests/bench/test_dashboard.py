@@ -1,0 +1,543 @@
+"""The dashboard: what it records, and that nothing it is connected to can hold a run up."""
+
+import gc
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+import rerun_cli
+from rerun.chunk import RrdReader
+
+from bench.clock import Stopwatch, WallClock
+from bench.dashboard import QUEUED_TICKS, Dashboard, DashboardLayout, picture, rebuild
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import MemoryCurve, Preisach, uniform_levels
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
+from bench.model_file import ModelFile
+
+SIGNALS = (
+    Signal("tec_setpoint", "°C", "temperature set-point", 3),
+    Signal("tec_temperature", "°C", "object temperature", 3),
+    Signal("tec_sink_temperature", "°C", "sink temperature", 2),
+    Signal("tec_current", "A", "TEC current", 3),
+    Signal("tec_voltage", "V", "TEC voltage", 3),
+    Signal("psd_position", "m", "tip deflection", 9),
+    Signal("curvature", "1/m", "curvature", 2),
+)
+LAYOUT = DashboardLayout(
+    title="Hysteresis loop",
+    input="tec_temperature",
+    output="curvature",
+    input_range=(15.0, 90.0),
+    output_range=(-200.0, 2000.0),
+    plane=(30.0, 70.0),
+    levels=20,
+)
+PROPERTIES = {"rig": "vo2", "protocol": "identify", "seed": 7}
+VULKAN = Path("/usr/share/vulkan/icd.d")
+# Stopping a thread of Rerun takes long only when a viewer hangs.
+PATIENCE = 60.0
+
+Tick = tuple[float, int, tuple[float, ...]]
+
+
+@pytest.fixture(autouse=True)
+def strict() -> Iterator[None]:
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before
+
+
+def make_model() -> ModelFile:
+    levels = uniform_levels(30.0, 70.0, 20)
+    middles = (levels[1:] + levels[:-1]) / 2
+    alpha, beta = np.meshgrid(middles, middles, indexing="ij")
+    density = np.exp(-(((alpha - 63.5) / 3) ** 2) / 2 - ((alpha - beta - 4) / 2.5) ** 2 / 2)[np.tril_indices(20)]
+    density *= 900 / (density.sum() * 4.0)
+    return ModelFile("preisach", Preisach(levels, density, 1020.0, None, (21.0, 84.0), "°C", "1/m"), None)
+
+
+def make_run(steps: int, ticks: int) -> Iterator[Tick | StepRecord | Event]:
+    """Yield what an engine tells of a damped oscillation between 21 and 84 °C."""
+    operator, random = make_model().operator, np.random.default_rng(1)
+    memory = MemoryCurve.from_negative_saturation(21.0)
+
+    def row(target: float, temperature: float) -> tuple[float, ...]:
+        kappa = operator.step(memory.step(temperature), temperature)[1] - 3.3 * (temperature - 20)
+        current = 0.03 * (temperature - 25)
+        values = (target, temperature, 24 + current, current, 3.1 * current, kappa * 4.5e-8, kappa)
+        return tuple(
+            float(v + s * random.normal()) for v, s in zip(values, (0, 0, 0.1, 0.01, 0.01, 5e-9, 2), strict=True)
+        )
+
+    yield Event(0.0, "INFO", "phase", "reset")
+    temperature, t = 21.0, 0.0
+    for step in range(steps):
+        if step == steps // 10:
+            yield Event(t, "INFO", "phase", "identification")
+        if step == steps // 2:
+            yield Event(t, "WARN", "pause", "paused before the next step")
+            t += 60.0
+            yield Event(t, "INFO", "resume", "resumed")
+        target = 52.5 - 31.5 * float(np.cos(2 * np.pi * 9 * step / steps) * np.exp(-2.2 * step / steps))
+        started, before = t, temperature
+        for tick in range(ticks):
+            t = started + 8.0 * (tick + 1) / (ticks + 1)
+            temperature = target + (before - target) * float(np.exp(-(t - started)))
+            yield t, step, row(target, temperature)
+        t, temperature = started + 8.0, target + 0.01 * float(random.normal())
+        values = row(target, temperature)
+        memory = memory.step(values[1])
+        yield StepRecord(step, started, t, "", "", step != 3, {"tec": target}, values)
+    yield Event(t, "INFO", "safe-state", "tec: safe")
+    yield Event(t, "INFO", "end", "completed")
+
+
+def keep_journal(folder: Path, entries: list[Tick | StepRecord | Event]) -> Path:
+    meta = {
+        "run": folder.name,
+        "rig": "vo2",
+        "rig_title": "VO2 microcantilever (emulated)",
+        "protocol": "identify",
+        "protocol_summary": "Damped oscillation of the temperature",
+        "parameters": {"high": 84.0, "low": 21.0},
+        "seed": 7,
+        "clock": "virtual",
+        "epoch": "2000-01-01T00:00:00+00:00",
+        "devices": {"tec": "Meerstetter TEC-1091", "psd": "LabJack T7"},
+        "operator": "lab",
+        "plan": {"steps": 400, "seconds": 3200.0},
+        "git": "0123456789ab",
+        "dashboard": {key: value for key, value in asdict(LAYOUT).items() if key != "title"},
+    }
+    folder.mkdir()
+    journal = Journal(folder / FILE_NAME, SIGNALS, meta)
+    # One transaction for all: the file need not outlive a power cut here.
+    journal._db.execute("BEGIN")
+    for entry in entries:
+        if isinstance(entry, StepRecord):
+            journal.step(entry)
+        elif isinstance(entry, Event):
+            journal.event(entry)
+        else:
+            journal.telemetry(*entry)
+    journal._db.execute("COMMIT")
+    journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
+    journal.close()
+    add_model(folder, "polynomial", 1.0, {"format": "bench-model", "version": 1, "no": "density"})
+    add_model(folder, "preisach", 2.0, make_model().to_json())
+    return folder
+
+
+def tell(dashboard: Dashboard, entries: list[Tick | StepRecord | Event]) -> None:
+    for entry in entries:
+        if isinstance(entry, StepRecord):
+            dashboard.step(entry)
+        elif isinstance(entry, Event):
+            dashboard.event(entry)
+        else:
+            dashboard.telemetry(*entry)
+
+
+def make_dashboard(
+    path: Path | None, *, live: bool = False, port: int = 0, layout: DashboardLayout | None = LAYOUT
+) -> Dashboard:
+    texts = {"run_id": "run", "title": "a run", "card": "# Card"}
+    return Dashboard(SIGNALS, layout, path=path, live=live, properties=PROPERTIES, port=port, **texts)
+
+
+def read(path: Path) -> dict[str, dict[str, list[object]]]:
+    """Return the columns of each entity of an .rrd, by the last part of the component's name."""
+    found: dict[str, dict[str, list[object]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        columns = found.setdefault(str(chunk.entity_path), {})
+        for field, column in zip(batch.schema, batch.columns, strict=True):
+            if "RowId" not in field.name:
+                values = column.cast("int64") if field.name == "t" else column
+                columns.setdefault(field.name.rpartition(":")[2], []).extend(values.to_pylist())
+    return found
+
+
+def table(columns: dict[str, list[object]], component: str) -> tuple[np.ndarray, np.ndarray, list[object]]:
+    """Return times in s, step numbers and values in order of time; static rows left out."""
+    order = np.argsort(np.array(columns["t"], dtype=np.int64), kind="stable")
+    t = np.array(columns["t"], dtype=np.float64)[order] / 1e9
+    values = columns[component][-len(t) :]
+    return t, np.array(columns["step"])[order], [values[i] for i in order]
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[Tick | StepRecord | Event]:
+    return list(make_run(400, 5))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory, entries: list[Tick | StepRecord | Event]) -> Path:
+    return keep_journal(tmp_path_factory.mktemp("runs") / "run", entries)
+
+
+@pytest.fixture(scope="module")
+def rebuilt(run_folder: Path) -> Path:
+    with Record(run_folder) as record:
+        rebuild(record, run_folder / "rebuilt.rrd")
+    return run_folder / "rebuilt.rrd"
+
+
+def test_a_rebuilt_recording_holds_what_the_journal_holds(run_folder: Path, rebuilt: Path) -> None:
+    found = read(rebuilt)
+    with Record(run_folder) as record:
+        ticks, steps, events = record.telemetry(), list(record.step_records()), record.events()
+    t, step, values = table(found["/signals/temperature"], "scalars")
+    np.testing.assert_allclose(t, ticks["t"], atol=1e-9)
+    np.testing.assert_array_equal(step, ticks["step"])
+    temperatures = np.column_stack([ticks[s.name] for s in SIGNALS if s.unit == "°C"])
+    np.testing.assert_array_equal(np.array(values), temperatures)
+    _, _, micrometres = table(found["/signals/position"], "scalars")
+    np.testing.assert_allclose(np.array(micrometres)[:, 0], ticks["psd_position"] * 1e6, rtol=1e-12)
+
+    t, step, values = table(found["/readings/curvature"], "scalars")
+    np.testing.assert_allclose(t, [s.finished for s in steps], atol=1e-9)
+    np.testing.assert_array_equal(step, [s.step for s in steps])
+    np.testing.assert_array_equal(np.array(values)[:, 0], [s.values[6] for s in steps])
+
+    t, _, texts = table(found["/events"], "text")
+    np.testing.assert_allclose(t, [e.t for e in events], atol=1e-9)
+    assert [text[0].partition("  ")[2] for text in texts] == [e.text for e in events]
+
+
+def test_loop_and_memory_curve_follow_the_readings(entries: list[Tick | StepRecord | Event], rebuilt: Path) -> None:
+    found = read(rebuilt)
+    steps = [entry for entry in entries if isinstance(entry, StepRecord)]
+    points = np.array([(s.values[1], s.values[6]) for s in steps])
+    _, _, path = table(found["/loop/data/path"], "strips")
+    segments = np.array(path)[:, 0]
+    np.testing.assert_allclose(segments[:, 1], points, rtol=1e-6)
+    np.testing.assert_allclose(segments[1:, 0], points[:-1], rtol=1e-6)
+    _, _, curves = table(found["/plane/data/memory"], "strips")
+    memory = MemoryCurve.from_negative_saturation(points[0, 0])
+    for (curve,), value in zip(curves, points[:, 0], strict=True):
+        memory = memory.step(value)
+        np.testing.assert_allclose(curve, memory.corners(30.0, 70.0), rtol=1e-6)
+
+
+def test_states_are_told_once_when_they_change(rebuilt: Path) -> None:
+    found = read(rebuilt)
+    _, _, phases = table(found["/state/phase"], "state")
+    assert phases == [["reset"], ["identification"]]
+    _, _, states = table(found["/state/run"], "state")
+    expected = ["running", "not settled", "running", "paused", "running", "safe", "completed"]
+    assert [state[0] for state in states] == expected
+
+
+def test_the_density_of_a_model_is_drawn(rebuilt: Path) -> None:
+    found = read(rebuilt)
+    assert len(found["/plane/density"]["buffer"]) == 1
+    assert ["preisach", "density [(1/m)/°C²]"] in found["/plane/legend/title"]["labels"]
+
+
+def test_live_and_rebuilt_recordings_are_equal(
+    tmp_path: Path, entries: list[Tick | StepRecord | Event], rebuilt: Path
+) -> None:
+    with make_dashboard(tmp_path / "live.rrd") as dashboard:
+        tell(dashboard, entries)
+        operator = make_model().operator
+        dashboard.model(operator.density_matrix(), operator.levels, "preisach")
+        dashboard.finish("completed", "")
+    assert dashboard.dropped == 0
+    live, again = read(tmp_path / "live.rrd"), read(rebuilt)
+    assert live.keys() == again.keys()
+    for path in live:
+        if "/__properties" in path or path == "/card":
+            continue
+        assert live[path].keys() == again[path].keys(), path
+        for component in live[path]:
+            if "t" in live[path] and component not in ("radii", "colors", "draw_order", "names", "widths", "values"):
+                mine, theirs = table(live[path], component), table(again[path], component)
+                np.testing.assert_array_equal(mine[0], theirs[0])
+                np.testing.assert_array_equal(mine[1], theirs[1])
+                assert mine[2] == theirs[2], path
+
+
+def test_readings_that_are_not_numbers_leave_a_gap(tmp_path: Path) -> None:
+    values = (20.0, float("nan"), 20.0, 0.0, 0.0, 0.0, 0.0)
+    record = StepRecord(0, 0.0, 8.0, "", "", True, {}, values)
+    with make_dashboard(tmp_path / "run.rrd") as dashboard:
+        dashboard.step(record)
+        dashboard.step(replace(record, step=1, finished=16.0, values=(20.0, 21.0, 20.0, 0.0, 0.0, 0.0, 1.0)))
+    assert dashboard.dropped == 0
+    found = read(tmp_path / "run.rrd")
+    assert table(found["/readings/temperature"], "scalars")[1].tolist() == [0, 1]
+    assert table(found["/plane/data/memory"], "strips")[1].tolist() == [1]
+
+
+def test_a_rig_without_a_loop_has_no_plane(tmp_path: Path, entries: list[Tick | StepRecord | Event]) -> None:
+    with make_dashboard(tmp_path / "run.rrd", layout=None) as dashboard:
+        tell(dashboard, entries[:100])
+    found = read(tmp_path / "run.rrd")
+    assert dashboard.dropped == 0
+    assert "/signals/curvature" in found
+    assert not [path for path in found if path.startswith(("/loop", "/plane"))]
+
+
+@pytest.mark.parametrize("change", [{"input": "x"}, {"output": "x"}])
+def test_a_layout_must_name_signals_that_there_are(tmp_path: Path, change: dict[str, str]) -> None:
+    with pytest.raises(ConfigurationError, match="no signal 'x'; there are: tec_setpoint"):
+        make_dashboard(tmp_path / "run.rrd", layout=replace(LAYOUT, **change))
+    assert not (tmp_path / "run.rrd").exists()
+
+
+@pytest.mark.parametrize("change", [{"plane": (70.0, 30.0)}, {"input_range": (0.0, float("nan"))}, {"levels": 0}])
+def test_a_layout_must_be_possible(change: dict[str, object]) -> None:
+    with pytest.raises(ConfigurationError, match="dashboard: "):
+        replace(LAYOUT, **change)
+
+
+def test_a_file_is_never_overwritten(tmp_path: Path, run_folder: Path) -> None:
+    path = tmp_path / "run.rrd"
+    path.write_bytes(b"precious")
+    with pytest.raises(ConfigurationError, match="never overwritten"):
+        make_dashboard(path)
+    with Record(run_folder) as record, pytest.raises(ConfigurationError, match="never overwritten"):
+        rebuild(record, path)
+    assert path.read_bytes() == b"precious"
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="no folder"):
+        make_dashboard(tmp_path / "none" / "run.rrd")
+
+
+def test_a_dashboard_must_lead_somewhere() -> None:
+    with pytest.raises(ValueError, match="file or a live view"):
+        make_dashboard(None)
+
+
+def test_a_taken_port_gives_the_next_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with make_dashboard(None, live=True, port=port) as dashboard:
+            assert dashboard.uri is not None
+            found = int(dashboard.uri.partition("127.0.0.1:")[2].partition("/")[0])
+            assert port < found < port + 50
+            wait_for_server(found)
+
+
+def test_no_free_port_is_an_error() -> None:
+    with socket.create_server(("127.0.0.1", 65535)), pytest.raises(ConfigurationError, match="no port"):
+        make_dashboard(None, live=True, port=65535)
+
+
+def test_the_server_is_not_reachable_from_outside() -> None:
+    with make_dashboard(None, live=True) as dashboard:
+        port = port_of(dashboard)
+        wait_for_server(port)
+        # 127.0.0.2 is this machine, too, but not the address that the server is bound to.
+        with socket.socket() as other:
+            assert other.connect_ex(("127.0.0.2", port)) != 0
+
+
+def test_clients_that_never_read_hold_nothing_up(tmp_path: Path) -> None:
+    dashboard = make_dashboard(tmp_path / "run.rrd", live=True)
+    port = port_of(dashboard)
+    wait_for_server(port)
+    clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
+    clients[1].sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0]))
+    clients[2].sendall(b"nonsense")
+    longest = feed(dashboard, 20_000)
+    stopwatch = Stopwatch()
+    dashboard.close()
+    assert stopwatch.seconds() < 5.0
+    assert longest < 0.5
+    for client in clients:
+        client.close()
+    assert dashboard.dropped == 0
+    assert len(table(read(tmp_path / "run.rrd")["/signals/temperature"], "scalars")[0]) == 20_000
+
+
+def test_a_viewer_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
+    dashboard = make_dashboard(tmp_path / "run.rrd", live=True)
+    assert dashboard.uri is not None
+    wait_for_server(port_of(dashboard))
+    # What a viewer does with what it gets, without a window.
+    command = [str(Path(rerun_cli.__file__).parent / "rerun"), "--save", str(tmp_path / "viewer.rrd"), dashboard.uri]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        feed(dashboard, 300)
+        wait_until(lambda: (tmp_path / "viewer.rrd").exists() and (tmp_path / "viewer.rrd").stat().st_size > 10_000)
+        os.kill(viewer.pid, signal.SIGSTOP)
+        longest, batches = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
+        os.kill(viewer.pid, signal.SIGCONT)
+        _, more = feed_batches(dashboard, until=lambda: dashboard.viewer_keeps_up)
+        os.kill(viewer.pid, signal.SIGSTOP)
+        _, again = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
+        stopwatch = Stopwatch()
+        dashboard.close()
+        assert stopwatch.seconds() < 8.0
+        assert longest < 0.5
+        found = read(tmp_path / "run.rrd")
+    finally:
+        viewer.kill()
+        viewer.wait()
+    dashboard._thread.join(PATIENCE)
+    assert dashboard.dropped == 0
+    rows = 300 + 250 * (batches + more + again)
+    assert len(table(found["/signals/temperature"], "scalars")[0]) == rows
+    said = [text[0].partition("  ")[2] for text in found["/events"]["text"]]
+    assert [text.partition(";")[0] for text in said] == [
+        "the viewer hangs",
+        "the viewer moves again",
+        "the viewer hangs",
+    ]
+
+
+def test_what_rerun_cannot_take_is_dropped_counted_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go, original = threading.Event(), rr.RecordingStream.send_columns
+
+    def stand_still(self: rr.RecordingStream, *arguments: object, **options: object) -> None:
+        let_go.wait(PATIENCE)
+        original(self, *arguments, **options)
+
+    monkeypatch.setattr(rr.RecordingStream, "send_columns", stand_still)
+    dashboard = make_dashboard(tmp_path / "run.rrd")
+    longest = feed(dashboard, 2 * QUEUED_TICKS)
+    # What matters more than telemetry still has room.
+    dashboard.step(StepRecord(7, 0.0, 8.0, "", "", True, {}, (0.0,) * len(SIGNALS)))
+    assert longest < 0.5
+    lost = dashboard.dropped
+    assert lost > 0
+    let_go.set()
+    dashboard.close()
+    found = read(tmp_path / "run.rrd")
+    assert len(table(found["/signals/temperature"], "scalars")[0]) == 2 * QUEUED_TICKS - lost
+    assert table(found["/readings/temperature"], "scalars")[1].tolist() == [7]
+    assert f"{lost} entries are missing" in found["/events"]["text"][-1][0]
+
+
+def test_closing_is_bounded_when_rerun_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go = threading.Event()
+    monkeypatch.setattr("bench.dashboard._CLOSE_SECONDS", 0.5)
+    monkeypatch.setattr(rr.RecordingStream, "send_columns", lambda *_, **__: let_go.wait(PATIENCE))
+    dashboard = make_dashboard(tmp_path / "run.rrd")
+    feed(dashboard, 1_000)
+    stopwatch = Stopwatch()
+    dashboard.close()
+    assert stopwatch.seconds() < 2.0
+    let_go.set()
+    dashboard._thread.join(PATIENCE)
+
+
+def test_a_refused_entry_does_not_end_the_view(tmp_path: Path) -> None:
+    with make_dashboard(tmp_path / "run.rrd") as dashboard:
+        dashboard.model([[1.0]], [0.0, 1.0, 2.0], "of the wrong shape")
+        wait_until(lambda: dashboard.dropped == 1)
+        feed(dashboard, 10)
+    found = read(tmp_path / "run.rrd")
+    assert len(table(found["/signals/temperature"], "scalars")[0]) == 10
+    assert "1 entries are missing" in found["/events"]["text"][-1][0]
+
+
+def test_telling_costs_the_control_thread_next_to_nothing(tmp_path: Path) -> None:
+    values = tuple(float(i) for i in range(len(SIGNALS)))
+    with make_dashboard(tmp_path / "run.rrd") as dashboard:
+        gc.disable()
+        stopwatch = Stopwatch()
+        for i in range(10_000):
+            dashboard.telemetry(0.1 * i, i, values)
+        seconds = stopwatch.seconds()
+        gc.enable()
+    # About 1 µs; the rest is room for a busy machine.
+    assert seconds / 10_000 < 10e-6
+
+
+def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
+    folder = keep_journal(tmp_path / "long", list(make_run(4_000, 5)))
+    stopwatch = Stopwatch()
+    with Record(folder) as record:
+        rebuild(record, folder / "run.rrd")
+    assert stopwatch.seconds() < 8.0
+    assert len(table(read(folder / "run.rrd")["/signals/current"], "scalars")[0]) == 20_000
+
+
+def test_a_picture_needs_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no recording"):
+        picture(tmp_path / "none.rrd", tmp_path / "none.png")
+
+
+@pytest.mark.skipif(
+    not [*VULKAN.glob("lvp_icd*.json")], reason="needs the packages mesa-vulkan-drivers and libvulkan1"
+)
+def test_the_viewer_draws_it_without_complaint(tmp_path: Path, rebuilt: Path) -> None:
+    png = tmp_path / "dashboard.png"
+    assert picture(rebuilt, png, at=1700.0, size=(1280, 800)) == []
+    pixels = read_png(png)
+    assert pixels.shape[:2] == (800, 1280)
+    # Loop, memory curve and plots fill it with colours; an empty viewer is nearly uniform.
+    assert len(np.unique(pixels[:, :, :3].reshape(-1, 3), axis=0)) > 1_000
+    right, top = pixels[:, 640:, :3].astype(int), pixels[:400, 640:, :3].astype(int)
+    assert ((right[:, :, 0] > 200) & (right[:, :, 1] < 160) & (right[:, :, 2] < 120)).sum() > 200
+    assert ((abs(top - (150, 248, 228))).sum(axis=2) < 60).sum() > 200
+
+
+def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> float:
+    """Tell ticks as fast as an emulated laboratory does; return the longest call, s."""
+    values, longest, stopwatch = tuple(float(i) for i in range(len(SIGNALS))), 0.0, Stopwatch()
+    before = stopwatch.seconds()
+    for i in range(start, start + ticks):
+        dashboard.telemetry(0.1 * i, i, values)
+        now = stopwatch.seconds()
+        longest, before = max(longest, now - before), now
+    return longest
+
+
+def feed_batches(dashboard: Dashboard, until: Callable[[], bool]) -> tuple[float, int]:
+    """Tell ticks in many batches until something happens; return the longest call, s, and how many."""
+    longest, batches, clock = 0.0, 0, WallClock()
+    while not until():
+        assert clock.now() < PATIENCE, "it does not happen"
+        longest, batches = max(longest, feed(dashboard, 250, start=250 * batches)), batches + 1
+        while dashboard._queue.qsize():
+            clock.sleep(0.001)
+    return longest, batches
+
+
+def port_of(dashboard: Dashboard) -> int:
+    assert dashboard.uri is not None
+    return int(dashboard.uri.partition("127.0.0.1:")[2].partition("/")[0])
+
+
+def wait_for_server(port: int) -> None:
+    def answers() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    wait_until(answers)
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    clock = WallClock()
+    while not condition():
+        assert clock.now() < PATIENCE, "it does not happen"
+        clock.sleep(0.05)
+
+
+def read_png(path: Path) -> np.ndarray:
+    from matplotlib.image import imread
+
+    return (imread(path) * 255).astype(np.uint8)

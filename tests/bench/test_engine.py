@@ -1,0 +1,648 @@
+import math
+import sqlite3
+import threading
+
+import numpy as np
+import pytest
+from heater_protocols import Settle, Stairs, settle, stairs
+
+from bench.clock import ScaledClock, VirtualClock
+from bench.engine import ABORT, RESUME, Engine, check_before_moving
+from bench.errors import (
+    AbortError,
+    ConfigurationError,
+    DeviceError,
+    InterlockError,
+    LimitError,
+    SettleTimeoutError,
+)
+from bench.interrupts import Interrupts
+from bench.journal import FILE_NAME, Journal, Record
+from bench.protocol import Dwell, Note, Phase, ProtocolParameters, Step, UntilSteady, protocol
+from bench.rig import Rig, load_rig
+
+
+class Nothing(ProtocolParameters):
+    pass
+
+
+def define(function):
+    function.__annotations__ = {"parameters": Nothing}
+    function.__doc__ = "A protocol."
+    return protocol(needs=("tec",))(function)
+
+
+class Watcher:
+    """An observer that remembers."""
+
+    def __init__(self):
+        self.ticks, self.steps, self.events = [], [], []
+
+    def telemetry(self, t, step, values):
+        self.ticks.append((t, step, tuple(values)))
+
+    def step(self, record):
+        self.steps.append(record)
+
+    def event(self, event):
+        self.events.append(event)
+
+
+class Bench:
+    """A rig with its journal and engine; `record` reads back what was written."""
+
+    def __init__(self, folder, path, clock=None, seed=1, observers=(), ask=None):
+        self.folder = folder
+        self.clock = clock or VirtualClock()
+        self.rig = Rig(load_rig(path), self.clock, seed)
+        self.tec, self.probe = self.rig.devices["tec"], self.rig.devices["probe"]
+        self.journal = Journal(folder / FILE_NAME, self.rig.signals, {})
+        self.interrupts = Interrupts()
+        self.watcher = Watcher()
+        self.engine = Engine(self.rig, self.journal, (*observers, self.watcher), self.interrupts, ask)
+
+    def run(self, definition, parameters=None):
+        try:
+            outcome = self.engine.run(definition, definition.parameters() if parameters is None else parameters)
+        finally:
+            self.journal.close()
+            self.rig.__exit__(None, None, None)
+        return outcome
+
+    def record(self):
+        return Record(self.folder)
+
+    def assert_safe(self):
+        assert self.tec.safe_times == self.probe.safe_times == 1
+        assert self.tec.calls[-1] == "safe"
+        assert not self.tec.output_enabled
+
+
+@pytest.fixture
+def bench(tmp_path, rig_file):
+    made = []
+
+    def make(*replacements, append="", **keys):
+        folder = tmp_path / f"run{len(made)}"
+        folder.mkdir()
+        made.append(Bench(folder, rig_file(*replacements, append=append), **keys))
+        return made[-1]
+
+    return make
+
+
+class TestCompleted:
+    def test_everything_is_recorded(self, bench):
+        b = bench()
+        outcome = b.run(stairs)
+        assert (outcome.status, outcome.reason, outcome.error) == ("completed", "", None)
+        assert outcome.steps == 4
+        assert outcome.laboratory_seconds == 8.0
+        assert outcome.is_safe
+        assert outcome.safe_state == {"tec": "safe", "probe": "safe"}
+        b.assert_safe()
+        with b.record() as run:
+            assert run.status == "completed"
+            assert run.meta["safe_state"] == {"tec": "safe", "probe": "safe"}
+            assert run.meta["finished"] == 8.0
+            records = list(run.step_records())
+            assert [entry.setpoints for entry in records] == [{"tec": value} for value in (30.0, 35.0, 40.0, 45.0)]
+            assert [(entry.started, entry.finished) for entry in records] == [
+                (2.0 * i, 2.0 * i + 2) for i in range(4)
+            ]
+            assert all(entry.phase == "climb" and entry.label == "up" and entry.settled for entry in records)
+            assert [event.text for event in run.events() if event.kind == "phase"] == ["climb"]
+            assert len([event for event in run.events() if event.kind == "note"]) == 5
+            assert [event.kind for event in run.events()][-3:] == ["safe-state", "safe-state", "end"]
+            steps = run.steps()
+            np.testing.assert_array_equal(steps["tec_setpoint"], [30.0, 35.0, 40.0, 45.0])
+            expected = [30.0 + (22.0 - 30.0) * math.exp(-2.0)]
+            for target in (35.0, 40.0, 45.0):
+                expected.append(target + (expected[-1] - target) * math.exp(-2.0))
+            np.testing.assert_allclose(steps["probe_temperature"], expected, atol=0.02)
+
+    def test_observers_see_what_the_journal_has(self, bench):
+        b = bench()
+        b.run(stairs)
+        with b.record() as run:
+            assert list(run.step_records()) == b.watcher.steps
+            assert run.events() == b.watcher.events
+            ticks = run.telemetry()
+            assert list(zip(ticks["t"], ticks["step"], strict=True)) == [tick[:2] for tick in b.watcher.ticks]
+            names = [signal.name for signal in run.signals]
+            for i, tick in enumerate(b.watcher.ticks):
+                np.testing.assert_array_equal([ticks[name][i] for name in names], tick[2])
+
+    def test_telemetry_ticks_at_the_exact_instants(self, bench):
+        b = bench(("period = 0.5", "period = 0.1"))
+        b.run(stairs, Stairs(count=3, dwell=1.0))
+        instants = [tick[0] for tick in b.watcher.ticks]
+        assert instants == [start + tick * 0.1 for start in (0.0, 1.0, 2.0) for tick in range(1, 10)]
+        assert [tick[1] for tick in b.watcher.ticks] == [0] * 9 + [1] * 9 + [2] * 9
+
+    @pytest.mark.parametrize(("period", "dwell"), [(0.7, 2.1), (0.1, 0.3), (0.3, 0.9), (0.1, 0.6), (0.05, 0.35)])
+    def test_no_tick_a_rounding_error_before_the_reading(self, bench, period, dwell):
+        b = bench(("period = 0.5", f"period = {period}"))
+        b.run(stairs, Stairs(count=5, dwell=dwell))
+        assert len(b.watcher.ticks) == 5 * (round(dwell / period) - 1)
+
+    def test_a_hold_shorter_than_a_period_has_no_tick(self, bench):
+        b = bench()
+        assert b.run(stairs, Stairs(dwell=0.4)).steps == 4
+        assert b.watcher.ticks == []
+
+    def test_no_dwell_at_all(self, bench):
+        b = bench()
+        outcome = b.run(stairs, Stairs(dwell=0.0, count=10, increment=1.0))
+        assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("completed", 10, 0.0)
+
+    def test_readings_reach_the_protocol(self, bench):
+        seen = []
+
+        def look(parameters):
+            seen.append((yield Step({"tec": 30.0}, Dwell(30.0))))
+            seen.append((yield Step({}, Dwell(1.0))))
+
+        b = bench()
+        b.run(define(look))
+        assert [reading.step for reading in seen] == [0, 1]
+        assert [reading.time for reading in seen] == [30.0, 31.0]
+        assert seen[0]["tec_setpoint"] == seen[1]["tec_setpoint"] == 30.0
+        assert seen[1]["probe_temperature"] == pytest.approx(30.0, abs=0.02)
+        assert b.tec.sent == [30.0]
+
+    def test_nothing_to_do(self, bench):
+        def idle(parameters):
+            yield Phase("none")
+
+        b = bench()
+        outcome = b.run(define(idle))
+        assert (outcome.status, outcome.steps) == ("completed", 0)
+        b.assert_safe()
+
+    def test_the_same_seed_gives_the_same_tables(self, bench):
+        tables = []
+        for seed in (5, 5, 6):
+            b = bench(seed=seed)
+            b.run(stairs, Stairs(count=30, increment=1.0))
+            db = sqlite3.connect(b.folder / FILE_NAME)
+            tables.append(
+                {
+                    name: db.execute(f"SELECT * FROM {name}").fetchall()
+                    for name in ("steps", "telemetry", "events", "meta")
+                }
+            )
+            db.close()
+        assert tables[0] == tables[1]
+        assert tables[0]["steps"] != tables[2]["steps"]
+
+    def test_whole_numbers_of_numpy_as_setpoints(self, bench):
+        def scan(parameters):
+            for target in np.arange(20, 40, 5):
+                yield Step({"tec": target}, Dwell(1.0))
+
+        b = bench()
+        assert b.run(define(scan)).status == "completed"
+        with b.record() as run:
+            assert [entry.setpoints["tec"] for entry in run.step_records()] == [20.0, 25.0, 30.0, 35.0]
+
+
+class TestWrongSetpoints:
+    @pytest.mark.parametrize("value", [95.5, 9.0, math.nan, math.inf])
+    def test_limits_are_checked_before_anything_is_sent(self, bench, value):
+        def beyond(parameters):
+            yield Step({"tec": 30.0}, Dwell(1.0))
+            yield Step({"tec": value}, Dwell(1.0))
+
+        b = bench()
+        outcome = b.run(define(beyond))
+        assert outcome.status == "failed"
+        assert isinstance(outcome.error, LimitError)
+        assert outcome.steps == 1
+        assert b.tec.sent == [30.0]
+        b.assert_safe()
+
+    def test_none_is_sent_when_another_is_wrong(self, bench):
+        def two(parameters):
+            yield Step({"tec": 30.0, "absent": 3.0}, Dwell(1.0))
+
+        b = bench()
+        outcome = b.run(define(two))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert "absent" in outcome.reason
+        assert "there are: tec" in outcome.reason
+        assert b.tec.sent == []
+
+    def test_a_sensor_takes_no_setpoint(self, bench):
+        def wrong(parameters):
+            yield Step({"probe": 30.0}, Dwell(1.0))
+
+        assert "probe is no device that takes a set-point" in bench().run(define(wrong)).reason
+
+    def test_an_unknown_signal_to_settle_is_found_before_anything_is_sent(self, bench):
+        b = bench()
+        outcome = b.run(settle, Settle(signal="prob_temperature"))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert "prob_temperature" in outcome.reason
+        assert b.tec.sent == []
+
+
+class TestBeforeMoving:
+    @pytest.fixture
+    def rig(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            yield rig
+            assert rig.devices["tec"].calls == []
+
+    def test_right(self, rig):
+        check_before_moving(rig, stairs, Stairs())
+
+    def test_setpoints_outside_of_the_limits(self, rig):
+        with pytest.raises(ConfigurationError) as caught:
+            check_before_moving(rig, stairs, Stairs(count=30))
+        assert "stairs would set tec to between 30 and 175 °C; rig heater allows 10 to 95 °C" in str(caught.value)
+
+    def test_a_device_that_cannot_be_set(self, rig):
+        def wrong(parameters):
+            yield Step({"probe": 30.0}, Dwell(1.0))
+
+        with pytest.raises(ConfigurationError, match="wrong sets probe, which rig heater cannot set"):
+            check_before_moving(rig, define(wrong), Nothing())
+
+    def test_needs(self, rig):
+        @protocol(needs=("tec", "curvature", "servo"))
+        def wanting(parameters: Nothing):
+            """Want."""
+            yield Note("x")
+
+        with pytest.raises(ConfigurationError, match="needs curvature, servo, which rig heater does not have"):
+            check_before_moving(rig, wanting, Nothing())
+
+    def test_a_signal_that_is_not_there(self, rig):
+        with pytest.raises(ConfigurationError, match="prob_temperature"):
+            check_before_moving(rig, settle, Settle(signal="prob_temperature"))
+
+
+class TestFaults:
+    def test_interlock_in_the_middle_of_a_hold(self, bench):
+        b = bench(("high = 90.0", "high = 41.0"))
+        outcome = b.run(stairs, Stairs(dwell=20.0))
+        assert outcome.status == "failed"
+        assert isinstance(outcome.error, InterlockError)
+        assert outcome.steps == 3
+        b.assert_safe()
+        with b.record() as run:
+            assert run.status == "failed"
+            assert "probe_temperature" in run.meta["reason"]
+            assert len(run.steps()) == 3
+            ticks = run.telemetry()
+            assert ticks["t"][-1] == outcome.laboratory_seconds
+            assert 60.0 < ticks["t"][-1] < 63.0
+            assert ticks["probe_temperature"][-1] > 41.0
+            assert np.all(ticks["probe_temperature"][:-1] <= 41.0)
+            (event,) = [event for event in run.events() if event.level == "ERROR"]
+            assert event.kind == "interlock"
+            assert "is outside of -inf to 41 °C" in event.text
+
+    def test_interlock_before_the_first_step(self, bench):
+        b = bench(("high = 90.0", "high = 20.0"))
+        outcome = b.run(stairs)
+        assert isinstance(outcome.error, InterlockError)
+        assert b.tec.sent == []
+        b.assert_safe()
+
+    def test_a_fault_in_the_middle_of_a_hold(self, bench):
+        b = bench()
+        b.probe.fail_at = 5.2
+        outcome = b.run(stairs)
+        assert outcome.status == "failed"
+        assert isinstance(outcome.error, DeviceError)
+        assert outcome.reason == "probe: open circuit at the sensor"
+        assert outcome.steps == 2
+        assert outcome.laboratory_seconds == 5.5
+        b.assert_safe()
+        with b.record() as run:
+            assert len(run.steps()) == 2
+            assert len(run.telemetry()) == 8
+            assert ("ERROR", "error") in [(event.level, event.kind) for event in run.events()]
+
+    @pytest.mark.parametrize("where", ["measure_error", "glance_error", "set_error"])
+    @pytest.mark.parametrize("error", [DeviceError("tec", "x"), OSError("gone"), StopIteration(), ValueError("bad")])
+    def test_whatever_a_device_raises_ends_in_the_safe_state(self, bench, where, error):
+        def go(parameters):
+            yield Step({"tec": 30.0}, Dwell(1.0))
+            setattr(b.tec, where, error)
+            yield Step({"tec": 31.0}, Dwell(1.0))
+            yield Step({"tec": 32.0}, Dwell(1.0))
+
+        b = bench()
+        outcome = b.run(define(go))
+        assert outcome.status == "failed"
+        assert outcome.error is error
+        assert outcome.steps == 1
+        b.assert_safe()
+        with b.record() as run:
+            assert run.status == "failed"
+
+    @pytest.mark.parametrize("error", [DeviceError("tec", "port gone"), OSError("gone"), KeyboardInterrupt()])
+    def test_one_that_cannot_be_made_safe(self, bench, error):
+        b = bench()
+        b.tec.safe_error = error
+        outcome = b.run(stairs)
+        assert outcome.status == "completed"
+        assert not outcome.is_safe
+        assert outcome.safe_state["probe"] == "safe"
+        assert type(error).__name__ in outcome.safe_state["tec"]
+        assert b.probe.safe_times == 1
+        with b.record() as run:
+            assert run.meta["safe_state"] == outcome.safe_state
+            (event,) = [event for event in run.events() if event.level == "ERROR"]
+            assert event.kind == "safe-state"
+            assert event.text.startswith("tec: ")
+
+    def test_not_even_a_keyboard_interrupt_leaves_the_output_on(self, bench):
+        def go(parameters):
+            yield Step({"tec": 30.0}, Dwell(1.0))
+            raise KeyboardInterrupt
+
+        b = bench()
+        with pytest.raises(KeyboardInterrupt):
+            b.run(define(go))
+        b.assert_safe()
+
+    def test_a_protocol_that_raises(self, bench):
+        def go(parameters):
+            yield Step({"tec": 30.0}, Dwell(1.0))
+            raise KeyError("tec_temprature")
+
+        b = bench()
+        outcome = b.run(define(go))
+        assert (outcome.status, outcome.steps) == ("failed", 1)
+        assert outcome.reason == "KeyError: 'tec_temprature'"
+        b.assert_safe()
+
+    @pytest.mark.parametrize("nonsense", [None, 42, "tec", {"tec": 30.0}, Step])
+    def test_a_protocol_that_yields_nonsense(self, bench, nonsense):
+        def go(parameters):
+            yield nonsense
+
+        b = bench()
+        outcome = b.run(define(go))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert "expected a Step, a Control, a Phase or a Note" in outcome.reason
+        b.assert_safe()
+
+    def test_a_protocol_that_goes_on_when_it_is_closed(self, bench):
+        # As one that wants to go home at the end, whatever happens.
+        def go(parameters):
+            try:
+                while True:
+                    yield Step({"tec": 30.0}, Dwell(2.0))
+            finally:
+                yield Step({"tec": 20.0}, Dwell(2.0))
+
+        b = bench()
+        b.probe.fail_at = 5.0
+        outcome = b.run(define(go))
+        assert outcome.reason == "probe: open circuit at the sensor"
+        assert b.tec.sent == [30.0, 30.0, 30.0]
+        b.assert_safe()
+
+    def test_a_protocol_cannot_swallow_a_fault(self, bench):
+        def go(parameters):
+            while True:
+                try:
+                    yield Step({"tec": 30.0}, Dwell(2.0))
+                except Exception:
+                    yield Note("never mind")
+
+        b = bench()
+        b.probe.fail_at = 5.0
+        assert b.run(define(go)).status == "failed"
+        b.assert_safe()
+
+    def test_a_full_disk_does_not_hide_the_safe_state(self, bench):
+        b = bench()
+        execute = b.journal._db
+
+        class Full:
+            def execute(self, *arguments):
+                if b.clock.now() > 3.0:
+                    raise sqlite3.OperationalError("database or disk is full")
+                return execute.execute(*arguments)
+
+            def close(self):
+                execute.close()
+
+        b.journal._db = Full()
+        outcome = b.run(stairs)
+        assert outcome.status == "failed"
+        assert "disk is full" in outcome.reason
+        assert outcome.is_safe
+        b.assert_safe()
+
+
+class BrokenObserver(Watcher):
+    """One whose terminal or viewer is gone."""
+
+    def __init__(self, *methods):
+        super().__init__()
+        for method in methods:
+            setattr(self, method, self.fail)
+
+    def fail(self, *arguments):
+        raise OSError(5, "Input/output error")
+
+
+class TestObservers:
+    @pytest.mark.parametrize("methods", [("telemetry",), ("step",), ("event",), ("telemetry", "step", "event")])
+    def test_one_that_fails_ends_no_run_and_is_told_no_more(self, bench, methods):
+        b = bench(observers=[BrokenObserver(*methods)])
+        outcome = b.run(stairs)
+        assert (outcome.status, outcome.steps) == ("completed", 4)
+        b.assert_safe()
+        assert len(b.watcher.steps) == 4
+        with b.record() as run:
+            assert run.status == "completed"
+            (event,) = [event for event in run.events() if event.level == "WARN" and event.kind == "observer"]
+            assert "BrokenObserver" in event.text
+
+
+class TestSettling:
+    def test_until_steady(self, bench):
+        b = bench()
+        outcome = b.run(settle)
+        assert outcome.status == "completed"
+        # 28 K with a time constant of 1 s drift by less than 0.02 K/s after 7.2 s.
+        assert 7.0 < outcome.laboratory_seconds < 30.0
+        with b.record() as run:
+            assert run.steps()["probe_temperature"][0] == pytest.approx(50.0, abs=0.05)
+            np.testing.assert_array_equal(
+                run.telemetry()["t"], 0.5 * np.arange(1, 2 * outcome.laboratory_seconds + 1)
+            )
+
+    def test_waits_its_minimum(self, bench):
+        outcome = bench().run(settle, Settle(minimum=60.0))
+        assert outcome.laboratory_seconds == 60.0
+
+    def test_times_out(self, bench):
+        b = bench()
+        outcome = b.run(settle, Settle(timeout=5.0))
+        assert outcome.status == "failed"
+        assert isinstance(outcome.error, SettleTimeoutError)
+        assert "probe_temperature is not steady after 5 s: it drifts by" in outcome.reason
+        assert "0.02 °C/s is allowed" in outcome.reason
+        assert outcome.laboratory_seconds == 5.0
+        b.assert_safe()
+
+    @pytest.mark.parametrize("period", [0.1, 1.0, 5.0, 20.0])
+    def test_comes_to_an_end_whatever_the_telemetry_period(self, bench, period):
+        outcome = bench(("period = 0.5", f"period = {period}")).run(settle, Settle(timeout=3600.0))
+        assert outcome.status == "completed", outcome.reason
+
+    def test_a_gap_in_the_signal_is_named(self, bench):
+        def go(parameters):
+            yield Step({}, UntilSteady("tec_setpoint", drift=1.0, noise=1.0, timeout=10.0))
+
+        b = bench()
+        outcome = b.run(define(go))
+        assert outcome.status == "failed"
+        assert "tec_setpoint" in outcome.reason
+
+
+class TestInterrupted:
+    def request(self, **flags):
+        """A protocol that sets flags of the interrupts in its second step."""
+
+        def go(parameters):
+            yield Step({"tec": 30.0}, Dwell(2.0))
+            for name, value in flags.items():
+                setattr(self.b.interrupts, name, value)
+            yield Step({"tec": 31.0}, Dwell(2.0))
+            yield Step({"tec": 32.0}, Dwell(2.0))
+
+        return define(go)
+
+    def test_pause_and_resume(self, bench):
+        asked = []
+
+        def ask():
+            asked.append(threading.current_thread() is not threading.main_thread())
+            return RESUME
+
+        self.b = b = bench(ask=ask)
+        outcome = b.run(self.request(pause_requested=True))
+        assert (outcome.status, outcome.steps) == ("completed", 3)
+        assert asked == [True]
+        assert not b.interrupts.pause_requested
+        kinds = [event.kind for event in b.watcher.events]
+        assert kinds.index("pause") < kinds.index("resume")
+        assert b.tec.sent == [30.0, 31.0, 32.0]
+
+    @pytest.mark.parametrize("answer", [ABORT, "", "whatever"])
+    def test_pause_and_abort(self, bench, answer):
+        self.b = b = bench(ask=lambda: answer)
+        outcome = b.run(self.request(pause_requested=True))
+        assert (outcome.status, outcome.steps) == ("aborted", 1)
+        assert isinstance(outcome.error, AbortError)
+        assert outcome.reason == "ended by the operator at a pause"
+        assert b.tec.sent == [30.0]
+        b.assert_safe()
+        with b.record() as run:
+            assert run.status == "aborted"
+
+    def test_a_pause_that_nobody_can_end_is_an_abort(self, bench):
+        self.b = b = bench()
+        outcome = b.run(self.request(pause_requested=True))
+        assert (outcome.status, outcome.steps) == ("aborted", 1)
+        assert "nobody is there" in outcome.reason
+        b.assert_safe()
+
+    def test_abort_at_once(self, bench):
+        self.b = b = bench()
+        outcome = b.run(self.request(abort_reason="SIGTERM"))
+        assert (outcome.status, outcome.reason, outcome.steps) == ("aborted", "ended by SIGTERM", 1)
+        b.assert_safe()
+
+    def test_abort_in_the_middle_of_a_hold(self, bench):
+        class Late(Watcher):
+            def telemetry(_, t, step, values):
+                if t >= 3.0:
+                    self.b.interrupts.abort_reason = "SIGTERM"
+
+        self.b = b = bench(observers=[Late()])
+        outcome = b.run(stairs)
+        assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("aborted", 1, 3.0)
+        b.assert_safe()
+
+    def test_abort_while_settling(self, bench):
+        class Late(Watcher):
+            def telemetry(_, t, step, values):
+                if t >= 3.0:
+                    self.b.interrupts.abort_reason = "SIGTERM"
+
+        self.b = b = bench(observers=[Late()])
+        assert b.run(settle).status == "aborted"
+        b.assert_safe()
+
+    def test_abort_at_a_pause(self, bench):
+        answered = threading.Event()
+
+        def ask():
+            self.b.interrupts.abort_reason = "Ctrl-C, twice"
+            answered.wait(60.0)
+            return RESUME
+
+        self.b = b = bench(ask=ask)
+        outcome = b.run(self.request(pause_requested=True))
+        answered.set()
+        assert (outcome.status, outcome.reason) == ("aborted", "ended by Ctrl-C, twice")
+        b.assert_safe()
+
+    @pytest.mark.timeout(60)
+    def test_a_protocol_that_only_talks_can_be_aborted(self, bench):
+        def chatter(parameters):
+            for i in range(100_000):
+                if i == 3:
+                    self.b.interrupts.abort_reason = "SIGTERM"
+                yield Note("still here")
+
+        self.b = b = bench()
+        assert b.run(define(chatter)).status == "aborted"
+        assert len([event for event in b.watcher.events if event.kind == "note"]) < 10
+
+    def test_interlocks_do_not_pause(self, bench):
+        done = threading.Event()
+
+        def ask():
+            self.b.probe.plate.temperature = 500.0
+            done.wait(60.0)
+            return RESUME
+
+        self.b = b = bench(ask=ask, clock=ScaledClock(50.0))
+        outcome = b.run(self.request(pause_requested=True))
+        done.set()
+        assert isinstance(outcome.error, InterlockError)
+        b.assert_safe()
+
+    def test_telemetry_goes_on_at_a_pause(self, bench):
+        enough = threading.Event()
+
+        class Counting(Watcher):
+            def telemetry(_, t, step, values):
+                super().telemetry(t, step, values)
+                if len(_.ticks) >= 12:
+                    enough.set()
+
+        def ask():
+            enough.wait(60.0)
+            return RESUME
+
+        self.b = b = bench(ask=ask, clock=ScaledClock(50.0), observers=[Counting()])
+        assert b.run(self.request(pause_requested=True)).status == "completed"
+        assert len([tick for tick in b.watcher.ticks if tick[1] == 1]) > 3
+
+    def test_the_clock_is_left_as_it_was(self, bench):
+        self.b = b = bench()
+        b.run(self.request(abort_reason="SIGTERM"))
+        assert not b.clock.interrupted()

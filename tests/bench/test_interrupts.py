@@ -1,0 +1,294 @@
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from bench.interrupts import Interrupts
+from bench.journal import Record
+
+HERE = Path(__file__).parent
+PROTOCOLS = str(HERE / "heater_protocols.py")
+
+
+class TestFlags:
+    def test_first_pauses_second_ends(self):
+        told = []
+        with Interrupts(told.append) as interrupts:
+            assert not interrupts.pause_requested
+            signal.raise_signal(signal.SIGINT)
+            assert interrupts.pause_requested
+            assert not interrupts.abort_requested()
+            signal.raise_signal(signal.SIGINT)
+            assert interrupts.abort_reason == "Ctrl-C, twice"
+        assert len(told) == 2
+        assert "pausing" in told[0]
+
+    def test_after_a_resume_the_next_pauses_again(self):
+        with Interrupts() as interrupts:
+            signal.raise_signal(signal.SIGINT)
+            interrupts.pause_requested = False
+            signal.raise_signal(signal.SIGINT)
+            assert interrupts.pause_requested
+            assert not interrupts.abort_requested()
+
+    @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+    def test_the_system_ends_at_once(self, name):
+        with Interrupts() as interrupts:
+            signal.raise_signal(getattr(signal, name))
+            assert interrupts.abort_requested()
+            assert interrupts.abort_reason == name
+
+    def test_former_handlers_come_back(self):
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        before = [signal.getsignal(number) for number in numbers]
+        with Interrupts():
+            assert [signal.getsignal(number) for number in numbers] != before
+        assert [signal.getsignal(number) for number in numbers] == before
+
+    def test_what_is_ignored_stays_ignored(self):
+        # As by nohup.
+        former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        try:
+            with Interrupts() as interrupts:
+                signal.raise_signal(signal.SIGHUP)
+                assert not interrupts.abort_requested()
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        finally:
+            signal.signal(signal.SIGHUP, former)
+
+    def test_a_terminal_that_is_gone_raises_nothing(self):
+        def gone(text):
+            raise OSError(5, "Input/output error")
+
+        with Interrupts(gone) as interrupts:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            assert interrupts.abort_requested()
+
+    def test_in_another_thread_it_watches_nothing(self):
+        before = signal.getsignal(signal.SIGTERM)
+        seen = []
+
+        def work():
+            with Interrupts() as interrupts:
+                seen.append(signal.getsignal(signal.SIGTERM))
+                seen.append(interrupts.abort_requested())
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        assert seen == [before, False]
+
+
+class Process:
+    """A run in a process of its own, on the clock of the room."""
+
+    def __init__(self, tmp_path, rig, protocol, *settings, clock="wall", terminal=False, **keys):
+        self.folder = tmp_path / "runs"
+        self.witness = tmp_path / "witness.txt"
+        command = [
+            sys.executable,
+            str(HERE / "run_heater.py"),
+            str(self.folder),
+            rig,
+            clock,
+            f"{PROTOCOLS}:{protocol}",
+        ]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])])}
+        self.terminal = None
+        if terminal:
+            self.terminal, inner = pty.openpty()
+            streams = {"stdin": inner, "stdout": inner, "stderr": inner, "start_new_session": True}
+            keys["preexec_fn"] = _take_terminal
+        else:
+            streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        self.process = subprocess.Popen([*command, *settings], env=environment, **streams, **keys)
+        if terminal:
+            os.close(inner)
+        self.output = ""
+
+    def until(self, text):
+        """Read on until the process has said something."""
+        number = self.terminal if self.terminal is not None else self.process.stdout.fileno()
+        while text not in self.output:
+            try:
+                piece = os.read(number, 4096)
+            except OSError:
+                piece = b""
+            if not piece:
+                raise AssertionError(f"it never said {text!r}: {self.output}")
+            self.output += piece.decode(errors="replace")
+
+    def send(self, number):
+        self.process.send_signal(number)
+
+    def end(self):
+        """Read to the end; return the exit code."""
+        try:
+            self.until("\0")
+        except AssertionError:
+            pass
+        return self.process.wait(60)
+
+    def record(self):
+        (folder,) = self.folder.iterdir()
+        return Record(folder)
+
+    def safe_devices(self):
+        return self.witness.read_text().split() if self.witness.exists() else []
+
+    def close(self):
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout:
+            self.process.stdout.close()
+        if self.terminal is not None:
+            os.close(self.terminal)
+
+
+def _take_terminal():
+    import fcntl
+    import termios
+
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+@pytest.fixture
+def start(tmp_path, rig_file):
+    started = []
+
+    def make(*arguments, **keys):
+        witness = tmp_path / "witness.txt"
+        path = rig_file(
+            ('port = "emulated://heater"', f'port = "emulated://heater"\nwitness = "{witness}"'),
+            ('port = "emulated://thermometer"', f'port = "emulated://thermometer"\nwitness = "{witness}"'),
+        )
+        # The bench guards that real devices see the wall clock; these are emulated and may see any.
+        started.append(Process(tmp_path, path, *arguments, **keys))
+        return started[-1]
+
+    yield make
+    for process in started:
+        process.close()
+
+
+@pytest.mark.timeout(120)
+class TestProcesses:
+    def assert_aborted(self, process, reason, code=130):
+        assert process.end() == code, process.output
+        assert sorted(process.safe_devices()) == ["probe", "tec"]
+        with process.record() as run:
+            assert run.status == "aborted"
+            assert reason in run.meta["reason"]
+            assert run.meta["safe_state"] == {"tec": "safe", "probe": "safe"}
+            return len(run.steps())
+
+    def test_runs_to_its_end(self, start):
+        process = start("stairs", "dwell=0.5", clock="virtual")
+        assert process.end() == 0, process.output
+        assert sorted(process.safe_devices()) == ["probe", "tec"]
+        with process.record() as run:
+            assert run.status == "completed"
+            assert run.meta["protocol"] == "stairs"
+            assert run.meta["devices"]["tec"] == "Test Heater, serial number 1, firmware 1.0"
+            assert run.meta["parameters"]["dwell"] == 0.5
+            assert run.meta["plan"]["steps"] == len(run.steps()) == 4
+
+    def test_ctrl_c_once_without_a_terminal_ends_at_the_next_step(self, start):
+        process = start("stairs", "dwell=0.5", "count=1000", "increment=0.05")
+        process.until("step 0 at")
+        process.send(signal.SIGINT)
+        steps = self.assert_aborted(process, "nobody is there to be asked")
+        assert "pausing at the next step" in process.output
+        assert 1 <= steps < 100
+
+    def test_ctrl_c_twice_ends_at_once(self, start):
+        process = start("stairs", "dwell=3000")
+        process.until("climbing")
+        process.send(signal.SIGINT)
+        process.until("pausing at the next step")
+        process.send(signal.SIGINT)
+        assert self.assert_aborted(process, "Ctrl-C, twice") == 0
+
+    @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+    @pytest.mark.parametrize("protocol", ["stairs", "settle"])
+    def test_the_system_ends_it_at_once(self, start, name, protocol):
+        more = ("dwell=3000",) if protocol == "stairs" else ("minimum=3000", "timeout=3600")
+        process = start(protocol, *more, clock="x2")
+        process.until("climbing" if protocol == "stairs" else "settling")
+        process.send(getattr(signal, name))
+        assert self.assert_aborted(process, name) == 0
+
+    def test_an_ignored_hangup_is_survived(self, start):
+        def ignore():
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+        process = start("stairs", "dwell=0.3", preexec_fn=ignore)
+        process.until("step 0 at")
+        process.send(signal.SIGHUP)
+        assert process.end() == 0, process.output
+        with process.record() as run:
+            assert run.status == "completed"
+
+    def test_killed_it_leaves_what_was_finished(self, start):
+        process = start("stairs", "dwell=0.02", "count=2000", "increment=0.02")
+        process.until("step 20 at")
+        process.send(signal.SIGKILL)
+        assert process.end() == -signal.SIGKILL
+        assert process.safe_devices() == []
+        with process.record() as run:
+            assert run.status == "unfinished"
+            steps = run.steps()["step"].tolist()
+            assert steps == list(range(len(steps)))
+            assert len(steps) >= 21
+            assert run.meta["protocol"] == "stairs"
+
+    def test_at_a_terminal_pause_and_resume(self, start):
+        process = start("stairs", "dwell=0.3", terminal=True)
+        process.until("step 0 at")
+        os.write(process.terminal, b"\x03")
+        process.until("resumes")
+        os.write(process.terminal, b"what\nr\n")
+        process.until("OUTCOME completed 4 True")
+        assert process.end() == 0, process.output
+        assert "please answer r" in process.output
+
+    @pytest.mark.parametrize("answer", [b"a\n", b"\x04"], ids=["a", "end of file"])
+    def test_at_a_terminal_pause_and_end(self, start, answer):
+        process = start("stairs", "dwell=0.3", "count=500", "increment=0.1", terminal=True)
+        process.until("step 0 at")
+        os.write(process.terminal, b"\x03")
+        process.until("resumes")
+        os.write(process.terminal, answer)
+        self.assert_aborted(process, "by the operator at a pause")
+
+    def test_at_a_terminal_ctrl_c_twice(self, start):
+        # The question is left open while the process ends.
+        process = start("stairs", "dwell=0.3", "count=500", "increment=0.1", terminal=True)
+        process.until("step 0 at")
+        os.write(process.terminal, b"\x03")
+        process.until("resumes")
+        os.write(process.terminal, b"\x03")
+        self.assert_aborted(process, "Ctrl-C, twice")
+        assert "Fatal" not in process.output
+
+    def test_the_terminal_is_closed(self, start):
+        process = start("stairs", "dwell=0.3", "count=2000", "increment=0.02", terminal=True)
+        process.until("step 0 at")
+        os.close(process.terminal)
+        process.terminal = None
+        process.process.wait(60)
+        assert sorted(process.safe_devices()) == ["probe", "tec"]
+        with process.record() as run:
+            assert run.status == "aborted"
+            assert run.meta["reason"] == "ended by SIGHUP"
+
+    def test_without_any_standard_input(self, start):
+        process = start("stairs", "dwell=0.1", clock="virtual", preexec_fn=lambda: os.close(0))
+        assert process.end() == 0, process.output

@@ -1,0 +1,349 @@
+import hashlib
+import json
+import math
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DataError
+from bench.journal import FILE_NAME, SCHEMA, Event, Journal, Record, StepRecord, add_model
+
+SIGNALS = (Signal("tec_temperature", "°C", "object temperature"), Signal("force", "N", "force", 4))
+
+
+def record(step, *values, setpoints=None, label="", phase="rise"):
+    return StepRecord(step, float(step), step + 0.5, phase, label, True, setpoints or {"tec": 20.0 + step}, values)
+
+
+def write(path, steps=3, signals=SIGNALS, meta=None, finish=True, ticks=2):
+    journal = Journal(path, signals, meta or {"rig": "vo2"})
+    journal.event(Event(0.0, "INFO", "phase", "rise"))
+    for step in range(steps):
+        for tick in range(ticks):
+            journal.telemetry(step + 0.1 * tick, step, [20.0 + step + 0.1 * tick] * len(signals))
+        journal.step(record(step, *(20.0 + step for _ in signals)))
+    if finish:
+        journal.finish(status="completed", reason="", finished=float(steps), safe_state={"tec": "safe"})
+    journal.close()
+
+
+def digest(folder):
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def intact(tmp_path_factory):
+    path = tmp_path_factory.mktemp("intact") / FILE_NAME
+    write(path, steps=40, ticks=5)
+    return path.read_bytes()
+
+
+class TestRoundTrip:
+    def test_everything_comes_back(self, tmp_path):
+        meta = {"rig": "vo2", "parameters": {"low": 21.0, "note": "10 µm"}, "command": ["bench", "run"], "seed": 3}
+        write(tmp_path / FILE_NAME, meta=meta)
+        with Record(tmp_path) as run:
+            assert run.meta["schema"] == SCHEMA
+            assert {key: run.meta[key] for key in meta} == meta
+            assert run.signals == SIGNALS
+            assert run.status == "completed"
+            assert run.meta["safe_state"] == {"tec": "safe"}
+            assert run.meta["finished"] == 3.0
+            steps = run.steps()
+            assert len(steps) == 3
+            np.testing.assert_array_equal(steps["step"], [0, 1, 2])
+            np.testing.assert_array_equal(steps["finished"], [0.5, 1.5, 2.5])
+            np.testing.assert_array_equal(steps["force"], [20.0, 21.0, 22.0])
+            assert list(run.step_records()) == [record(step, 20.0 + step, 20.0 + step) for step in range(3)]
+            ticks = run.telemetry()
+            assert len(ticks) == 6
+            np.testing.assert_array_equal(ticks["step"], [0, 0, 1, 1, 2, 2])
+            assert run.events() == [Event(0.0, "INFO", "phase", "rise")]
+
+    def test_every_digit_is_kept(self, tmp_path):
+        values = [math.pi, 1e-300, -0.0, 0.1 + 0.2, 1.7976931348623157e308, 5e-324]
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        for step, value in enumerate(values):
+            journal.step(record(step, value, -value))
+        journal.close()
+        with Record(tmp_path) as run:
+            np.testing.assert_array_equal(run.steps()["force"], [-value for value in values])
+            assert [entry.values[0] for entry in run.step_records()] == values
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    def test_what_is_not_finite(self, tmp_path, value):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"odd": value})
+        journal.telemetry(0.0, 0, (value, 1.0))
+        journal.step(record(0, value, 1.0))
+        journal.close()
+        with Record(tmp_path) as run:
+            np.testing.assert_array_equal(run.steps()["tec_temperature"], [value])
+            np.testing.assert_array_equal(run.telemetry()["tec_temperature"], [value])
+            np.testing.assert_array_equal(next(run.step_records()).values, (value, 1.0))
+            np.testing.assert_array_equal(run.meta["odd"], value)
+
+    def test_numbers_of_numpy_are_numbers(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        journal.telemetry(0.0, 0, (np.float32(1.5), np.int64(2)))
+        journal.step(record(0, np.float32(1.5), np.int64(2), setpoints={"tec": np.int64(20), "hv": np.float32(0.5)}))
+        journal.close()
+        with Record(tmp_path) as run:
+            (entry,) = run.step_records()
+            assert entry.values == (1.5, 2.0)
+            assert entry.setpoints == {"tec": 20.0, "hv": 0.5}
+            assert run.telemetry()["force"][0] == 2.0
+
+    def test_units(self, tmp_path):
+        write(tmp_path / FILE_NAME)
+        with Record(tmp_path) as run:
+            assert run.unit("force") == "N"
+            assert run.unit("started") == run.unit("finished") == run.unit("t") == "s"
+            assert run.unit("step") == "1"
+
+    def test_without_signals_and_without_steps(self, tmp_path):
+        write(tmp_path / FILE_NAME, steps=0, signals=())
+        with Record(tmp_path) as run:
+            assert len(run.steps()) == len(run.telemetry()) == 0
+            assert list(run.step_records()) == []
+
+    @pytest.mark.parametrize(
+        "name", ['a"b', "a b", "5", "Größe °C", "select", "a'b", "a;DROP TABLE steps;--", "%s", "?", "[x]", "a.b", ""]
+    )
+    def test_signals_with_odd_names(self, tmp_path, name):
+        write(tmp_path / FILE_NAME, signals=(Signal(name, "m", "odd"), SIGNALS[0]))
+        with Record(tmp_path) as run:
+            assert run.signals[0].name == name
+            np.testing.assert_array_equal(run.steps()[name], [20.0, 21.0, 22.0])
+            np.testing.assert_array_equal(run.telemetry()[name][:2], [20.0, 20.1])
+
+    @pytest.mark.parametrize("name", ["step", "t", "T", "Phase", "setpoints", "label", "tick", "finished"])
+    def test_signals_named_like_its_own_columns_are_refused(self, tmp_path, name):
+        with pytest.raises(ConfigurationError, match=name):
+            Journal(tmp_path / FILE_NAME, (Signal(name, "m", "odd"),), {})
+        assert not (tmp_path / FILE_NAME).exists()
+
+    def test_signals_that_differ_only_in_case_are_refused(self, tmp_path):
+        with pytest.raises(ConfigurationError, match="Force"):
+            Journal(tmp_path / FILE_NAME, (*SIGNALS, Signal("Force", "N", "odd")), {})
+
+    def test_texts_that_no_encoding_holds(self, tmp_path):
+        # A file name of another encoding on the command line comes as such a text.
+        meta = {"command": ["bench", "m\udce4rz.toml", "µ"]}
+        write(tmp_path / FILE_NAME, meta=meta)
+        with Record(tmp_path) as run:
+            assert run.meta["command"] == meta["command"]
+
+    @settings(max_examples=25, deadline=None)
+    @given(data=st.data())
+    def test_any_values(self, tmp_path_factory, data):
+        folder = tmp_path_factory.mktemp("any")
+        rows = data.draw(st.lists(st.tuples(st.floats(), st.floats()), max_size=5))
+        text = data.draw(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\x00")))
+        journal = Journal(folder / FILE_NAME, SIGNALS, {"text": text})
+        for step, row in enumerate(rows):
+            journal.step(record(step, *row, label=text))
+        journal.event(Event(0.0, "INFO", "note", text))
+        journal.close()
+        with Record(folder) as run:
+            np.testing.assert_array_equal([entry.values for entry in run.step_records()], rows or [])
+            assert all(entry.label == text for entry in run.step_records())
+            assert run.meta["text"] == text
+            assert run.events()[0].text == text
+
+
+class TestDurability:
+    def test_is_never_overwritten(self, tmp_path):
+        path = tmp_path / FILE_NAME
+        write(path)
+        before = digest(tmp_path)
+        with pytest.raises(ConfigurationError, match="never overwritten"):
+            Journal(path, SIGNALS, {})
+        assert digest(tmp_path) == before
+
+    def test_settings_of_the_database(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        assert journal._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        assert journal._db.execute("PRAGMA synchronous").fetchone() == (2,)
+        journal.close()
+
+    def test_survives_the_death_of_the_process(self, tmp_path):
+        child = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("write_journal.py")), str(tmp_path / FILE_NAME)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        told = []
+        with child:
+            for line in child.stdout:
+                told.append(int(line))
+                if len(told) == 200:
+                    child.kill()
+            told_after_all = told[-1]
+        assert child.returncode == -signal.SIGKILL
+        with Record(tmp_path) as run:
+            assert run.status == "unfinished"
+            steps = run.steps()["step"].tolist()
+            assert steps == list(range(len(steps)))
+            assert len(steps) >= told_after_all + 1 >= 200
+            assert len(steps) - (told_after_all + 1) <= 1
+            for entry in run.step_records():
+                assert entry.values == (entry.step * 0.1, -entry.step * 0.1)
+                assert entry.setpoints == {"tec": entry.step * 0.1}
+            assert len(run.telemetry()) >= len(steps)
+
+    def test_can_be_read_while_it_is_written(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        with Record(tmp_path) as run:
+            assert run.status == "unfinished"
+            for step in range(5):
+                journal.step(record(step, 1.0, 2.0))
+                assert len(run.steps()) == step + 1
+        journal.finish(status="completed", reason="", finished=5.0, safe_state={})
+        journal.close()
+        with Record(tmp_path) as run:
+            assert run.status == "completed"
+
+    def test_writing_goes_on_while_somebody_reads_slowly(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        for step in range(3):
+            journal.step(record(step, 1.0, 2.0))
+        with Record(tmp_path) as run:
+            rows = run.step_records()
+            next(rows)
+            journal.step(record(3, 1.0, 2.0))
+            add_model(tmp_path, "m", 1.0, {})
+            journal.finish(status="completed", reason="", finished=5.0, safe_state={})
+            journal.close()
+            assert len(list(rows)) == 2
+            assert len(run.steps()) == 4
+
+    def test_reading_changes_nothing(self, tmp_path):
+        write(tmp_path / FILE_NAME)
+        before = digest(tmp_path)
+        assert list(before) == [FILE_NAME]
+        for path in (tmp_path, tmp_path / FILE_NAME):
+            with Record(path) as run:
+                run.steps(), run.telemetry(), run.events(), list(run.step_records())
+        assert digest(tmp_path) == before
+
+    def test_reading_an_unfinished_one_changes_no_record(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        journal.step(record(0, 1.0, 2.0))
+        before = digest(tmp_path)
+        with Record(tmp_path) as run:
+            assert len(run.steps()) == 1
+        after = digest(tmp_path)
+        assert {name: after[name] for name in (FILE_NAME, FILE_NAME + "-wal")} == {
+            name: before[name] for name in (FILE_NAME, FILE_NAME + "-wal")
+        }
+        journal.close()
+
+    def test_the_same_is_written_twice(self, tmp_path):
+        for name in ("a", "b"):
+            (tmp_path / name).mkdir()
+            write(tmp_path / name / FILE_NAME)
+        assert digest(tmp_path / "a") == digest(tmp_path / "b")
+
+
+class TestUnusable:
+    def test_no_run(self, tmp_path):
+        with pytest.raises(DataError, match=f"is not a run: there is no {FILE_NAME}"):
+            Record(tmp_path)
+        with pytest.raises(DataError, match="is not a run"):
+            Record(tmp_path / "absent.sqlite")
+        with pytest.raises(DataError, match="is not a run"):
+            add_model(tmp_path, "m", 0.0, {})
+
+    @pytest.mark.parametrize("content", [b"", b"no database at all", b"SQLite format 3\x00" + b"\xff" * 5000])
+    def test_no_journal(self, tmp_path, content):
+        path = tmp_path / "x.sqlite"
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=r"x\.sqlite is not a readable journal"):
+            Record(path)
+
+    def test_another_database(self, tmp_path):
+        path = tmp_path / "x.sqlite"
+        db = sqlite3.connect(path)
+        db.execute("CREATE TABLE other (a)")
+        db.close()
+        with pytest.raises(DataError, match="is not a readable journal"):
+            Record(path)
+        with pytest.raises(DataError, match="damaged"):
+            add_model(path, "m", 0.0, {})
+
+    @pytest.mark.parametrize("version", [0, 2, "1", None])
+    def test_another_schema(self, tmp_path, version):
+        path = tmp_path / FILE_NAME
+        write(path)
+        db = sqlite3.connect(path)
+        if version is None:
+            db.execute("DELETE FROM meta WHERE key = 'schema'")
+        else:
+            db.execute("UPDATE meta SET value = ? WHERE key = 'schema'", (json.dumps(version),))
+        db.commit()
+        db.close()
+        with pytest.raises(DataError, match="schema version .*; this bench reads version 1"):
+            Record(path)
+
+    @pytest.mark.parametrize(
+        "statement",
+        [
+            "UPDATE meta SET value = '{'",
+            "UPDATE meta SET value = x'80'",
+            "UPDATE meta SET value = 7",
+            "DROP TABLE signals",
+            "DROP TABLE steps",
+            "ALTER TABLE steps DROP COLUMN force",
+            "UPDATE steps SET setpoints = 'tec'",
+            "UPDATE steps SET force = 'heavy'",
+            "UPDATE steps SET label = CAST(x'ff' AS TEXT)",
+            "DROP TABLE telemetry",
+            "DROP TABLE events",
+        ],
+    )
+    def test_a_damaged_one_raises_data_errors_only(self, tmp_path, statement):
+        path = tmp_path / FILE_NAME
+        write(path)
+        db = sqlite3.connect(path)
+        db.execute(statement)
+        db.commit()
+        db.close()
+        with pytest.raises(DataError, match=FILE_NAME), Record(path) as run:
+            run.steps(), run.telemetry(), run.events(), list(run.step_records())
+
+    @settings(max_examples=60, deadline=None)
+    @given(data=st.data())
+    def test_any_damage_raises_data_errors_only(self, tmp_path_factory, intact, data):
+        path = tmp_path_factory.mktemp("damage") / FILE_NAME
+        content = bytearray(intact)
+        start = data.draw(st.integers(0, len(content) - 1))
+        if data.draw(st.booleans()):
+            del content[start:]
+        else:
+            content[start : start + 600] = data.draw(st.binary(min_size=600, max_size=600))
+        path.write_bytes(bytes(content))
+        try:
+            with Record(path) as run:
+                run.steps(), run.telemetry(), run.events(), list(run.step_records())
+        except DataError:
+            pass
+
+
+class TestModels:
+    def test_a_model_is_kept_with_its_run(self, tmp_path):
+        write(tmp_path / FILE_NAME)
+        add_model(tmp_path, "preisach", 3.0, {"order": 20})
+        add_model(tmp_path / FILE_NAME, "preisach", 4.0, {"order": 21})
+        db = sqlite3.connect(tmp_path / FILE_NAME)
+        assert db.execute("SELECT name, t, model FROM models").fetchall() == [("preisach", 4.0, '{"order": 21}')]
+        db.close()
+        with Record(tmp_path) as run:
+            assert len(run.steps()) == 3

@@ -1,0 +1,230 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.devices import Signal
+from bench.errors import DataError
+from bench.journal import FILE_NAME, Journal, StepRecord
+from bench.measurements import Columns, check_excitation, read_columns, split_unit, write_csv
+
+
+@pytest.fixture
+def table(tmp_path):
+    def write(text, encoding="utf-8"):
+        path = tmp_path / "data.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+        return path
+
+    return write
+
+
+def wrong(path, *expected, names=("force", "length"), **keys):
+    with pytest.raises(DataError) as caught:
+        read_columns(path, names, **keys)
+    for part in (path.name, *expected):
+        assert part in str(caught.value), str(caught.value)
+    assert caught.value.exit_code == 3
+
+
+class TestRight:
+    TEXT = "time [s],force [N],length [m]\n0,1.5,0.1\n1,-2e-3, 0.2\n2,.5,0.3\n"
+
+    @pytest.mark.parametrize("names", [("force", "length"), ("force [N]", "length [m]")])
+    def test_columns_and_units(self, table, names):
+        columns = read_columns(table(self.TEXT), names)
+        np.testing.assert_array_equal(columns.values[names[0]], [1.5, -2e-3, 0.5])
+        np.testing.assert_array_equal(columns.values[names[1]], [0.1, 0.2, 0.3])
+        assert columns.units == {names[0]: "N", names[1]: "m"}
+        assert columns.values[names[0]].dtype == np.float64
+
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+    @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+    def test_however_it_was_saved(self, table, encoding, ending):
+        path = table(self.TEXT.replace("\n", ending), encoding)
+        assert len(read_columns(path, ["time"]).values["time"]) == 3
+
+    def test_quoted_cells_blank_lines_and_no_final_newline(self, table):
+        path = table('"time [s]","force, total [N]"\n"0","1"\n\n1,2\n\n2,"3"')
+        np.testing.assert_array_equal(read_columns(path, ["force, total"]).values["force, total"], [1.0, 2.0, 3.0])
+
+    def test_columns_that_are_not_asked_for_may_hold_anything(self, table):
+        path = table("force,remark\n1,good\n2,\n3,nan\n")
+        np.testing.assert_array_equal(read_columns(path, ["force"]).values["force"], [1.0, 2.0, 3.0])
+
+    def test_the_exact_header_wins(self, table):
+        path = table("force,force [kN]\n1,2\n")
+        assert read_columns(path, ["force"]).values["force"][0] == 1.0
+        assert read_columns(path, ["force [kN]"]).units == {"force [kN]": "kN"}
+
+    @pytest.mark.parametrize(
+        ("header", "expected"),
+        [
+            ("force [N]", ("force", "N")),
+            (" force [1/m] ", ("force", "1/m")),
+            ("force", ("force", "")),
+            ("a [b] [c]", ("a [b]", "c")),
+            ("a [b", ("a [b", "")),
+            ("[N]", ("[N]", "")),
+            ("", ("", "")),
+            ("force []", ("force", "")),
+        ],
+    )
+    def test_units_of_headers(self, header, expected):
+        assert split_unit(header) == expected
+
+    @settings(deadline=None)
+    @given(rows=st.lists(st.tuples(st.floats(allow_nan=False, allow_infinity=False), st.floats(-1, 1)), min_size=1))
+    def test_what_is_written_is_read_to_the_last_digit(self, tmp_path_factory, rows):
+        path = tmp_path_factory.getbasetemp() / "written.csv"
+        array = np.array(rows)
+        write_csv(path, ["a, b [m]", "c"], [array[:, 0], array[:, 1]])
+        columns = read_columns(path, ["a, b", "c"])
+        np.testing.assert_array_equal(columns.values["a, b"], array[:, 0])
+        np.testing.assert_array_equal(columns.values["c"], array[:, 1])
+
+    def test_writing_where_it_cannot(self, tmp_path):
+        with pytest.raises(DataError, match="cannot be written"):
+            write_csv(tmp_path / "absent" / "a.csv", ["a"], [[1.0]])
+
+
+class TestTrouble:
+    def test_no_file(self, tmp_path):
+        wrong(tmp_path / "absent.csv", "does not exist")
+
+    @pytest.mark.parametrize("text", ["", "\n", " , ,\n1,2,3\n", "\ufeff"])
+    def test_empty(self, table, text):
+        wrong(table(text), "is empty; expected a header line")
+
+    @pytest.mark.parametrize("text", ["force,length\n", "force,length\n\n\n"])
+    def test_header_only(self, table, text):
+        wrong(table(text), "has 0 rows of data; at least 1 are needed")
+
+    def test_too_few_rows(self, table):
+        path = table("force,length\n" + "1,2\n" * 9)
+        wrong(path, "has 9 rows of data; at least 10 are needed", at_least=10)
+        assert len(read_columns(path, ["force"], at_least=9).values["force"]) == 9
+
+    def test_a_missing_column_lists_those_that_are_there(self, table):
+        wrong(table("Force [N],length\n1,2\n"), "has no column 'force'; it has: Force [N], length")
+
+    def test_another_separator_shows_in_the_list(self, table):
+        wrong(table("force;length\n1;2\n"), "it has: force;length")
+
+    @pytest.mark.parametrize("header", ["force,force,length", "force [N],force [kN],length"])
+    def test_two_columns_of_one_name(self, table, header):
+        wrong(table(f"{header}\n1,2,3\n"), "has 2 columns 'force'")
+
+    @pytest.mark.parametrize(
+        ("cell", "expected"),
+        [
+            ("", "is empty"),
+            ("  ", "is empty"),
+            ("abc", "'abc' is not a number"),
+            ("1;5", "'1;5' is not a number"),
+            ('"1,5"', "'1,5' is not a number"),
+            ("12 N", "'12 N' is not a number"),
+            ("1_000", "'1_000' is not a number"),
+            ("0x10", "'0x10' is not a number"),
+            ("nan", "nan is not a finite number"),
+            ("NaN", "NaN is not a finite number"),
+            ("-inf", "-inf is not a finite number"),
+            ("1e999", "1e999 is not a finite number"),
+            ("#DIV/0!", "'#DIV/0!' is not a number"),
+        ],
+    )
+    def test_a_cell(self, table, cell, expected):
+        wrong(table(f"force,length\n1,2\n3,4\n5,{cell}\n7,8\n"), "row 3, column length", expected)
+
+    def test_a_short_row(self, table):
+        wrong(table("force,length\n1,2\n3\n"), "row 2, column length: is empty; expected a number")
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            b"\xff\xfef\x00o\x00r\x00c\x00e\x00",
+            b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x80\x90",
+            b"force,length\n1,\xb5\n",
+            b'force,length\n1,"2\n3,4\n',
+            b"force,length\n" + b"1" * 200_000 + b",2\n",
+        ],
+    )
+    def test_what_is_no_csv(self, table, content):
+        wrong(table(content))
+
+    def test_null_characters(self, table):
+        wrong(table(b"force,length\n1,\x00\n"))
+
+    def test_a_folder_that_is_no_run(self, tmp_path):
+        wrong(tmp_path, "is not a run")
+
+    @settings(deadline=None, max_examples=200)
+    @given(st.binary(max_size=60), st.booleans())
+    def test_any_bytes_are_read_or_are_a_data_error(self, tmp_path_factory, content, header):
+        path = tmp_path_factory.getbasetemp() / "any.csv"
+        path.write_bytes(b"a,b\n" * header + content)
+        try:
+            columns = read_columns(path, ["a", "b"])
+        except DataError as error:
+            assert "any.csv" in str(error)
+        else:
+            assert all(np.isfinite(values).all() for values in columns.values.values())
+
+
+class TestRuns:
+    @pytest.fixture
+    def run(self, tmp_path):
+        def write(*rows):
+            signals = (Signal("tec_temperature", "°C", "t"), Signal("curvature", "1/m", "c"))
+            journal = Journal(tmp_path / FILE_NAME, signals, {})
+            for step, row in enumerate(rows):
+                journal.step(StepRecord(step, step * 8.0, step * 8.0 + 8.0, "", "", True, {}, row))
+            journal.close()
+            return tmp_path
+
+        return write
+
+    def test_columns_and_units(self, run):
+        path = run((21.0, 0.0), (22.0, -3.0))
+        for source in (path, path / FILE_NAME):
+            columns = read_columns(source, ["tec_temperature", "curvature", "finished", "step"])
+            np.testing.assert_array_equal(columns.values["curvature"], [0.0, -3.0])
+            np.testing.assert_array_equal(columns.values["finished"], [8.0, 16.0])
+            assert columns.units == {"tec_temperature": "°C", "curvature": "1/m", "finished": "s", "step": "1"}
+
+    def test_a_missing_column(self, run):
+        path = run((21.0, 0.0))
+        with pytest.raises(
+            DataError, match="has no column 'force'; it has: step, started, finished, tec_temperature"
+        ):
+            read_columns(path, ["force"])
+
+    def test_a_gap(self, run):
+        path = run((21.0, 0.0), (22.0, float("nan")), (23.0, float("nan")))
+        with pytest.raises(DataError, match="step 1, column curvature: there is no value"):
+            read_columns(path, ["tec_temperature", "curvature"])
+
+    def test_too_few_steps(self, run):
+        with pytest.raises(DataError, match="has 0 rows of data"):
+            read_columns(run(), ["curvature"])
+        with pytest.raises(DataError, match="is not a run"):
+            read_columns(run.__closure__[0].cell_contents / "absent.sqlite", ["curvature"])
+
+
+class TestExcitation:
+    def columns(self, values):
+        return Columns("data.csv", {"force": np.array(values, dtype=float)}, {"force": "N"})
+
+    def test_one_that_changes_is_good(self):
+        assert check_excitation(self.columns(range(20)), "force") == []
+
+    def test_constant(self):
+        with pytest.raises(DataError, match=r"data\.csv: column force is 3 in all 20 rows; it excites nothing"):
+            check_excitation(self.columns([3.0] * 20), "force")
+
+    def test_plateaus_are_odd_though_usable(self):
+        (warning,) = check_excitation(self.columns(np.repeat([1.0, 2.0, 3.0], 10)), "force")
+        assert "column force: 27 of 30 rows repeat the row before" in warning
+
+    def test_a_few_repetitions_are_no_plateau(self):
+        assert check_excitation(self.columns(np.repeat(np.arange(10), 2)), "force") == []

@@ -1,0 +1,213 @@
+import copy
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.errors import DataError
+from bench.hysteresis import MemoryCurve, Polynomial, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
+from bench.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
+
+LEVELS = uniform_levels(30.0, 70.0, 4)
+INPUTS = np.array([21.0, 84.0, 40.0, 60.0, 55.0])
+
+
+def preisach(term=None):
+    density = np.linspace(0.1, 1.0, 10)
+    return Preisach(LEVELS, density, 3.5, term, (21.0, 84.0), "°C", "1/m")
+
+
+MODELS = {
+    "preisach": preisach(),
+    "non-monotonic": preisach(ThermalExpansion(2.8, 4.3, 30.0, 70.0, 20.0)),
+    "with a quadratic": preisach(QuadraticTerm(0.5, -0.01, 20.0)),
+    "with a line": preisach(QuadraticTerm(0.5)),
+    "polynomial": Polynomial([1.0, -2.0, 0.5], (21.0, 84.0), 7.0, "°C", "1/m"),
+}
+MEMORY = MemoryCurve((84.0, 40.0, 60.0), 55.0)
+
+
+def content(name="non-monotonic"):
+    memory = None if name == "polynomial" else MEMORY
+    file = ModelFile(name, MODELS[name], memory, {"source": "data.csv", "rows": 3400})
+    return json.loads(json.dumps(file.to_json()))
+
+
+class TestRoundTrip:
+    @pytest.mark.parametrize("name", list(MODELS))
+    def test_every_operator(self, tmp_path, name):
+        path = tmp_path / "model.json"
+        memory = None if name == "polynomial" else MEMORY
+        ModelFile(name, MODELS[name], memory, {"source": "µ.csv", "rms": 0.1 + 0.2}).save(path)
+        loaded = load_model(path)
+        assert loaded.name == name
+        assert loaded.memory == memory
+        assert loaded.provenance["source"] == "µ.csv"
+        assert loaded.provenance["rms"] == 0.1 + 0.2
+        assert loaded.provenance["bench"]
+        assert loaded.operator.input_unit == "°C"
+        assert loaded.operator.output_unit == "1/m"
+        assert loaded.operator.input_range == MODELS[name].input_range
+        np.testing.assert_array_equal(loaded.operator.evaluate(INPUTS), MODELS[name].evaluate(INPUTS))
+        assert loaded.to_json() == json.loads(path.read_text(encoding="utf-8"))
+
+    def test_saving_twice_gives_the_same_file(self, tmp_path):
+        for name in ("a.json", "b.json"):
+            ModelFile("m", MODELS["preisach"], MEMORY).save(tmp_path / name)
+        assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+        load_model(tmp_path / "a.json").save(tmp_path / "c.json")
+        assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+
+    def test_saving_where_it_cannot(self, tmp_path):
+        with pytest.raises(DataError, match="cannot be written"):
+            ModelFile("m", MODELS["preisach"], None).save(tmp_path / "absent" / "m.json")
+
+
+class TestUnusable:
+    def test_no_file(self, tmp_path):
+        with pytest.raises(DataError, match=r"absent\.json cannot be read: No such file"):
+            load_model(tmp_path / "absent.json")
+        with pytest.raises(DataError, match="cannot be read"):
+            load_model(tmp_path)
+
+    @pytest.mark.parametrize(
+        "text",
+        [b"", b"{", b"\xff\xfe", b"[1, 2", b"\x00", b'{"format": "bench-model", "version": 1' + b"0" * 5000 + b"}"],
+        ids=range(6),
+    )
+    def test_no_json(self, tmp_path, text):
+        path = tmp_path / "m.json"
+        path.write_bytes(text)
+        with pytest.raises(DataError, match=r"m\.json"):
+            load_model(path)
+
+    def test_too_deep(self, tmp_path):
+        path = tmp_path / "m.json"
+        path.write_text("[" * 100_000)
+        with pytest.raises(DataError, match=r"m\.json"):
+            load_model(path)
+
+    @pytest.mark.parametrize("document", [None, [], "x", 5, {}, {"format": "other"}])
+    def test_no_model_file(self, document):
+        with pytest.raises(DataError, match=f"m.json is not a model file: its `format` is not '{FORMAT}'"):
+            parse_model(document, "m.json")
+
+    @pytest.mark.parametrize("version", [0, 2, "1", None, [1]])
+    def test_another_version(self, version):
+        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
+            parse_model({**content(), "version": version}, "m.json")
+
+    @pytest.mark.parametrize("key", ["name", "operator", "memory", "provenance"])
+    def test_a_missing_key_is_named(self, key):
+        document = content()
+        del document[key]
+        with pytest.raises(DataError, match=f"m.json is damaged: key '{key}' is missing"):
+            parse_model(document, "m.json")
+
+    @pytest.mark.parametrize(
+        ("path", "value"),
+        [
+            (("operator",), None),
+            (("operator",), []),
+            (("operator", "type"), "magic"),
+            (("operator", "type"), ["preisach"]),
+            (("operator", "levels"), [30.0, 20.0]),
+            (("operator", "levels"), "abc"),
+            (("operator", "density"), [1.0]),
+            (("operator", "density"), [math.nan] * 10),
+            (("operator", "density"), [10**400] * 10),
+            (("operator", "bias"), "much"),
+            (("operator", "bias"), math.inf),
+            (("operator", "bias"), 10**400),
+            (("operator", "bias"), None),
+            (("operator", "input_range"), [1.0]),
+            (("operator", "input_range"), "ab"),
+            (("operator", "input_unit"), 5),
+            (("operator", "output_unit"), ["1/m"]),
+            (("operator", "reversible"), 5),
+            (("operator", "reversible"), {"type": "magic"}),
+            (("operator", "reversible", "k0"), "2.8"),
+            (("operator", "reversible", "k0"), None),
+            (("operator", "reversible", "low"), 80.0),
+            (("operator", "reversible", "extra"), 1.0),
+            (("memory",), []),
+            (("memory",), False),
+            (("memory", "extrema"), [1.0, 2.0, 3.0]),
+            (("memory", "extrema"), 5),
+            (("memory", "extrema"), "12"),
+            (("memory", "extrema"), [math.nan]),
+            (("memory", "input"), "x"),
+            (("memory", "input"), 10**400),
+            (("memory", "saturation"), 0),
+            (("provenance",), 5),
+            (("provenance",), "text"),
+        ],
+    )
+    def test_wrong_values(self, path, value):
+        document = content()
+        node = document
+        for part in path[:-1]:
+            node = node[part]
+        node[path[-1]] = value
+        with pytest.raises(DataError, match=r"m\.json"):
+            parse_model(document, "m.json")
+
+
+def _paths(node, prefix=()):
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield (*prefix, key)
+        if isinstance(value, dict | list):
+            yield from _paths(value, (*prefix, key))
+
+
+values = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(max_size=6),
+        st.sampled_from([10**400, -1, 0, 1e308]),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=4), inner, max_size=2)),
+    max_leaves=4,
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(name=st.sampled_from(list(MODELS)), data=st.data())
+def test_any_mutation_is_a_usable_model_or_a_data_error(name, data):
+    document = copy.deepcopy(content(name))
+    for _ in range(data.draw(st.integers(1, 3))):
+        known = list(_paths(document))
+        if not known:
+            break
+        *parents, key = data.draw(st.sampled_from(known))
+        node = document
+        for part in parents:
+            node = node[part]
+        action = data.draw(st.sampled_from(["replace", "replace", "delete", "add"]))
+        if action == "replace":
+            node[key] = data.draw(values)
+        elif action == "delete":
+            del node[key]
+        elif isinstance(node, dict):
+            node[data.draw(st.text(max_size=5))] = data.draw(values)
+        else:
+            node.append(data.draw(values))
+    try:
+        file = parse_model(document, "m.json")
+    except DataError as error:
+        assert "m.json" in str(error)
+        return
+    assert isinstance(file, ModelFile)
+    with np.errstate(over="ignore", invalid="ignore"):
+        outputs = file.operator.evaluate(np.linspace(*file.operator.input_range, 5))
+    assert outputs.shape == (5,)
+    assert outputs.dtype == np.float64
+    json.dumps(file.to_json())
+    assert isinstance(file.operator.input_unit, str)
+    assert isinstance(file.operator.output_unit, str)

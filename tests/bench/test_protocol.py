@@ -1,0 +1,485 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.errors import ConfigurationError
+from bench.protocol import (
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    ProtocolParameters,
+    Reading,
+    Step,
+    UntilSteady,
+    find_protocol,
+    packaged_protocols,
+    parameter,
+    plan,
+    protocol,
+)
+
+
+class Parameters(ProtocolParameters):
+    low: float = parameter(20.0, unit="°C", low=-20, high=150, help="where to begin")
+    count: int = parameter(5, unit="1", low=1, help="how many steps")
+    slow: float = parameter(1.0, unit="s", high=60, help="hold")
+    free: float = parameter(0.0, unit="V", help="anything")
+    title: str = parameter("x", unit="", help="a text")
+    needed: float = parameter(..., unit="A", low=0, high=4, help="must be said")
+
+
+@protocol(needs=("tec",))
+def ramp(parameters: Parameters) -> Messages:
+    """Climb in steps of one kelvin.
+
+    More about it.
+    """
+    yield Phase("climb")
+    for i in range(parameters.count):
+        yield Step({"tec": parameters.low + i}, Dwell(parameters.slow))
+    yield Note("there")
+
+
+class Nothing(ProtocolParameters):
+    pass
+
+
+def define(function, needs=("tec",)):
+    function.__annotations__ = {"parameters": Nothing}
+    function.__doc__ = "A protocol."
+    return protocol(needs=needs)(function)
+
+
+class TestParse:
+    def test_texts_become_numbers(self):
+        parameters = ramp.parse({"low": "-3.5", "count": "7", "needed": "1e0", "title": "12"})
+        assert parameters.low == -3.5
+        assert parameters.count == 7
+        assert parameters.needed == 1.0
+        assert parameters.title == "12"
+        assert parameters.slow == 1.0
+
+    def test_an_unknown_name_lists_the_known(self):
+        with pytest.raises(ConfigurationError) as caught:
+            ramp.parse({"lwo": "3", "needed": "1"})
+        assert "there is no parameter 'lwo'; there are: low, count, slow, free, title, needed" in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("name", "value", "allowed"),
+        [
+            ("low", "151", "-20 to 150 °C"),
+            ("low", "warm", "-20 to 150 °C"),
+            ("low", "nan", "-20 to 150 °C"),
+            ("low", "", "-20 to 150 °C"),
+            ("count", "0", "≥ 1"),
+            ("count", "2.5", "≥ 1"),
+            ("slow", "61", "≤ 60 s"),
+            ("slow", "-inf", "≤ 60 s"),
+            ("free", "nan", "any float V"),
+            ("free", "inf", "any float V"),
+            ("needed", "-1", "0 to 4 A"),
+        ],
+    )
+    def test_a_wrong_value_names_what_is_allowed(self, name, value, allowed):
+        with pytest.raises(ConfigurationError) as caught:
+            ramp.parse({"needed": "1", name: value})
+        message = str(caught.value)
+        assert f"protocol ramp: parameter {name} = {value!r} is not allowed" in message
+        assert f"allowed: {allowed}" in message
+
+    def test_a_missing_one_is_named(self):
+        with pytest.raises(ConfigurationError, match="parameter needed is missing; allowed: 0 to 4 A"):
+            ramp.parse({})
+
+    def test_all_that_is_wrong_is_said_at_once(self):
+        with pytest.raises(ConfigurationError) as caught:
+            ramp.parse({"low": "1000", "cuont": "3"})
+        assert len(str(caught.value).splitlines()) == 3
+
+    def test_parameters_cannot_be_changed(self):
+        with pytest.raises(ValueError, match="frozen"):
+            ramp.parse({"needed": "1"}).low = 3.0
+
+    @given(st.dictionaries(st.text(max_size=8), st.text(max_size=8), max_size=4))
+    def test_any_text_gives_parameters_or_a_configuration_error(self, settings):
+        try:
+            assert isinstance(ramp.parse(settings), Parameters)
+        except ConfigurationError as error:
+            assert str(error)
+
+
+class TestHelp:
+    def test_says_everything(self):
+        entries = {entry.name: entry for entry in ramp.help()}
+        assert list(entries) == ["low", "count", "slow", "free", "title", "needed"]
+        low = entries["low"]
+        assert (low.default, low.unit, low.allowed, low.text) == ("20.0", "°C", "-20 to 150", "where to begin")
+        assert entries["count"].allowed == "≥ 1"
+        assert entries["slow"].allowed == "≤ 60"
+        assert entries["needed"].default == "must be given"
+
+    def test_name_and_summary(self):
+        assert ramp.name == "ramp"
+        assert ramp.summary == "Climb in steps of one kelvin"
+        assert ramp.description.endswith("More about it.")
+        assert ramp.needs == ("tec",)
+
+
+class TestDefinition:
+    def test_underscores_become_dashes(self):
+        def slow_ramp(parameters):
+            yield Note("x")
+
+        assert define(slow_ramp).name == "slow-ramp"
+
+    def test_wrong_forms_are_refused(self):
+        def untyped(parameters):
+            """Do."""
+            yield Note("x")
+
+        def silent(parameters: Nothing) -> Messages:
+            yield Note("x")
+
+        def two(parameters: Nothing, more: Nothing) -> Messages:
+            """Do."""
+            yield Note("x")
+
+        def extra(parameters: Nothing, more) -> Messages:
+            """Do."""
+            yield Note("x")
+
+        def no_generator(parameters: Nothing) -> Messages:
+            """Do."""
+
+        for function in (untyped, silent, two, extra, no_generator):
+            with pytest.raises(TypeError, match=function.__name__):
+                protocol(needs=())(function)
+
+    def test_needs_is_a_sequence_of_names_not_a_text(self):
+        def soak(parameters):
+            yield Note("x")
+
+        with pytest.raises(TypeError, match="needs"):
+            define(soak, needs="tec")
+
+
+class TestMessages:
+    @pytest.mark.parametrize("seconds", [-1.0, math.nan, math.inf])
+    def test_dwell_refuses(self, seconds):
+        with pytest.raises(ValueError, match="finite number ≥ 0"):
+            Dwell(seconds)
+
+    @pytest.mark.parametrize(
+        "keys",
+        [
+            {"drift": 0.0},
+            {"drift": math.nan},
+            {"noise": 0.0},
+            {"noise": math.nan},
+            {"timeout": 0.0},
+            {"timeout": math.nan},
+            {"minimum": -1.0},
+            {"minimum": 10.0, "timeout": 10.0},
+        ],
+    )
+    def test_until_steady_refuses(self, keys):
+        with pytest.raises(ValueError, match="UntilSteady"):
+            UntilSteady("a", **{"drift": 1.0, "noise": 1.0, "timeout": 10.0, **keys})
+
+    def test_reading_by_signal(self):
+        assert Reading(0, 1.0, True, {"a": 3.0})["a"] == 3.0
+
+
+class TestPlan:
+    def test_counts_and_sums(self):
+        expected = plan(ramp, ramp.parse({"needed": "1", "slow": "2.5"}))
+        assert expected.steps == 5
+        assert expected.seconds == expected.at_most == 12.5
+        assert expected.extremes == {"tec": (20.0, 24.0)}
+
+    def test_until_steady_counts_between_minimum_and_timeout(self):
+        def settle(parameters):
+            yield Step({}, UntilSteady("a", drift=1.0, noise=1.0, timeout=300.0, minimum=8.0))
+            yield Step({}, Dwell(2.0))
+
+        expected = plan(define(settle), Nothing())
+        assert (expected.seconds, expected.at_most) == (10.0, 302.0)
+
+    def test_readings_echo_the_setpoints(self):
+        seen = []
+
+        def chase(parameters):
+            reading = yield Step({"tec": 40.0, "supply": 5.0}, Dwell(1.0))
+            seen.extend(reading[name] for name in ("tec_setpoint", "tec_temperature", "supply_voltage", "curvature"))
+            while reading["tec_temperature"] < 43.0:
+                reading = yield Step({"tec": reading["tec_setpoint"] + 1.0}, Dwell(1.0))
+
+        assert plan(define(chase), Nothing()).extremes["tec"] == (40.0, 43.0)
+        assert seen == [40.0, 40.0, 5.0, 0.0]
+
+    def test_devices_whose_names_have_underscores_echo_too(self):
+        seen = []
+
+        def two(parameters):
+            reading = yield Step({"tec": 30.0, "tec_two": 40.0}, Dwell(1.0))
+            seen.extend((reading["tec_two_temperature"], reading["tec_temperature"]))
+
+        plan(define(two), Nothing())
+        assert seen == [40.0, 30.0]
+
+    def test_nothing_to_do(self):
+        def idle(parameters):
+            yield Phase("none")
+
+        assert plan(define(idle), Nothing()).steps == 0
+
+    def test_a_protocol_that_never_ends_is_refused(self):
+        def endless(parameters):
+            while True:
+                yield Step({}, Dwell(0.0))
+
+        with pytest.raises(ConfigurationError, match="endless does not end within 1000000 steps"):
+            plan(define(endless), Nothing())
+
+    @pytest.mark.timeout(60)
+    def test_a_protocol_that_talks_for_ever_is_refused(self):
+        def chatter(parameters):
+            while True:
+                yield Note("still here")
+
+        with pytest.raises(ConfigurationError, match="chatter does not end"):
+            plan(define(chatter), Nothing())
+
+    def test_parameters_that_do_not_fit_together(self):
+        def broken(parameters):
+            raise ValueError("settling must be shorter than duration")
+            yield
+
+        with pytest.raises(ConfigurationError, match="protocol broken: settling must be shorter"):
+            plan(define(broken), Nothing())
+
+    @pytest.mark.parametrize("nonsense", [None, 42, "tec", {"tec": 20.0}, Step])
+    def test_nonsense_is_found_before_anything_moves(self, nonsense):
+        def odd(parameters):
+            yield Step({"tec": 20.0}, Dwell(1.0))
+            yield nonsense
+
+        with pytest.raises(ConfigurationError, match="protocol odd yielded"):
+            plan(define(odd), Nothing())
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf, "warm", None])
+    def test_a_setpoint_that_is_no_number_is_found_before_anything_moves(self, value):
+        def odd(parameters):
+            yield Step({"tec": 20.0}, Dwell(1.0))
+            yield Step({"tec": value}, Dwell(1.0))
+
+        with pytest.raises(ConfigurationError, match="protocol odd .*tec"):
+            plan(define(odd), Nothing())
+
+
+class TestFiles:
+    GOOD = """
+from bench.protocol import Dwell, Messages, ProtocolParameters, Step, parameter, protocol
+
+class Parameters(ProtocolParameters):
+    target: float = parameter(60.0, unit="°C", low=0, high=90, help="where")
+
+@protocol(needs=("tec",))
+def soak(parameters: Parameters) -> Messages:
+    \"\"\"Hold.\"\"\"
+    yield Step({"tec": parameters.target}, Dwell(1.0))
+"""
+    SECOND = GOOD + GOOD.split("@", 1)[1].replace("soak", "other").join(("@", ""))
+
+    def write(self, tmp_path, text, name="mine.py"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return str(path)
+
+    def test_one_protocol(self, tmp_path):
+        definition = find_protocol(self.write(tmp_path, self.GOOD))
+        assert definition.name == "soak"
+        assert plan(definition, definition.parse({})).extremes == {"tec": (60.0, 60.0)}
+
+    def test_by_name(self, tmp_path):
+        path = self.write(tmp_path, self.SECOND)
+        assert find_protocol(f"{path}:other").name == "other"
+        with pytest.raises(ConfigurationError, match="choose one by .*mine.py:NAME; it has: soak, other"):
+            find_protocol(path)
+        with pytest.raises(ConfigurationError, match="has no protocol 'third'; it has: soak, other"):
+            find_protocol(f"{path}:third")
+
+    def test_a_folder_with_a_colon(self, tmp_path):
+        folder = tmp_path / "a:b"
+        folder.mkdir()
+        path = self.write(folder, self.GOOD)
+        assert find_protocol(path).name == "soak"
+        assert find_protocol(f"{path}:soak").name == "soak"
+
+    def test_two_files_of_one_name(self, tmp_path):
+        for folder, target in (("a", "30.0"), ("b", "40.0")):
+            (tmp_path / folder).mkdir()
+            path = self.write(tmp_path / folder, self.GOOD.replace("60.0", target))
+            definition = find_protocol(path)
+            assert definition.parse({}).target == float(target)
+
+    def test_imported_protocols_do_not_count(self, tmp_path):
+        text = "from protocols.creep import creep\n" + self.GOOD
+        assert find_protocol(self.write(tmp_path, text)).name == "soak"
+
+    def test_none_within(self, tmp_path):
+        with pytest.raises(ConfigurationError, match="it has: none"):
+            find_protocol(self.write(tmp_path, "x = 1\n"))
+
+    def test_no_file(self, tmp_path):
+        with pytest.raises(ConfigurationError, match="does not exist"):
+            find_protocol(str(tmp_path / "absent.py"))
+        (tmp_path / "folder.py").mkdir()
+        with pytest.raises(ConfigurationError, match="folder.py"):
+            find_protocol(str(tmp_path / "folder.py"))
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "def broken(:\n",
+            "import no_such_module_anywhere\n",
+            "undefined_name\n",
+            "1 / 0\n",
+            "raise ValueError('no')\n",
+            "import sys\nsys.exit(3)\n",
+            "{}['key']\n",
+            "import os\nos.no_such_attribute\n",
+            "raise RuntimeError\n",
+            "x = '\x00'\n",
+            GOOD.replace('"""Hold."""', ""),
+            GOOD.replace("low=0", "low='a'"),
+            GOOD.replace("Parameters) -> Messages", "int) -> Messages"),
+            GOOD.replace(
+                "class Parameters(ProtocolParameters):", "class Parameters(ProtocolParameters):\n    y: object()\n"
+            ),
+        ],
+    )
+    def test_every_kind_of_error_names_the_file(self, tmp_path, text):
+        with pytest.raises(ConfigurationError, match="mine.py"):
+            find_protocol(self.write(tmp_path, text))
+
+    def test_not_text(self, tmp_path):
+        path = tmp_path / "mine.py"
+        path.write_bytes(b"\xff\xfe\x00\x01")
+        with pytest.raises(ConfigurationError, match="mine.py"):
+            find_protocol(str(path))
+
+
+class TestPackaged:
+    def test_names(self):
+        protocols = packaged_protocols()
+        assert list(protocols) == sorted(protocols)
+        assert {"creep", "damped-oscillation", "random-validation"} <= set(protocols)
+        for definition in protocols.values():
+            assert definition.summary
+            assert all(entry.text and not entry.text.endswith(".") for entry in definition.help())
+
+    def test_an_unknown_name_lists_the_known(self):
+        with pytest.raises(ConfigurationError) as caught:
+            find_protocol("damped-osculation")
+        assert "there is no protocol 'damped-osculation'" in str(caught.value)
+        assert "damped-oscillation" in str(caught.value)
+        assert "path/to/file.py" in str(caught.value)
+
+    def test_two_of_one_name_are_refused(self, tmp_path, monkeypatch):
+        package = tmp_path / "twin_protocols"
+        package.mkdir()
+        (package / "__init__.py").write_text("")
+        for module in ("one", "two"):
+            (package / f"{module}.py").write_text(TestFiles.GOOD, encoding="utf-8")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setattr("bench.protocol.PROTOCOL_PACKAGE", "twin_protocols")
+        with pytest.raises(ConfigurationError, match="two protocols of the package are named soak"):
+            packaged_protocols()
+
+    def test_damped_oscillation(self):
+        definition = find_protocol("damped-oscillation")
+        expected = plan(definition, definition.parse({}))
+        assert 3300 <= expected.steps <= 3500
+        assert expected.extremes["tec"] == (21.0, 84.0)
+        assert expected.seconds == pytest.approx(8.0 * expected.steps)
+        assert expected.at_most == pytest.approx(expected.seconds + 292.0)
+
+    def test_random_validation(self):
+        definition = find_protocol("random-validation")
+        expected = plan(definition, definition.parse({}))
+        assert expected.steps == 600
+        low, high = expected.extremes["tec"]
+        assert 21.0 <= low < 40.0
+        assert 72.0 < high <= 84.0
+
+    def test_random_validation_is_the_same_each_time(self):
+        definition = find_protocol("random-validation")
+        parameters = definition.parse({"count": "50"})
+
+        def setpoints():
+            messages, got = definition.generator(parameters), []
+            try:
+                message = next(messages)
+                while True:
+                    got.append(message)
+                    message = (
+                        messages.send(Reading(0, 0.0, True, {})) if isinstance(message, Step) else next(messages)
+                    )
+            except StopIteration:
+                return got
+
+        assert setpoints() == setpoints()
+        assert (
+            plan(definition, definition.parse({"sequence_seed": "2"})).extremes
+            != plan(definition, definition.parse({})).extremes
+        )
+
+    def test_creep(self):
+        definition = find_protocol("creep")
+        expected = plan(definition, definition.parse({}))
+        assert expected.steps == 1 + 2 * (1 + 120)
+        assert expected.extremes["tec"] == (25.0, 80.0)
+
+    @pytest.mark.parametrize("settling", ["60", "3600"])
+    def test_creep_that_settles_too_long(self, settling):
+        definition = find_protocol("creep")
+        with pytest.raises(ConfigurationError, match="settling must be shorter than duration"):
+            plan(definition, definition.parse({"settling": settling}))
+
+    def test_creep_that_settles_almost_as_long_as_it_watches(self):
+        definition = find_protocol("creep")
+        parameters = definition.parse({"settling": "59.9"})
+        try:
+            assert plan(definition, parameters).steps == 243
+        except ConfigurationError as error:
+            assert "settling" in str(error)
+
+    @pytest.mark.parametrize("name", ["creep", "damped-oscillation", "random-validation"])
+    @given(data=st.data())
+    def test_whatever_is_allowed_has_a_plan_or_a_configuration_error(self, name, data):
+        definition = find_protocol(name)
+        settings = {}
+        for field, info in definition.parameters.model_fields.items():
+            low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), 0)
+            high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), 100)
+            if field in ("count", "half_cycles"):
+                settings[field] = str(data.draw(st.integers(low, 20), label=field))
+            elif field in ("increment", "interval", "dwell"):
+                settings[field] = str(data.draw(st.floats(0.5, high), label=field))
+            elif field == "duration":
+                settings[field] = str(data.draw(st.floats(low, 100.0), label=field))
+            elif info.annotation is int:
+                settings[field] = str(data.draw(st.integers(low, high), label=field))
+            else:
+                settings[field] = str(data.draw(st.floats(low, high), label=field))
+        try:
+            expected = plan(definition, definition.parse(settings))
+        except ConfigurationError as error:
+            assert str(error).startswith(f"protocol {name}")
+        else:
+            for low, high in expected.extremes.values():
+                assert -20.0 <= low <= high <= 150.0

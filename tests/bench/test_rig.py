@@ -1,0 +1,504 @@
+import tomllib
+
+import pytest
+from heater_laboratory import CLOSED, RIG, HeaterLaboratory, HeaterTEC
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.clock import VirtualClock
+from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.rig import Rig, load_rig, packaged_rigs
+
+SPOT = """
+[devices.spot]
+driver = "heater_laboratory:Spot"
+port = "emulated://spot"
+"""
+DERIVED = """
+[derived.curvature]
+kind = "cantilever-curvature"
+source = "spot_position"
+length = 300e-6
+"""
+DASHBOARD = """
+[dashboard]
+input = "tec_temperature"
+output = "probe_temperature"
+input_range = [0.0, 100.0]
+output_range = [0.0, 100.0]
+plane = [30.0, 70.0]
+"""
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    CLOSED.clear()
+    yield
+    assert HeaterLaboratory.opened == 0
+
+
+def wrong(path, *expected, overrides=None):
+    """Load and connect a rig that is wrong; the message has all that is expected, and no traceback behind it."""
+    with pytest.raises(ConfigurationError) as caught, Rig(load_rig(path, overrides), VirtualClock(), 1):
+        pass
+    message = str(caught.value)
+    for part in (*expected, "heater"):
+        assert part in message, message
+    assert caught.value.exit_code == 2
+    return message
+
+
+class TestRight:
+    def test_loads_and_connects(self, rig_file):
+        file = load_rig(rig_file())
+        assert file.name == "heater"
+        assert file.emulated
+        assert [entry.name for entry in file.devices] == ["tec", "probe"]
+        assert file.devices[0].driver is HeaterTEC
+        with Rig(file, VirtualClock(), 1) as rig:
+            assert [signal.name for signal in rig.signals] == [
+                "tec_setpoint",
+                "tec_temperature",
+                "tec_sink_temperature",
+                "tec_current",
+                "tec_voltage",
+                "probe_temperature",
+            ]
+            assert list(rig.actuators) == ["tec"]
+            assert set(rig.measure()) == set(rig.glance()) == {signal.name for signal in rig.signals}
+            assert rig.devices["tec"].calls == []
+        assert CLOSED == ["probe", "tec"]
+
+    def test_the_text_is_kept_as_it_is(self, rig_file):
+        path = rig_file(append="# µ\n")
+        assert load_rig(path).text == RIG + "# µ\n"
+
+    def test_a_byte_order_mark_does_no_harm(self, tmp_path):
+        path = tmp_path / "heater.toml"
+        path.write_text(RIG, encoding="utf-8-sig")
+        assert load_rig(str(path)).name == "heater"
+
+    def test_overrides(self, rig_file):
+        path = rig_file()
+        file = load_rig(
+            path,
+            {
+                "telemetry.period": "2",
+                "rig.title": "another",
+                "devices.tec.temperature_limits": "[0, 50]",
+                "emulation.noise": "0",
+            },
+        )
+        assert file.telemetry.period == 2.0
+        assert file.rig.title == "another"
+        assert file.devices[0].settings.temperature_limits == (0.0, 50.0)
+        assert file.laboratory_settings.noise == 0.0
+        assert load_rig(path).rig.title == "a heated plate"
+
+    def test_packaged(self):
+        assert "vo2" in packaged_rigs()
+        assert load_rig("vo2").name == "vo2"
+
+    def test_dashboard(self, rig_file):
+        assert load_rig(rig_file(append=DASHBOARD)).dashboard.levels == 20
+
+
+class TestFile:
+    def test_none(self, tmp_path):
+        with pytest.raises(ConfigurationError, match="there is no rig 'vo3'; there are: .*vo2.*path/to/rig.toml"):
+            load_rig("vo3")
+        wrong(str(tmp_path / "heater.toml"), "cannot be read")
+
+    def test_a_folder(self, tmp_path):
+        (tmp_path / "heater.toml").mkdir()
+        wrong(str(tmp_path / "heater.toml"), "cannot be read")
+
+    def test_not_toml(self, rig_file):
+        wrong(rig_file(append="\nperiod = \n"), "not valid TOML", "line")
+
+    def test_a_table_twice(self, rig_file):
+        wrong(rig_file(append="\n[rig]\ntitle = 'x'\n"), "not valid TOML")
+
+    def test_not_text(self, tmp_path):
+        path = tmp_path / "heater.toml"
+        path.write_bytes(RIG.encode("utf-16"))
+        wrong(str(path), "cannot be read", "utf-8")
+
+    def test_empty(self, tmp_path):
+        path = tmp_path / "heater.toml"
+        path.write_text("")
+        wrong(str(path), "rig: is missing", "devices: is missing")
+
+
+class TestUnknownKeys:
+    @pytest.mark.parametrize(
+        ("old", "new", "key", "allowed"),
+        [
+            (
+                "[rig]",
+                "titel = 1\n[rig]",
+                "titel",
+                "rig, devices, derived, interlocks, telemetry, dashboard, emulation",
+            ),
+            ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
+            ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title, description"),
+            (
+                "temperature_limits",
+                "temperature-limits = 3\ntemperature_limits",
+                "devices.tec.temperature-limits",
+                "witness",
+            ),
+            ('port = "emulated://heater"', 'prot = "x"\nport = "emulated://heater"', "devices.tec.prot", "port"),
+            ("high = 90.0", "high = 90.0\nhihg = 3.0", "interlocks.0.hihg", "signal, low, high, seconds"),
+            ("period = 0.5", "period = 0.5\nperoid = 1", "telemetry.peroid", "period"),
+            ("noise = 0.002", "noise = 0.002\nnoize = 1", "emulation.noize", "noise, time_constant"),
+        ],
+    )
+    def test_at_each_level(self, rig_file, old, new, key, allowed):
+        message = wrong(rig_file((old, new)), f"{key}: there is no such key", "allowed are:", allowed)
+        assert len(message.splitlines()) == 1
+
+    def test_in_the_dashboard(self, rig_file):
+        wrong(rig_file(append=DASHBOARD + "level = 3\n"), "dashboard.level: there is no such key", "levels")
+
+    def test_in_a_derived_signal(self, rig_file):
+        wrong(
+            rig_file(append=DERIVED.replace("length", "lenght")),
+            "derived.curvature.lenght: there is no such key",
+            "allowed are: kind, source, length, residual_curvature",
+            "derived.curvature.length: is missing (length of the beam, m)",
+        )
+
+    def test_in_a_derived_signal_with_a_dash(self, rig_file):
+        wrong(
+            rig_file(append=DERIVED.replace("[derived.curvature]", "[derived.my-curve]") + "x = 1\n"),
+            "derived.my-curve.x",
+        )
+
+
+class TestWrongValues:
+    @pytest.mark.parametrize(
+        ("old", "new", "expected"),
+        [
+            ('"a heated plate"', "5", ("rig.title = 5", "string")),
+            ('"a heated plate"', '""', ("rig.title = ''", "at least 1")),
+            ("period = 0.5", "period = 0.0", ("telemetry.period = 0.0", "0.01")),
+            ("period = 0.5", "period = 61", ("telemetry.period = 61", "60")),
+            ("period = 0.5", "period = 'often'", ("telemetry.period = 'often'", "number")),
+            ("period = 0.5", "period = nan", ("telemetry.period = nan",)),
+            ("high = 90.0", "high = 90.0\nlow = 95.0", ("interlocks.0", "low must be below high", "95", "90")),
+            ("high = 90.0", "high = 90.0\nseconds = -1", ("interlocks.0.seconds = -1", "greater than or equal to 0")),
+            ("high = 90.0", "", ("interlocks.0", "low or high")),
+            ("high = 90.0", "high = nan", ("interlocks.0",)),
+            ("[10.0, 95.0]", "[10.0]", ("devices.tec.temperature_limits",)),
+            ("[10.0, 95.0]", "[10.0, nan]", ("devices.tec.temperature_limits", "nan")),
+            ("[10.0, 95.0]", "[10.0, inf]", ("devices.tec.temperature_limits", "inf")),
+            ("[10.0, 95.0]", "'warm'", ("devices.tec.temperature_limits = 'warm'", "allowed set-points, °C")),
+            (
+                "noise = 0.002",
+                "noise = 2",
+                ("emulation.noise = 2", "less than or equal to 1", "noise of one reading"),
+            ),
+            ("noise = 0.002", "noise = nan", ("emulation.noise = nan",)),
+            (
+                "temperature_limits = [10.0, 95.0]",
+                "",
+                ("devices.tec.temperature_limits: is missing", "allowed set-points"),
+            ),
+            ('driver = "heater_laboratory:HeaterTEC"', "", ("devices.tec.driver", "expected module:class")),
+            ('"heater_laboratory:HeaterTEC"', "5", ("devices.tec.driver = 5", "expected module:class")),
+            (
+                '"heater_laboratory:HeaterTEC"',
+                '"HeaterTEC"',
+                ("devices.tec.driver = 'HeaterTEC'", "expected module:class"),
+            ),
+            (
+                '"heater_laboratory:HeaterTEC"',
+                '"no_such:X"',
+                ("devices.tec.driver = 'no_such:X'", "cannot be loaded"),
+            ),
+            ('"heater_laboratory:HeaterTEC"', '":X"', ("devices.tec.driver = ':X'",)),
+            ('"heater_laboratory:HeaterTEC"', '".relative:X"', ("devices.tec.driver = '.relative:X'",)),
+            ('"heater_laboratory:HeaterTEC"', '"a..b:X"', ("devices.tec.driver = 'a..b:X'",)),
+            ('"heater_laboratory:HeaterTEC"', '"heater_laboratory:Gone"', ("has no Gone",)),
+            ('"heater_laboratory:HeaterTEC"', '"heater_laboratory:RIG"', ("devices.tec.driver", "not a class")),
+            ('"heater_laboratory:HeaterTEC"', '"heater_laboratory:NoSettings"', ("devices.tec.driver", "Settings")),
+            (
+                '"heater_laboratory:HeaterTEC"',
+                '"heater_laboratory:NoDriver"',
+                ("devices.tec.driver", "NoDriver plays none of the roles"),
+            ),
+            (
+                '"heater_laboratory:HeaterTEC"',
+                '"heater_laboratory:HeaterLaboratory"',
+                ("devices.tec.driver", "HeaterLaboratory"),
+            ),
+            (
+                '"heater_laboratory:HeaterLaboratory"',
+                '"heater_laboratory:HeaterTEC"',
+                ("emulation.laboratory", "HeaterTEC"),
+            ),
+            ('laboratory = "heater_laboratory:HeaterLaboratory"', "", ("emulation.laboratory",)),
+            ('"heater_laboratory:HeaterLaboratory"', '"no_such:X"', ("emulation.laboratory = 'no_such:X'",)),
+            ('"heater_laboratory:HeaterLaboratory"', '".x:X"', ("emulation.laboratory = '.x:X'",)),
+            (
+                '"emulated://heater"',
+                '"emulated://cooler"',
+                ("devices.tec.port = 'emulated://cooler'", "emulated://heater"),
+            ),
+            (
+                '"probe_temperature"',
+                '"prob_temperature"',
+                ("interlocks.0.signal = 'prob_temperature'", "tec_current"),
+            ),
+        ],
+    )
+    def test_names_file_key_value_and_what_is_allowed(self, rig_file, old, new, expected):
+        wrong(rig_file((old, new)), *expected)
+
+    @pytest.mark.parametrize(
+        "code", ["1 / 0", "raise RuntimeError('no')", "def broken(:", "import no_such_module", "undefined"]
+    )
+    def test_a_driver_whose_module_fails(self, rig_file, tmp_path, monkeypatch, code):
+        (tmp_path / "failing_driver.py").write_text(code)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        wrong(
+            rig_file(("heater_laboratory:HeaterTEC", "failing_driver:X")), "devices.tec.driver = 'failing_driver:X'"
+        )
+
+    def test_an_emulated_port_without_a_laboratory(self, rig_file):
+        path = rig_file(('[emulation]\nlaboratory = "heater_laboratory:HeaterLaboratory"\nnoise = 0.002', ""))
+        wrong(path, "devices.tec.port = 'emulated://heater'", "none: the rig has no [emulation]")
+
+    def test_no_devices(self, tmp_path):
+        path = tmp_path / "heater.toml"
+        path.write_text("[rig]\ntitle = 'x'\n[devices]\n")
+        wrong(str(path), "devices", "at least 1")
+
+    @pytest.mark.parametrize(
+        "table", ["rig", "devices", "telemetry", "emulation", "interlocks", "derived", "dashboard"]
+    )
+    def test_a_table_that_is_none(self, tmp_path, table):
+        path = tmp_path / "heater.toml"
+        text = f"{table} = 5\n" + ("" if table == "rig" else "[rig]\ntitle = 'x'\n")
+        path.write_text(text + ("" if table == "devices" else "[devices.a]\ndriver = 'a:b'\n"))
+        wrong(str(path), f"{table} = 5")
+
+    def test_all_wrong_devices_are_named_at_once(self, rig_file):
+        message = wrong(
+            rig_file(("heater_laboratory:HeaterTEC", "no_such:A"), ("heater_laboratory:Thermometer", "no_such:B"))
+        )
+        assert len(message.splitlines()) == 2
+
+    @pytest.mark.parametrize(
+        ("key", "value"),
+        [
+            ("input_range", "[1.0, 1.0]"),
+            ("input_range", "[2.0, 1.0]"),
+            ("output_range", "[nan, 1.0]"),
+            ("plane", "[0.0, inf]"),
+            ("plane", "[70.0, 30.0]"),
+            ("levels", "1"),
+        ],
+    )
+    def test_dashboard_ranges(self, rig_file, key, value):
+        lines = [line for line in DASHBOARD.splitlines() if not line.startswith(key)]
+        wrong(rig_file(append="\n".join([*lines, f"{key} = {value}\n"])), f"dashboard.{key}")
+
+    def test_dashboard_signals(self, rig_file):
+        wrong(
+            rig_file(append=DASHBOARD.replace('"tec_temperature"', '"tec"')),
+            "dashboard.input = 'tec'",
+            "tec_setpoint",
+        )
+
+
+class TestDerived:
+    def test_is_computed(self, rig_file):
+        with Rig(load_rig(rig_file(append=SPOT + DERIVED)), VirtualClock(), 1) as rig:
+            assert rig.signals[-1].name == "curvature"
+            rig.devices["tec"].set(82.0)
+            rig.clock.sleep(100.0)
+            values = rig.measure()
+            assert values["spot_position"] == pytest.approx(60e-6, abs=0.05e-6)
+            assert values["curvature"] == pytest.approx(1350.0, abs=5.0)
+
+    def test_of_a_derived_one_that_comes_before(self, rig_file):
+        second = DERIVED.replace("derived.curvature", "derived.again").replace("spot_position", "curvature")
+        wrong(rig_file(append=SPOT + DERIVED + second), "derived.again.source = 'curvature'", "1/m")
+
+    def test_an_unknown_source(self, rig_file):
+        wrong(rig_file(append=DERIVED), "derived.curvature.source = 'spot_position'", "probe_temperature")
+
+    def test_of_itself(self, rig_file):
+        wrong(
+            rig_file(append=DERIVED.replace("spot_position", "curvature")), "derived.curvature.source = 'curvature'"
+        )
+
+    def test_of_a_derived_one_that_comes_later(self, rig_file):
+        later = DERIVED.replace("derived.curvature", "derived.later").replace("spot_position", "probe_temperature")
+        wrong(
+            rig_file(append=DERIVED.replace("spot_position", "later") + later), "derived.curvature.source = 'later'"
+        )
+
+    def test_of_a_signal_of_another_unit(self, rig_file):
+        wrong(
+            rig_file(append=DERIVED.replace("spot_position", "probe_temperature")),
+            "derived.curvature.source = 'probe_temperature'",
+            "°C",
+        )
+
+    def test_of_an_unknown_kind(self, rig_file):
+        wrong(rig_file(append=DERIVED.replace("cantilever-curvature", "magic")), "derived.curvature.kind = 'magic'")
+
+    def test_too_bent_at_rest(self, rig_file):
+        wrong(rig_file(append=DERIVED + "residual_curvature = 9000\n"), "derived.curvature", "7770.4 1/m")
+
+
+class TestNames:
+    def test_two_signals_of_one_name(self, rig_file):
+        more = '\n[devices.tec_sink]\ndriver = "heater_laboratory:Thermometer"\nport = "emulated://thermometer"\n'
+        wrong(rig_file(append=more), "tec_sink_temperature")
+
+    @pytest.mark.parametrize("name", ["Probe", "probe"])
+    def test_case_does_not_make_a_difference(self, rig_file, name):
+        more = (
+            f'\n[devices.{name.upper()}]\ndriver = "heater_laboratory:Thermometer"\nport = "emulated://thermometer"\n'
+        )
+        wrong(rig_file(append=more), "PROBE_temperature")
+
+
+class TestOverrides:
+    @pytest.mark.parametrize(
+        ("key", "expected"),
+        [
+            ("devices.laser.port", "there is no table 'devices.laser' in which 'port' could be set"),
+            ("dashboard.levels", "there is no table 'dashboard'"),
+            ("rig.title.x", "there is no table 'rig.title'"),
+            ("interlocks.0.high", "there is no table 'interlocks.0'"),
+            ("devices.tec.prot", "devices.tec.prot: there is no such key"),
+            ("telemetry.period", "telemetry.period = 'soon'"),
+            ("telemetry", "telemetry = 'soon'"),
+            ("", "there is no such key"),
+            (".", "there is no table"),
+        ],
+    )
+    def test_of_what_is_not_there(self, rig_file, key, expected):
+        wrong(rig_file(), expected, overrides={key: "soon"})
+
+    @given(st.text(max_size=20), st.text(max_size=20))
+    def test_any_text(self, tmp_path_factory, key, value):
+        path = tmp_path_factory.getbasetemp() / "heater.toml"
+        path.write_text(RIG, encoding="utf-8")
+        try:
+            load_rig(str(path), {key: value, "devices.tec.port": value})
+        except ConfigurationError as error:
+            assert str(error)
+
+
+class TestConnecting:
+    def test_those_connected_before_are_closed_again(self, rig_file):
+        path = rig_file(
+            ('port = "emulated://thermometer"', 'port = "emulated://thermometer"\nconnect_error = "no answer"')
+        )
+        with pytest.raises(DeviceConnectionError, match="probe: no answer"):
+            Rig(load_rig(path), VirtualClock(), 1)
+        assert CLOSED == ["tec"]
+
+    def test_one_that_fails_to_close_keeps_none_from_being_closed(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            for device in rig.devices.values():
+                device.close_error = OSError(5, "Input/output error")
+        assert CLOSED == ["probe", "tec"]
+
+    def test_needs(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            rig.check_needs("x", ["tec", "probe_temperature"])
+            with pytest.raises(
+                ConfigurationError, match="protocol x needs curvature, which rig heater does not have"
+            ):
+                rig.check_needs("x", ["tec", "curvature"])
+
+
+def _paths(node, prefix=()):
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield (*prefix, key)
+        if isinstance(value, dict | list):
+            yield from _paths(value, (*prefix, key))
+
+
+def _toml(value):
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in value)
+        return f'"{escaped}"'
+    return repr(value)
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=10)
+values = st.one_of(
+    texts,
+    st.integers(-(2**63), 2**63 - 1),
+    st.floats(),
+    st.booleans(),
+    st.lists(st.floats(), max_size=3),
+    st.dictionaries(texts, st.integers(0, 3), max_size=2),
+    st.sampled_from(
+        ["emulated://heater", "heater_laboratory:HeaterTEC", "os:getcwd", "tec_temperature", "json:JSONDecoder"]
+    ),
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(data=st.data())
+def test_any_mutation_loads_or_is_a_configuration_error(tmp_path_factory, data):
+    content = tomllib.loads(RIG + SPOT + DASHBOARD + DERIVED)
+    for _ in range(data.draw(st.integers(1, 3))):
+        known = list(_paths(content))
+        if not known:
+            break
+        *parents, key = data.draw(st.sampled_from(known))
+        node = content
+        for part in parents:
+            node = node[part]
+        action = data.draw(st.sampled_from(["delete", "rename", "replace", "add"]))
+        if action == "delete":
+            del node[key]
+        elif action == "replace" or not isinstance(node, dict):
+            node[key] = data.draw(values)
+        elif action == "rename":
+            node[data.draw(texts)] = node.pop(key)
+        else:
+            node[data.draw(texts)] = data.draw(values)
+    path = tmp_path_factory.getbasetemp() / "mutated.toml"
+    path.write_text("\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in content.items()), encoding="utf-8")
+    try:
+        with Rig(load_rig(str(path)), VirtualClock(), 1) as rig:
+            assert rig.signals
+    except ConfigurationError as error:
+        assert "mutated.toml" in str(error)
+    except DeviceConnectionError:
+        pass  # a port that is no emulated one any more
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_any_damage_to_the_text_is_a_configuration_error(tmp_path_factory, data):
+    content = bytearray((RIG + SPOT + DERIVED).encode())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 6))] = data.draw(st.binary(max_size=4))
+    path = tmp_path_factory.getbasetemp() / "damaged.toml"
+    path.write_bytes(bytes(content))
+    try:
+        with Rig(load_rig(str(path)), VirtualClock(), 1):
+            pass
+    except ConfigurationError as error:
+        assert "damaged.toml" in str(error)
+    except DeviceConnectionError:
+        pass  # a port that is no emulated one any more

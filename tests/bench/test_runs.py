@@ -1,0 +1,195 @@
+import io
+import sqlite3
+import threading
+
+import pytest
+from heater_laboratory import CLOSED, HeaterLaboratory, HeaterTEC
+from heater_protocols import Settle, Stairs, settle, stairs
+from rich.console import Console
+
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.journal import Event, Record, StepRecord
+from bench.rig import load_rig
+from bench.runs import RIG_FILE_NAME, Run, carry_out, run_card
+from bench.terminal import ProgressDisplay, ask_operator
+
+
+@pytest.fixture
+def console():
+    return Console(file=io.StringIO(), width=200)
+
+
+@pytest.fixture
+def make(tmp_path, rig_file):
+    def run(*replacements, protocol=stairs, parameters=None, **keys):
+        return Run(
+            **{
+                "protocol": protocol,
+                "parameters": protocol.parameters() if parameters is None else parameters,
+                "rig": rig_file(*replacements),
+                "folder": tmp_path / "runs" / "deep",
+                "clock": "virtual",
+                "recording": False,
+                **keys,
+            }
+        )
+
+    CLOSED.clear()
+    yield run
+    assert HeaterLaboratory.opened == 0
+
+
+class TestCarryOut:
+    def test_leaves_a_folder_with_everything(self, make, console):
+        run = make(overrides={"telemetry.period": "1"}, seed=7)
+        result = carry_out(run, console)
+        assert result.outcome.status == "completed"
+        assert result.outcome.is_safe
+        assert result.folder.parent == run.folder
+        assert result.folder.name.startswith("heater-stairs-")
+        assert sorted(path.name for path in result.folder.iterdir()) == ["journal.sqlite", RIG_FILE_NAME]
+        assert result.time_ratio == 8.0 / result.wall_seconds
+        assert CLOSED == ["probe", "tec"]
+        with Record(result.folder) as record:
+            meta = record.meta
+            assert meta["run"] == result.folder.name
+            assert (
+                meta["rig_file"]
+                == load_rig(run.rig).text
+                == (result.folder / RIG_FILE_NAME).read_text(encoding="utf-8")
+            )
+            assert meta["overrides"] == {"telemetry.period": "1"}
+            assert meta["seed"] == 7
+            assert meta["epoch"] == "2000-01-01T00:00:00+00:00"
+            assert meta["parameters"] == stairs.parameters().model_dump()
+            assert meta["plan"]["steps"] == len(record.steps()) == 4
+            assert meta["plan"]["seconds"] == meta["finished"] == 8.0
+            assert set(meta["devices"]) == {"tec", "probe"}
+            assert meta["calibration"]["tec"]["temperature_limits"] == [10.0, 95.0]
+            assert meta["packages"]["numpy"]
+            card = run_card(meta)
+            assert "# a heated plate" in card
+            assert "| seed | 7 |" in card
+            assert "Test Heater, serial number 1" in card
+
+    def test_two_runs_within_one_second_have_two_folders(self, make, console):
+        folders = {carry_out(make(), console).folder for _ in range(3)}
+        assert len(folders) == 3
+
+    def test_the_same_seed_gives_the_same_readings(self, make, console):
+        tables = []
+        for _ in range(2):
+            folder = carry_out(make(seed=3), console).folder
+            db = sqlite3.connect(folder / "journal.sqlite")
+            tables.append(
+                [db.execute(f"SELECT * FROM {name}").fetchall() for name in ("steps", "telemetry", "events")]
+            )
+            db.close()
+        assert tables[0] == tables[1]
+
+    @pytest.mark.parametrize(
+        ("keys", "expected"),
+        [
+            ({"parameters": Stairs(count=100)}, "rig heater allows 10 to 95 °C"),
+            ({"clock": "moon"}, "clock 'moon' is unknown"),
+            ({"overrides": {"devices.tec.port": "/dev/ttyUSB9"}}, "has real devices, which know only the wall clock"),
+            ({"protocol": settle, "parameters": Settle(signal="absent")}, "absent"),
+        ],
+    )
+    def test_what_is_wrong_is_found_before_anything_is_made(self, make, console, keys, expected):
+        run = make(**keys)
+        with pytest.raises(ConfigurationError, match=expected):
+            carry_out(run, console)
+        assert not run.folder.exists()
+
+    def test_a_folder_that_cannot_be_made(self, make, console, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(ConfigurationError, match="folder of the run cannot be made"):
+            carry_out(make(folder=tmp_path / "file" / "runs"), console)
+        assert CLOSED == ["probe", "tec"]
+
+    def test_a_device_that_does_not_answer(self, make, console):
+        run = make(
+            ('port = "emulated://thermometer"', 'port = "emulated://thermometer"\nconnect_error = "no answer"')
+        )
+        with pytest.raises(DeviceConnectionError, match="probe: no answer"):
+            carry_out(run, console)
+        assert not run.folder.exists()
+
+    def test_the_outcome_is_told_although_the_line_is_gone(self, make, console, monkeypatch):
+        def gone(self):
+            raise OSError(5, "Input/output error")
+
+        monkeypatch.setattr(HeaterTEC, "close", gone)
+        monkeypatch.setattr(HeaterTEC, "safe", gone)
+        result = carry_out(make(), console)
+        assert not result.outcome.is_safe
+        assert result.outcome.safe_state == {"tec": "OSError: [Errno 5] Input/output error", "probe": "safe"}
+
+    def test_a_failure_is_told_with_its_reason(self, make, console):
+        result = carry_out(make(("high = 90.0", "high = 41.0"), parameters=Stairs(dwell=10.0)), console)
+        assert result.outcome.status == "failed"
+        assert "interlock" in console.file.getvalue()
+        with Record(result.folder) as record:
+            assert record.status == "failed"
+
+
+SIGNALS = (Signal("tec_temperature", "°C", "t", 2), Signal("force", "N", "f"))
+
+
+class TestDisplay:
+    def show(self, **keys):
+        console = Console(file=io.StringIO(), width=160, **keys)
+        with ProgressDisplay(console, "stairs", SIGNALS, ("tec_temperature",), 2) as display:
+            display.event(Event(0.0, "INFO", "phase", "climb"))
+            display.event(Event(3661.0, "INFO", "note", "there [bold]now"))
+            display.event(Event(5.0, "WARN", "pause", "paused"))
+            display.event(Event(6.0, "ERROR", "interlock", "too hot"))
+            display.event(Event(7.0, "INFO", "safe-state", "tec: safe"))
+            display.telemetry(1.0, 0, (20.123, float("nan")))
+            for step in range(2):
+                display.step(StepRecord(step, 0.0, 8.0, "", "", True, {}, (20.123, 1.0)))
+        return console.file.getvalue()
+
+    def test_without_a_terminal_only_events(self):
+        shown = self.show()
+        assert "1:01:01  note: there [bold]now" in shown
+        assert "pause: paused" in shown
+        assert "interlock: too hot" in shown
+        assert "tec: safe" not in shown
+        assert "2/2" not in shown
+
+    def test_at_a_terminal_a_bar_with_readings(self):
+        shown = self.show(force_terminal=True)
+        assert "2/2" in shown
+        assert "tec_temperature 20.12 °C" in shown
+        assert "force" not in shown
+
+    def test_leaving_a_terminal_that_is_gone(self):
+        class Gone(io.StringIO):
+            lost = False
+
+            def write(self, text):
+                if self.lost and threading.current_thread() is threading.main_thread():
+                    raise OSError(5, "Input/output error")
+                return super().write(text)
+
+        file = Gone()
+        with ProgressDisplay(Console(file=file, force_terminal=True), "stairs", SIGNALS, (), 2):
+            file.lost = True
+
+
+class TestQuestion:
+    @pytest.mark.parametrize(
+        ("typed", "answer"),
+        [("r\n", "resume"), ("Resume\n", "resume"), ("a\n", "abort"), ("abort\n", "abort"), ("", "abort")],
+    )
+    def test_answers(self, console, monkeypatch, typed, answer):
+        monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+        assert ask_operator(console) == answer
+
+    def test_asks_until_it_understands(self, console, monkeypatch):
+        monkeypatch.setattr("sys.stdin", io.StringIO("what\n\n r \n"))
+        assert ask_operator(console) == "resume"
+        assert console.file.getvalue().count("please answer") == 2

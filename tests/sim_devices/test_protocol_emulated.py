@@ -1,0 +1,257 @@
+import subprocess
+import sys
+
+import pytest
+import serial
+
+from bench.clock import VirtualClock
+from sim_devices import protocol_emulated
+
+
+class Echo:
+    """Answers every line with itself, reversed."""
+
+    def __init__(self):
+        self.received = bytearray()
+        self.pieces = []
+
+    def receive(self, data):
+        self.pieces.append(data)
+        self.received += data
+        *lines, rest = bytes(self.received).split(b"\n")
+        self.received = bytearray(rest)
+        return b"".join(line[::-1] + b"\n" for line in lines)
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def echo(clock):
+    server = Echo()
+    protocol_emulated.register("echo", server, clock)
+    yield server
+    protocol_emulated.unregister("echo")
+
+
+@pytest.fixture
+def port(echo):
+    with serial.serial_for_url("emulated://echo", baudrate=57600, timeout=0.5) as port:
+        yield port
+
+
+class TestAddress:
+    def test_of_a_registered_instrument(self, clock):
+        try:
+            assert protocol_emulated.register("here", Echo(), clock) == "emulated://here"
+        finally:
+            protocol_emulated.unregister("here")
+
+    def test_is_not_given_twice(self, echo, clock):
+        with pytest.raises(ValueError, match="emulated://echo is taken"):
+            protocol_emulated.register("echo", Echo(), clock)
+
+    def test_is_free_again_after_unregistering(self, echo, clock):
+        protocol_emulated.unregister("echo")
+        protocol_emulated.unregister("echo")
+        assert protocol_emulated.register("echo", Echo(), clock) == "emulated://echo"
+
+    def test_an_unknown_name_lists_the_known(self, echo):
+        with pytest.raises(
+            serial.SerialException, match="no emulated instrument at emulated://ehco; there are: .*emulated://echo"
+        ):
+            serial.serial_for_url("emulated://ehco")
+
+    def test_when_there_is_none(self):
+        protocol_emulated.install()
+        with pytest.raises(serial.SerialException, match="there are: none"):
+            serial.serial_for_url("emulated://echo")
+
+    def test_installing_again_changes_nothing(self):
+        protocol_emulated.install()
+        before = list(serial.protocol_handler_packages)
+        protocol_emulated.install()
+        assert serial.protocol_handler_packages == before
+        assert before.count("sim_devices") == 1
+
+    def test_importing_has_no_effect(self):
+        code = (
+            "import sys, threading, serial; before = list(serial.protocol_handler_packages); "
+            "import sim_devices.protocol_emulated as p; "
+            "assert serial.protocol_handler_packages == before; assert p._servers == {}; "
+            "assert threading.active_count() == 1"
+        )
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+class TestPort:
+    def test_writes_are_answered(self, port, echo):
+        assert port.write(b"abc\n") == 4
+        assert port.in_waiting == 4
+        assert port.read(4) == b"cba\n"
+        assert port.in_waiting == 0
+        assert echo.pieces == [b"abc\n"]
+
+    @pytest.mark.parametrize("data", [b"ab\n", bytearray(b"ab\n"), memoryview(b"ab\n")])
+    def test_writes_anything_that_holds_bytes(self, port, data):
+        assert port.write(data) == 3
+        assert port.readline() == b"ba\n"
+
+    def test_refuses_texts(self, port):
+        with pytest.raises(TypeError):
+            port.write("ab\n")
+
+    def test_pieces_make_one_request(self, port):
+        port.write(b"ab")
+        assert port.in_waiting == 0
+        port.write(b"c\nxy\n")
+        assert port.read(100) == b"cba\nyx\n"
+
+    def test_what_is_not_read_waits(self, port):
+        port.write(b"abc\n")
+        assert port.read() == b"c"
+        assert port.read(2) == b"ba"
+        assert port.read_until(b"\n") == b"\n"
+
+    def test_what_was_received_can_be_forgotten(self, port):
+        port.write(b"abc\n")
+        port.reset_output_buffer()
+        assert port.in_waiting == 4
+        port.reset_input_buffer()
+        assert port.in_waiting == 0
+        assert port.read(1) == b""
+
+    def test_modem_lines_do_no_harm(self, port):
+        port.rts = port.dtr = True
+        port.break_condition = False
+        port.baudrate = 115200
+        port.flush()
+        assert (port.cts, port.dsr, port.ri, port.cd) == (True, True, False, True)
+
+
+class TestTime:
+    def test_each_byte_costs_ten_bits_both_ways(self, port, clock):
+        port.write(b"0123456\n")
+        assert clock.now() == pytest.approx(16 * 10 / 57600, rel=1e-12)
+        port.baudrate = 9600
+        before = clock.now()
+        port.write(b"0123456\n")
+        assert clock.now() - before == pytest.approx(16 * 10 / 9600, rel=1e-9)
+
+    def test_the_instrument_gets_its_request_when_the_last_byte_has_gone(self, clock):
+        class Watch:
+            def receive(self, data):
+                self.at = clock.now()
+                return b"12345"
+
+        watch = Watch()
+        protocol_emulated.register("watch", watch, clock)
+        try:
+            with serial.serial_for_url("emulated://watch", baudrate=1000, timeout=1) as port:
+                port.write(b"0123456789")
+                assert watch.at == pytest.approx(0.1)
+                assert clock.now() == pytest.approx(0.15)
+        finally:
+            protocol_emulated.unregister("watch")
+
+    def test_reading_what_is_there_costs_nothing(self, port, clock):
+        port.write(b"abc\n")
+        before = clock.now()
+        port.read(4)
+        port.in_waiting  # noqa: B018
+        assert clock.now() == before
+
+    def test_waiting_in_vain_costs_the_timeout(self, port, clock):
+        assert port.read(1) == b""
+        assert clock.now() == 0.5
+        port.write(b"ab\n")
+        before = clock.now()
+        assert port.read(10) == b"ba\n"
+        assert clock.now() == before + 0.5
+
+    @pytest.mark.parametrize("timeout", [0, None])
+    def test_without_a_timeout(self, port, clock, timeout):
+        port.timeout = timeout
+        port.write(b"ab\n")
+        before = clock.now()
+        assert port.read(3) == b"ba\n"
+        assert clock.now() == before
+
+    def test_not_waiting_costs_nothing(self, port, clock):
+        port.timeout = 0
+        assert port.read(5) == b""
+        assert clock.now() == 0.0
+
+    @pytest.mark.timeout(20)
+    def test_waiting_for_ever_for_what_never_comes_is_an_error(self, port):
+        # A real port would never return, which no test or rehearsal can use.
+        port.timeout = None
+        with pytest.raises(serial.SerialException, match="ever"):
+            port.read(1)
+
+
+class TestLine:
+    def test_a_port_that_is_not_open(self, echo):
+        port = serial.serial_for_url("emulated://echo", do_not_open=True)
+        assert not port.is_open
+        for use in (
+            port.read,
+            lambda: port.write(b"x"),
+            port.flush,
+            port.reset_input_buffer,
+            lambda: port.in_waiting,
+        ):
+            with pytest.raises(serial.PortNotOpenError):
+                use()
+        port.open()
+        assert port.is_open
+        port.close()
+        with pytest.raises(serial.PortNotOpenError):
+            port.read()
+
+    def test_opening_an_open_port_is_an_error(self, port):
+        with pytest.raises(serial.SerialException, match="already open"):
+            port.open()
+
+    def test_reopened_it_has_forgotten(self, port):
+        port.write(b"abc\n")
+        port.close()
+        port.close()
+        port.open()
+        assert port.in_waiting == 0
+
+    def test_unplugged(self, port):
+        port.write(b"abc\n")
+        protocol_emulated.unregister("echo")
+        for use in (port.read, lambda: port.write(b"x"), lambda: port.in_waiting):
+            with pytest.raises(serial.SerialException, match="emulated://echo was unplugged"):
+                use()
+        port.close()
+
+    def test_plugged_in_again(self, port, clock):
+        protocol_emulated.unregister("echo")
+        protocol_emulated.register("echo", Echo(), clock)
+        port.write(b"abc\n")
+        assert port.read(4) == b"cba\n"
+
+    def test_two_ports_do_not_mix(self, clock, echo):
+        class Other:
+            def receive(self, data):
+                return data.upper()
+
+        other = protocol_emulated.register("other", Other(), clock)
+        try:
+            with (
+                serial.serial_for_url("emulated://echo", timeout=0) as first,
+                serial.serial_for_url(other, timeout=0) as second,
+            ):
+                first.write(b"abc\n")
+                second.write(b"abc\n")
+                assert second.read(10) == b"ABC\n"
+                assert first.read(10) == b"cba\n"
+                protocol_emulated.unregister("other")
+                assert first.read(10) == b""
+        finally:
+            protocol_emulated.unregister("other")
