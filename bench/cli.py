@@ -10,9 +10,9 @@ import json
 import sqlite3
 import sys
 from collections.abc import Sequence
-from enum import StrEnum
+from enum import Enum, StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 from rich.console import Console
@@ -60,9 +60,13 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 def fail(error: BenchError) -> NoReturn:
     """Print an error of the bench and exit with its code."""
-    for line in str(error).splitlines():
-        _errors.print("[bold red]error:[/]", line, highlight=False, soft_wrap=True)
+    _print_error(error)
     sys.exit(error.exit_code)
+
+
+def _print_error(error: BenchError) -> None:
+    for line in str(error).splitlines():
+        _errors.print("[bold red]error:[/]", line, highlight=False, markup=True, soft_wrap=True)
 
 
 @app.command("list")
@@ -136,7 +140,10 @@ def run(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in an emulated laboratory.")] = 0,
     clock: Annotated[
-        str, typer.Option(help="wall; virtual (as fast as it goes), or xN (N times as fast) on emulated rigs.")
+        str,
+        typer.Option(
+            help="wall; on emulated rigs also virtual (as fast as it goes) or xN (N times as fast, up to about 100)."
+        ),
     ] = "wall",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the folder of the run is made.")] = Path(
         "recordings"
@@ -200,17 +207,21 @@ def run(
             "laboratory_seconds": outcome.laboratory_seconds,
             "wall_seconds": result.wall_seconds,
             "safe_state": dict(outcome.safe_state),
+            "is_safe": outcome.is_safe,
         },
     )
+    for name, state in outcome.safe_state.items():
+        if state != SAFE:
+            _errors.print(f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False)
     if outcome.error is not None:
         if not isinstance(outcome.error, BenchError):
             raise outcome.error
-        fail(outcome.error)
+        _print_error(outcome.error)
+    # What is not safe matters more than what ended the run.
     if not outcome.is_safe:
-        for name, state in outcome.safe_state.items():
-            if state != SAFE:
-                _errors.print(f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False)
         sys.exit(UNSAFE_EXIT_CODE)
+    if isinstance(outcome.error, BenchError):
+        sys.exit(outcome.error.exit_code)
 
 
 @app.command("identify")
@@ -307,7 +318,7 @@ def predict_(
     model = load_model(model_path)
     columns = read_columns(file, [input_column] + ([output_column] if output_column else []))
     inputs = columns.values[input_column]
-    check_unit(model, columns.units[input_column], input_column)
+    check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
         _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
     predicted = predict(model, inputs, continue_memory=continue_memory)
@@ -326,6 +337,78 @@ def predict_(
         )
     console.print(f"{inputs.size} rows: {out}", highlight=False, soft_wrap=True)
     write_json(json_file, result)
+
+
+class PolicyOption(Enum):
+    """Which answer of an inverse is taken."""
+
+    NEAREST: Literal["nearest"] = "nearest"  # type: ignore[misc]  # so that its value is of a literal type
+    PAPER: Literal["paper"] = "paper"  # type: ignore[misc]
+
+
+@app.command()
+def invert(
+    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
+    column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the set-points go.")] = Path("setpoints.csv"),
+    policy: Annotated[
+        PolicyOption,
+        typer.Option(help="Which answer, where there are several: nearest, or the paper's direction rule."),
+    ] = PolicyOption.NEAREST,
+    continue_memory: Annotated[
+        bool,
+        typer.Option(
+            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        ),
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Compute the set-points that bring a model's output to one target after another.
+
+    Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
+    only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
+    `too low`; what cannot be met is clamped to the nearest reachable value).
+    """
+    from bench.measurements import header_with_unit, read_columns, write_csv
+    from bench.model_file import load_model
+    from bench.modelling import check_unit, invert_targets
+
+    model = load_model(model_path)
+    columns = read_columns(file, [column])
+    units = (model.operator.input_unit, model.operator.output_unit)
+    check_unit(units[1], columns.units[column], column)
+    found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
+    header = [
+        header_with_unit(name, unit)
+        for name, unit in (
+            ("target", units[1]), ("passing", units[0]), ("setpoint", units[0]), ("predicted", units[1]), ("flag", "")
+        )
+    ]  # fmt: skip
+    passing = ["" if value != value else value for value in found.passing.tolist()]
+    write_csv(out, header, [found.targets, passing, found.setpoints, found.predicted, list(found.flags)])
+    counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
+    two = sum(value != "" for value in passing)
+    console.print(
+        f"{len(found.flags)} targets: {counts['met']} met, {counts['too high']} too high, "
+        f"{counts['too low']} too low; {two} by way of saturation: {out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    met = [abs(p - t) for p, t, f in zip(found.predicted, found.targets, found.flags, strict=True) if f == "met"]
+    write_json(
+        json_file,
+        {
+            "model": model.name,
+            "targets": len(found.flags),
+            "met": counts["met"],
+            "too_high": counts["too high"],
+            "too_low": counts["too low"],
+            "through_saturation": two,
+            "largest_residual": float(max(met)) if met else None,
+            "out": str(out),
+        },
+    )
 
 
 @app.command()

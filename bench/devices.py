@@ -269,6 +269,11 @@ class Device(ABC):
         return
 
     @property
+    def hints(self) -> dict[str, list[str]]:
+        """What a live table shows of this device (bluesky asks): its first signal."""
+        return {"fields": [self.signals[0].name]}
+
+    @property
     @abstractmethod
     def identity(self) -> Identity:
         """Maker, model, serial number and firmware, as the instrument said when it was connected."""

@@ -233,6 +233,8 @@ class Engine:
                         message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"
                     )
                 self._send({message.actuator: command.setpoint})
+                if not command.wait > 0:
+                    raise ConfigurationError(f"the controller of {message.output} asked to wait {command.wait} s")
                 end = now + command.wait
                 if end > latest:
                     raise SettleTimeoutError(

@@ -114,6 +114,47 @@ def plot_sequence_and_errors(
         figure.savefig(path)
 
 
+def plot_tracking(
+    path: Path,
+    reference: Floats,
+    outputs: Mapping[str, Floats],
+    *,
+    horizontal: Floats | None = None,
+    horizontal_label: str = "index of the target",
+    output_label: str,
+    error_label: str,
+) -> None:
+    """Draw a reference and the outputs under several controllers, and below it their errors (Fig. 12).
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    reference : ndarray, shape (N,)
+        What was wanted.
+    outputs : mapping of str to ndarray
+        What came of it by the controller's title, each of shape (N,).
+    horizontal : ndarray or None, shape (N,)
+        Where they are drawn, such as times; their index if None.
+    horizontal_label, output_label, error_label : str
+        Axis labels, with units.
+    """
+    places = np.arange(reference.size, dtype=np.float64) if horizontal is None else horizontal
+    marker = "." if horizontal is None else ""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        top.plot(places, reference, color="black", linewidth=1.2, label="reference")
+        for i, (title, output) in enumerate(outputs.items()):
+            style = {"color": _COLORS[i], "linewidth": 0.8, "marker": marker, "markersize": 3.0}
+            top.plot(places, output, label=title, **style)
+            bottom.plot(places, output - reference, label=title, **style)
+        top.set_ylabel(output_label)
+        bottom.set(xlabel=horizontal_label, ylabel=error_label)
+        top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(outputs) + 1, fontsize=7.5)
+        figure.savefig(path)
+
+
 def plot_density(path: Path, model: Preisach) -> None:
     """Draw a Preisach density on its plane; cells without density are white (Figs. 6 and 8).
 

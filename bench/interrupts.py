@@ -20,6 +20,12 @@ class Interrupts:
     former handlers come back at the end. In a thread other than the main one it watches nothing, as Python
     has it.
 
+    Parameters
+    ----------
+    notify : callable
+        Tells the operator what was understood. Called in the midst of whatever goes on: it must not wait for
+        a lock, as the lines that were interrupted may hold it; printing through a console does.
+
     Attributes
     ----------
     pause_requested : bool

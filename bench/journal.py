@@ -8,12 +8,13 @@ becomes one self-contained file, which can be read where nothing can be written.
 Schema, version 1
 -----------------
 `meta(key, value)`
-    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `protocol`,
+    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `overrides`, `protocol`,
     `parameters`, `seed`, `clock`, `epoch` (time of day at t = 0), `devices` (identity by name),
     `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and whether it was clean),
-    `host` (with the room's time at the start), `plan`, `dashboard`, and at the end `status` (`completed`,
-    `aborted`, `failed`), `reason`, `finished` (laboratory s), `safe_state` (outcome by device).
-    A file without `status` is of a run that is going on or whose process died.
+    `host` (with the room's time at the start), `controls` (the signal under control), `plan`, `dashboard`,
+    and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished` (laboratory s),
+    `safe_state` (outcome by device). A file without `status` is of a run that is going on or whose process
+    died.
 `signals(position, name, unit, description, precision)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …)`

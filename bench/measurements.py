@@ -93,7 +93,7 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
     return []
 
 
-def write_csv(path: Path, header: Sequence[str], columns: Sequence[npt.ArrayLike]) -> None:
+def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequence[object]]) -> None:
     """Write columns of equal length as CSV, numbers with all their digits.
 
     Raises
@@ -101,14 +101,19 @@ def write_csv(path: Path, header: Sequence[str], columns: Sequence[npt.ArrayLike
     DataError
         If the file cannot be written.
     """
-    arrays = [np.asarray(column) for column in columns]
+    plain = [column.tolist() if isinstance(column, np.ndarray) else column for column in columns]
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
-            writer.writerows(zip(*(array.tolist() for array in arrays), strict=True))
+            writer.writerows(zip(*plain, strict=True))
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error}") from None
+
+
+def header_with_unit(name: str, unit: str) -> str:
+    """Return a column header such as `force [N]`; the name alone where there is no unit."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def split_unit(header: str) -> tuple[str, str]:

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.control.baselines import LookUp
+from bench.control.inverse import Inverse, Reach
+from bench.controllers import Policy
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Preisach
+from bench.hysteresis import Polynomial, Preisach
 from bench.identification import MODELS, Errors, Identification, identify
 from bench.measurements import FEWEST_ROWS, check_excitation, read_columns
 from bench.model_file import ModelFile
@@ -165,17 +168,83 @@ def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) 
     return np.asarray(model.operator.evaluate(inputs, model.memory if continue_memory else None))
 
 
-def check_unit(model: ModelFile, unit: str, column: str) -> None:
-    """Check that a column's unit is that of the model's input; an unknown unit passes.
+@dataclass(frozen=True)
+class InvertedTargets:
+    """Set-points that bring a model's output to one target after another.
+
+    Attributes
+    ----------
+    targets : ndarray, shape (N,)
+        Output units.
+    setpoints : ndarray, shape (N,)
+        Input units.
+    passing : ndarray, shape (N,)
+        Set-point to pass before it, where the target is met only after saturation; nan where there is none.
+    predicted : ndarray, shape (N,)
+        Output of the model at `setpoints`, output units.
+    flags : tuple of str
+        By target: `met`, `too high` or `too low`. What is not met is clamped to the nearest reachable value.
+    """
+
+    targets: Floats
+    setpoints: Floats
+    passing: Floats
+    predicted: Floats
+    flags: tuple[str, ...]
+
+
+def invert_targets(
+    model: ModelFile, targets: Floats, *, policy: Policy = "nearest", continue_memory: bool = False
+) -> InvertedTargets:
+    """Invert a model for a sequence of targets.
+
+    Parameters
+    ----------
+    model : ModelFile
+        Any model: Preisach models are inverted exactly with their memory, a polynomial by its look-up table.
+    targets : ndarray, shape (N,)
+        Output units, finite.
+    policy : {"nearest", "paper"}
+        Which answer is taken where a Preisach model has several.
+    continue_memory : bool
+        Start from the memory that the model file keeps rather than from negative saturation.
+
+    Raises
+    ------
+    DataError
+        If this kind of model has no inverse.
+    """
+    operator = model.operator
+    if isinstance(operator, Preisach):
+        found = Inverse(operator, policy).follow(targets, model.memory if continue_memory else None)
+        setpoints, passing, predicted = found.setpoints, found.saturating, found.outputs
+        reached = [
+            Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW
+            for met, target, output in zip(found.met.tolist(), targets.tolist(), predicted.tolist(), strict=True)
+        ]
+    elif isinstance(operator, Polynomial):
+        table = LookUp(operator)
+        answers = [table.look_up(target) for target in targets.tolist()]
+        setpoints = np.array([setpoint for setpoint, _ in answers])
+        passing = np.full(targets.size, np.nan)
+        predicted = operator.evaluate(setpoints)
+        reached = [reach for _, reach in answers]
+    else:
+        raise DataError(f"models of the kind {model.name} cannot be inverted; a Preisach model or a polynomial can")
+    flags = tuple(reach.value for reach in reached)
+    return InvertedTargets(targets, setpoints, passing, predicted, flags)
+
+
+def check_unit(expected: str, unit: str, column: str) -> None:
+    """Check that a column's unit is that of the model; an unknown unit passes.
 
     Raises
     ------
     DataError
         If both are known and differ.
     """
-    expected = model.operator.input_unit
     if unit and expected and unit != expected:
-        raise DataError(f"column {column} is in {unit}; the model {model.name} takes its input in {expected}")
+        raise DataError(f"column {column} is in {unit}; the model has it in {expected}")
 
 
 def outside_of_range(model: ModelFile, inputs: Floats) -> str:

@@ -145,6 +145,14 @@ class Control:
     timeout: float
     label: str = ""
 
+    def __post_init__(self) -> None:
+        low, high = self.limits
+        if not (-math.inf < low <= high < math.inf and 0 < self.timeout < math.inf):
+            raise ValueError(
+                "Control: expected finite limits, the lower one first, and a finite timeout > 0, got "
+                f"limits={self.limits}, timeout={self.timeout}"
+            )
+
 
 @dataclass(frozen=True)
 class Phase:
@@ -424,6 +432,8 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 at_most += message.timeout
                 reading = Reading(steps, seconds, True, echo)
                 steps += 1
+                if steps > _LONGEST_PLAN:
+                    raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
             elif isinstance(message, Phase | Note):
                 others += 1
@@ -482,7 +492,13 @@ def packaged_protocols() -> dict[str, ProtocolDefinition]:
     found: dict[str, ProtocolDefinition] = {}
     package = importlib.import_module(PROTOCOL_PACKAGE)
     for module in pkgutil.iter_modules(package.__path__):
-        for definition in _definitions(importlib.import_module(f"{PROTOCOL_PACKAGE}.{module.name}")):
+        try:
+            imported = importlib.import_module(f"{PROTOCOL_PACKAGE}.{module.name}")
+        except Exception as error:
+            raise ConfigurationError(
+                f"protocol module {module.name} cannot be loaded: {type(error).__name__}: {error}"
+            ) from error
+        for definition in _definitions(imported):
             if definition.name in found:
                 raise ConfigurationError(f"two protocols of the package are named {definition.name}")
             found[definition.name] = definition

@@ -17,10 +17,11 @@ from bench.figures import plot_density, plot_errors, plot_loops, plot_signals
 from bench.hysteresis import Preisach
 from bench.identification import measure_errors
 from bench.journal import Record, Table
-from bench.measurements import write_csv
+from bench.measurements import header_with_unit, write_csv
 from bench.model_file import ModelFile, load_model, parse_model
 from bench.modelling import IdentifiedFile, errors_json, predict
 from bench.runs import RECORDING_NAME, run_card
+from bench.tracking_results import results_json
 
 
 def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console: Console) -> dict[str, Any]:
@@ -58,6 +59,9 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
         figures = _draw_run(record, steps, folder)
         models = [*_models_of(record), *(load_model(path) for path in model_paths)]
         comparison, more = _compare(record, steps, models, folder)
+        controlled = str(record.meta.get("controls", ""))
+        control = results_json(record, controlled) if controlled else {}
+        _print_control(control, record.unit(controlled), console)
     _print_comparison(comparison, console)
     for path in [*figures, *more]:
         console.print(f"figure: {path}", highlight=False, soft_wrap=True)
@@ -70,6 +74,7 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
         "safe_state": record.meta.get("safe_state", {}),
         "extremes": extremes,
         "models": comparison,
+        **control,
         "figures": [str(path) for path in [*figures, *more]],
     }
 
@@ -252,6 +257,14 @@ def _print_comparison(comparison: Mapping[str, Mapping[str, Any]], console: Cons
     console.print(table)
 
 
+def _print_control(results: Mapping[str, Mapping[str, float]], unit: str, console: Console) -> None:
+    for name, entry in results.items():
+        parts = [f"error {key} {entry[key]:.2f} {unit}" for key in ("max", "rms", "median") if key in entry]
+        if "seconds_per_target" in entry:
+            parts.append(f"{entry['seconds_per_target']:.1f} s a target")
+        console.print(f"{name}: {', '.join(parts)}", highlight=False)
+
+
 def _models_of(record: Record) -> list[ModelFile]:
     return [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
 
@@ -259,7 +272,7 @@ def _models_of(record: Record) -> list[ModelFile]:
 def _headers(record: Record, table: Table) -> list[str]:
     units = {"step": "", "settled": "", "t": "s", "started": "s", "finished": "s"}
     units |= {signal.name: signal.unit for signal in record.signals}
-    return [f"{name} [{units[name]}]" if units[name] else name for name in table.columns]
+    return [header_with_unit(name, units[name]) for name in table.columns]
 
 
 def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:

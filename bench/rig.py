@@ -208,8 +208,8 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
 class Rig:
     """Connected devices, and the signals that they give.
 
-    Use it as a context manager: leaving it closes every line that still can be closed. It does not bring the devices into their safe
-    state; whoever moves them does (the engine, always).
+    Use it as a context manager: leaving it closes every line that still can be closed. It does not bring the
+    devices into their safe state; whoever moves them does (the engine, always).
 
     Parameters
     ----------

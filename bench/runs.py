@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import importlib.metadata
+import os
 import platform
 import shutil
 import subprocess
@@ -129,7 +130,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in rig.signals[:2])
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
         observers.append(stack.enter_context(progress))
-        interrupts = stack.enter_context(Interrupts(lambda text: console.print(text, style="yellow")))
+        interrupts = stack.enter_context(Interrupts(_say_at_once))
         ask = (lambda: ask_operator(console)) if sys.stdin is not None and sys.stdin.isatty() else None
         outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, run.parameters)
         if dashboard is not None:
@@ -197,6 +198,7 @@ def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:
         "protocol": run.protocol.name,
         "protocol_summary": run.protocol.summary,
         "parameters": run.parameters.model_dump(mode="json"),
+        "controls": run.protocol.controls,
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
         "clock": run.clock,
@@ -218,6 +220,11 @@ def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:
             "started": room_date().isoformat(),
         },
     }
+
+
+def _say_at_once(text: str) -> None:
+    # In a signal's handler: a console has locks, and whatever was interrupted may hold them.
+    os.write(2, f"\n{text}\n".encode())
 
 
 def _make_folder(parent: Path, name: str) -> Path:

@@ -20,7 +20,7 @@ class Parameters(ProtocolParameters):
         1.2, unit="K", low=0.01, high=20, help="largest difference of neighbouring set-points"
     )
     dwell: float = parameter(8.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
-    sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the sequence, the same whatever the rig's seed")
+    sequence_seed: int = parameter(5, unit="1", low=0, help="seed of the sequence, the same whatever the rig's seed")
 
 
 @protocol(needs=("tec", "tec_temperature", "curvature"))

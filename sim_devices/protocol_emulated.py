@@ -54,14 +54,18 @@ def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
 class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     """A pyserial port that is wired to an emulated instrument."""
 
+    is_open: bool
+
     def open(self) -> None:
         """Connect to the instrument.
 
         Raises
         ------
         serial.SerialException
-            If no emulated instrument has this name.
+            If the port is open already, or no emulated instrument has this name.
         """
+        if self.is_open:
+            raise SerialException("Port is already open.")
         name = str(self.portstr).removeprefix(_SCHEME)
         if name not in _servers:
             known = ", ".join(_SCHEME + other for other in sorted(_servers)) or "none"
@@ -81,8 +85,16 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         return len(self._received)
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` bytes; fewer only after the timeout has passed on the clock."""
+        """Return up to `size` bytes; fewer only after the timeout has passed on the clock.
+
+        Raises
+        ------
+        serial.SerialException
+            If bytes are missing and there is no timeout: a real port would wait for ever.
+        """
         clock = self._clock_of_open_port()
+        if len(self._received) < size and self._timeout is None:
+            raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
         if len(self._received) < size and self._timeout:
             # Nothing can arrive unasked, so all that waiting brings is that the time is gone.
             clock.sleep(self._timeout)

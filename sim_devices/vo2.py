@@ -71,8 +71,12 @@ class VO2Laboratory:
 
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name."""
-        port = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
         self._t7_server.start()
+        try:
+            port = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
+        except ValueError:
+            self._t7_server.close()
+            raise
         return {"tec": port, "psd": self._t7_server.address}
 
     def close(self) -> None:

@@ -18,6 +18,8 @@ _output_at = memory.output_at
 _load = memory.load
 _evaluate = memory.evaluate
 _borrowed = memory.borrowed
+_reversible_value = memory.reversible_value
+_swept_differences = memory.swept_differences
 
 
 @njit(cache=True, forceinline=True)
@@ -347,3 +349,105 @@ def follow(
                 levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u
             )
             present = u
+
+
+@njit(cache=True)
+def _tabulate(levels: Floats, density: Floats, table: Floats, below: Floats) -> float:
+    """Fill in the prefix sums of `Preisach.lattice`; return the mass, the sum of density * area."""
+    order = levels.size - 1
+    total = 0.0
+    below[0] = 0.0
+    for i in range(order):
+        height = levels[i + 1] - levels[i]
+        row = 0.0
+        for j in range(order):
+            value = density[i * (i + 1) // 2 + j] if j <= i else 0.0
+            width = levels[j + 1] - levels[j]
+            table[i, j, 1] = row
+            table[i, j, 3] = value
+            row += value * width
+            if i + 1 < order:
+                table[i + 1, j, 2] = table[i, j, 2] + value * height
+        if i + 1 < order:
+            corner = 0.0
+            for j in range(order):
+                table[i + 1, j, 0] = corner
+                corner += table[i + 1, j, 2] * (levels[j + 1] - levels[j])
+        half = 0.5 * table[i, i, 3] * height * height
+        below[i + 1] = below[i] + half
+        total += row * height - half
+    return total
+
+
+@njit(cache=True)
+def adapt(
+    levels: Floats,
+    inverse_step: float,
+    old_density: Floats,
+    bias: float,
+    breaks: Floats,
+    quadratics: Floats,
+    left: Floats,
+    height: Floats,
+    inside: float,
+    raw: float,
+    value: float,
+    before: float,
+    output: float,
+    step: float,
+    bias_step: float,
+    regularisation: float,
+) -> tuple[Floats, Floats, Floats, float, float, float, float, float]:
+    """Correct the density by the change of output while the input moved from `raw` to `value`.
+
+    `before` is the output measured at `raw`, NaN if there was none. Returns density, table, below, bias, offset,
+    outputs at negative and at positive saturation, and the error of the predicted change (NaN without one).
+    """
+    density = old_density.copy()
+    order = levels.size - 1
+    error = np.nan
+    if not np.isnan(before):
+        inputs = np.empty(1)
+        inputs[0] = value
+        starts = np.empty(2, np.int64)
+        no_cells, no_changes = np.empty(0, np.int32), np.empty(0)
+        count = _swept_differences(
+            inputs, levels, inverse_step, left, height, inside, starts, no_cells, no_changes, False
+        )
+        cells, changes = np.empty(count, np.int32), np.empty(count)
+        _swept_differences(inputs, levels, inverse_step, left, height, inside, starts, cells, changes, True)
+        areas = np.empty(count)
+        on = np.zeros(density.size)
+        predicted = _reversible_value(breaks, quadratics, value) - _reversible_value(breaks, quadratics, raw)
+        for e in range(count):
+            c = cells[e]
+            predicted += density[c] * changes[e]
+            i = int((np.sqrt(8.0 * c + 1.0) - 1.0) / 2.0)
+            j = c - i * (i + 1) // 2
+            area = (levels[i + 1] - levels[i]) * (levels[j + 1] - levels[j])
+            areas[e] = 0.5 * area if i == j else area
+            on[c] += changes[e] / areas[e]
+        error = output - before - predicted
+        norm = 0.0
+        for e in range(count):
+            norm += on[cells[e]] * changes[e] / areas[e]
+        if norm > 0.0:
+            gain = step * error / (norm + regularisation)
+            for e in range(count):
+                c = cells[e]
+                # A cell may be listed more than once.
+                density[c] = max(0.0, density[c] + gain * on[c] / areas[e])
+                on[c] = 0.0
+    table = np.zeros((order, order, 4))
+    below = np.empty(order + 1)
+    mass = _tabulate(levels, density, table, below)
+    here = np.empty(1)
+    here[0] = value
+    offset = bias - mass
+    found = _evaluate(here, levels, inverse_step, table, below, offset, breaks, quadratics, left, height, inside)[0]
+    if not np.isnan(output):
+        bias += bias_step * (output - found)
+    offset = bias - mass
+    minus = offset + _reversible_value(breaks, quadratics, levels[0])
+    plus = offset + 2.0 * mass + _reversible_value(breaks, quadratics, levels[-1])
+    return density, table, below, bias, offset, minus, plus, error

@@ -154,7 +154,7 @@ class DisturbanceEstimator:
     -----
     A Kalman filter of a random walk, carried out by filterpy: P⁻ = P + q, K = P⁻ / (P⁻ + r),
     d += K (z - d), P = (1 - K) P⁻, with the steady state P⁻ = (q + √(q² + 4 q r)) / 2 (Bar-Shalom, Li,
-    Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 5.2). Where a
+    Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001). Where a
     controller takes the estimate away from its next target, and the true local gain is g times the
     model's, the error goes on by the factor 1 - K g: stable for 0 < K g < 2.
     """

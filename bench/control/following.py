@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.inverse import Inverse, Reach
-from bench.control.tracking import Actuator, IntegralParameters, Trace, check_positive, saturation
-from bench.hysteresis import MemoryCurve, _checks
+from bench.control.tracking import Actuator, Trace, check_positive
+from bench.hysteresis import MemoryCurve, Preisach, _checks
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,11 @@ class _Follower(Actuator):
     def __init__(
         self,
         input_range: tuple[float, float],
-        limits: tuple[float, float] | None,
-        state: MemoryCurve | None,
+        limits: tuple[float, float] | None = None,
+        model: Preisach | None = None,
+        state: MemoryCurve | None = None,
     ) -> None:
-        super().__init__(input_range, limits, state)
+        super().__init__(input_range, limits, model, state)
         self._reference = math.nan
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
@@ -72,9 +74,7 @@ class _Follower(Actuator):
         before, self._reference = self._reference, _checks.number("reference", reference)
         step = 0.0 if math.isnan(before) else reference - before
         if self._observe(measured_input):
-            setpoint = self._answer_to(step, output)
-            if math.isfinite(setpoint):
-                self._setpoint = self._clip(setpoint)
+            self._setpoint = self._clip(self._answer_to(step, output))
         return self._setpoint
 
     def _answer_to(self, step: float, output: float) -> float:
@@ -105,8 +105,7 @@ class OpenLoopFollower(_Follower):
         limits: tuple[float, float] | None = None,
         parameters: FollowingParameters | None = None,
     ) -> None:
-        operator = inverse.operator
-        super().__init__(operator.input_range, limits, operator.initial_state() if state is None else state)
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
         self._parameters = parameters or FollowingParameters()
 
@@ -176,7 +175,7 @@ class ClosedLoopFollower(OpenLoopFollower):
 
     def _answer_to(self, step: float, output: float) -> float:
         assert self._state is not None
-        known = math.isfinite(output)
+        known = self._is_known(output)
         self._estimator.update(output - self._inverse.operator.value(self._state) if known else None)
         return self._inverted(step, self._estimator.value)
 
@@ -196,7 +195,7 @@ class IntegralFollower(_Follower):
     """
 
     def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
-        super().__init__(tuple(_checks.increasing("limits", limits).tolist()), None, None)
+        super().__init__(limits)
         self._parameters = parameters or IntegralParameters()
 
     @property
@@ -205,7 +204,7 @@ class IntegralFollower(_Follower):
         return Trace(reference=self._reference)
 
     def _answer_to(self, step: float, output: float) -> float:
-        if not math.isfinite(output):
+        if not self._is_known(output):
             return self._setpoint
         error = self._reference - step - output
         wished = self._setpoint + self._parameters.gain * self._parameters.period * error

@@ -116,6 +116,12 @@ class Inverse:
         if self.policy not in ("nearest", "paper"):
             raise ValueError(f"policy: expected 'nearest' or 'paper', got {self.policy!r}")
 
+    def _retuned(self, operator: Preisach, ends: tuple[float, float, float]) -> Inverse:
+        """Return the inverse of an operator with another nonnegative density on the same levels."""
+        other = object.__new__(Inverse)
+        other.__dict__.update(operator=operator, policy=self.policy, _ends=ends, _monotone=self._monotone)
+        return other
+
     @cached_property
     def _ends(self) -> tuple[float, float, float]:
         """Outputs at negative and positive saturation, and the tolerance."""

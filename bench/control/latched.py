@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
-
-import numpy as np
 
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.inverse import Inverse
 from bench.control.tracking import (
     Arrival,
-    Command,
     Correcting,
     CorrectionParameters,
+    Move,
     Reading,
     Script,
     check_positive,
@@ -45,6 +42,9 @@ class LatchParameters:
         Creep per output unit of the error that is left, input units per second and output unit.
     creep_offset : float
         Error at which the creep would be slowest, output units: what stepping back will take away.
+    creep_horizon, creep_fast : float
+        Where the model has the target further ahead than the creep would come, as after a turn, the creep is
+        so fast as to be there in `creep_horizon` s, but not above `creep_fast`, input units per second.
     creep_until : float
         Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on.
     creep_limit : float
@@ -73,20 +73,20 @@ class LatchParameters:
         Of the estimate of the locked output, for each reading, output units squared: what the input wanders
         unseen, by the small slope; noise of one reading.
     end_margin : float
-        Within this distance of the outputs at saturation, in output units, the slope is small and the loop
-        is wide: there the incremental inverse alone is used.
+        Within this distance of the outputs at saturation, in output units, and beyond them, the incremental
+        inverse alone is used.
     """
 
     approach: float = 25.0
     approach_done: float = 1.8
     approach_corrections: int = 8
-    arrival: Arrival = Arrival(tolerance=0.1, hold=0.2)
+    arrival: Arrival = field(default_factory=lambda: Arrival(tolerance=0.1, hold=0.2))
     creep_least: float = 0.015
     creep_most: float = 0.12
-    creep_fast: float = 0.3
-    creep_horizon: float = 4.0
     creep_gain: float = 0.003
     creep_offset: float = 1.8
+    creep_horizon: float = 4.0
+    creep_fast: float = 0.3
     creep_until: float = 3.3
     creep_limit: float = 60.0
     step_back: float = 0.5
@@ -162,8 +162,8 @@ class Latched(Correcting):
             raise ValueError("inverse: expected a model with a reversible part, by which a locked output is moved")
         super().__init__(inverse, state, limits, correction or CorrectionParameters(corrections=9, close_enough=2.0))
         self._parameters = parameters or LatchParameters()
-        low, high = float(inverse.operator.levels[0]), float(inverse.operator.levels[-1])
-        self._ends = sorted(inverse.operator.evaluate([low, high]).tolist())
+        self._poll = self._parameters.arrival.poll
+        self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._extreme: float | None = None
         self._direction: Direction = 1
         self._tries = 0
@@ -194,8 +194,8 @@ class Latched(Correcting):
     def _run(self, target: float, reading: Reading) -> Script:
         p = self._parameters
         self._extreme, self._locked, self._tries = None, False, 0
-        minus, plus = self._ends
-        if minus + p.end_margin <= target <= plus - p.end_margin:
+        low, high = self._saturated
+        if low + p.end_margin <= target <= high - p.end_margin:
             self._direction = 1 if target > reading.output else -1
             while self._tries < p.tries:
                 self._tries += 1
@@ -205,11 +205,11 @@ class Latched(Correcting):
                 self._extreme = None
                 self._direction = 1 if self._direction < 0 else -1
         if not self._locked:
-            yield from self._correct(target, self._correction.corrections)
+            yield from self._correct(target)
         yield from self._hold(self._poll)
 
-    def _latch(self, target: float, reading: Reading) -> Generator[Command, Reading, Reading]:
-        """Try to lock from one side; return the last reading."""
+    def _latch(self, target: float, reading: Reading) -> Move:
+        """Try to lock from one side."""
         p = self._parameters
         direction = self._direction
 
@@ -221,59 +221,60 @@ class Latched(Correcting):
             if left(reading) <= p.approach_done * p.approach:
                 break
             setpoint = self._ahead(target - direction * p.approach - self._estimator.value)
-            (*_, reading) = yield from self._arrive(setpoint, p.arrival)
+            if setpoint is None:
+                return reading
+            reading = yield from self._arrive(setpoint, p.arrival)
             self._estimator.update(reading.output - self._model())
 
-        spent = 0.0
-        while left(reading) > p.creep_until:
+        for _ in range(round(p.creep_limit / self._poll)):
+            if left(reading) <= p.creep_until:
+                break
             ahead = self._ahead(self._model() + direction * left(reading))
-            if spent >= p.creep_limit or ahead == (self._low if direction < 0 else self._high):
+            if ahead is None:
                 return reading
-            rate = min(
-                max(p.creep_least + p.creep_gain * (left(reading) - p.creep_offset), p.creep_least), p.creep_most
-            )
-            # Where the model says that the way is long, as after a turn, there is no need to crawl.
-            rate = max(rate, min(abs(ahead - reading.input) / p.creep_horizon, p.creep_fast))
+            rate = max(p.creep_least + p.creep_gain * (left(reading) - p.creep_offset), p.creep_least)
+            long = min(abs(ahead - reading.input) / p.creep_horizon, p.creep_fast)
+            rate = max(min(rate, p.creep_most), long)
             reading = yield self._command(self._setpoint + direction * rate * self._poll, self._poll)
-            spent += self._poll
-        if left(reading) < -p.lock_within:
+        if not -p.lock_within <= left(reading) <= p.creep_until:
             return reading
 
         self._extreme = reading.input
         return (yield from self._fine_loop(target))
 
-    def _fine_loop(self, target: float) -> Generator[Command, Reading, Reading]:
-        """Step back and move the locked output to the target; return the last reading."""
+    def _fine_loop(self, target: float) -> Move:
+        """Step back and move the locked output to the target."""
         p = self._parameters
+        assert self._extreme is not None
         locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
-        setpoint = self._behind(-math.inf if self._direction < 0 else math.inf, p.step_back)
-        slope = reversible_slope(self._inverse.operator, setpoint)
-        origin = setpoint
+        origin = setpoint = self._behind(self._extreme - self._direction * p.step_back)
+        slope = reversible_slope(self._inverse.operator, origin)
         for move in range(p.fine_moves + 1):
             for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
                 reading = yield self._command(setpoint, self._poll)
-                # Where the input still is on its way, what it has to go is known.
+                # Its output by the slope, had it been at `origin`: no need to wait for the input to settle.
                 locked.update(reading.output - slope * (reading.input - origin))
-                setpoint = self._behind(setpoint, p.nearest)
+                setpoint = self._behind(setpoint)
             error = target - locked.value - slope * (setpoint - origin)
-            if abs(error) > p.lock_within:
+            if abs(error) > p.lock_within or slope == 0.0:
                 return reading
             if move < p.fine_moves:
-                setpoint = self._behind(setpoint + p.fine_gain * error / slope, p.nearest)
+                setpoint = self._behind(setpoint + p.fine_gain * error / slope)
         self._locked = abs(error) <= p.accept
         return reading
 
-    def _behind(self, setpoint: float, nearest: float) -> float:
-        """Return the set-point moved to where the output is locked, at least `nearest` behind the extreme."""
+    def _behind(self, setpoint: float) -> float:
+        """Return the set-point moved into the stretch behind the extreme where the output is locked."""
         assert self._extreme is not None
         distance = self._direction * (self._extreme - setpoint)
-        distance = min(max(distance, nearest), self._parameters.farthest)
+        distance = min(max(distance, self._parameters.nearest), self._parameters.farthest)
         return self._clip(self._extreme - self._direction * distance)
 
-    def _ahead(self, target: float) -> float:
-        """Return the input of the model's output `target` in the present direction, else its end."""
+    def _ahead(self, target: float) -> float | None:
+        """Return the input of the model's output `target` in the present direction, None beyond the limits."""
         assert self._state is not None
-        return self._clip(walk(self._inverse.operator, self._state, self._direction, target))
+        found = walk(self._inverse.operator, self._state, self._direction, target)
+        return found if found is not None and self._low < found < self._high else None
 
 
 def reversible_slope(operator: Preisach, value: float) -> float:
@@ -298,7 +299,7 @@ def reversible_slope(operator: Preisach, value: float) -> float:
     return float(linear + 2.0 * quadratic * value)
 
 
-def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: float) -> float:
+def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: float) -> float | None:
     """Return the first input in one direction at which the output has come to the target.
 
     Parameters
@@ -314,23 +315,24 @@ def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: f
 
     Returns
     -------
-    float
-        Input; the end of the operating range if the target is not met on the way.
+    float or None
+        Input, the present one if the target is met already; None if it is not met on the way.
     """
-    end = operator.input_range[0 if direction < 0 else 1]
     missing = direction * (target - operator.value(state))
     while missing > 0.0:
         segment = operator.segment(state, direction)
         if segment is None:
-            return end
-        quadratic, linear = direction * segment.quadratic, direction * segment.linear
-        roots = np.roots([quadratic, linear, -missing]) if quadratic or linear else np.empty(0)
-        inside = [float(d.real) for d in roots if abs(d.imag) == 0.0 and 0.0 <= d.real <= segment.length]
-        if inside:
-            return state.input + direction * min(inside)
-        missing -= segment.length * (linear + segment.length * quadratic)
+            return None
+        # The output comes nearer by a d² + b d.
+        a, b = direction * segment.quadratic, direction * segment.linear
+        square = b * b + 4.0 * a * missing
+        # The smaller positive root, in the form that does not cancel; without a positive divisor there is none.
+        divisor = b + math.sqrt(square) if square >= 0.0 else 0.0
+        if divisor > 0.0 and 2.0 * missing / divisor <= segment.length:
+            return state.input + direction * 2.0 * missing / divisor
+        missing -= segment.length * (b + segment.length * a)
         following = state.step(state.input + direction * segment.length)
         if following.input == state.input:
-            return end
+            return None
         state = following
     return state.input

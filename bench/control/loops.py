@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 from bench.control.tracking import Command, Follower, TargetController, Trace
@@ -22,7 +23,7 @@ class Loop(Protocol):
         """What the controller thinks."""
 
 
-class Reach:
+class ReachTarget:
     """Bring the output to one target.
 
     Parameters
@@ -51,7 +52,7 @@ class Reach:
         return self._controller.trace
 
 
-class Follow:
+class FollowReference:
     """Make the output follow a reference at a fixed rate.
 
     Parameters
@@ -83,6 +84,7 @@ class Follow:
         self._sample = 0
         self._start = 0.0
         self._setpoint = 0.0
+        self._now = 0.0
 
     def begin(self, t: float, measured_input: float, output: float) -> Command:
         """Set the first set-point."""
@@ -92,6 +94,7 @@ class Follow:
 
     def update(self, t: float, measured_input: float, output: float) -> Command:
         """Set the next one, for the reference at the end of the period."""
+        self._now = t - self._start
         if self._sample == self._samples:
             return Command(self._setpoint, 0.0, done=True)
         self._sample += 1
@@ -102,5 +105,5 @@ class Follow:
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
-        return self._follower.trace
+        """What the controller thinks, with the reference of the moment of the last reading."""
+        return replace(self._follower.trace, reference=self._reference(self._now))

@@ -17,8 +17,8 @@ def tracking_targets(rng: np.random.Generator, low: float, high: float, count: i
     """Return targets that visit a range in large and in small moves, up and down.
 
     The first half is a decaying oscillation about the middle of the range, of 2.5 targets a half-cycle so
-    that targets fall on its flanks too; it calls up nested minor loops, as the step references of Zhang et
-    al. 2013, section V, do. The second half is uniformly random.
+    that targets fall on its flanks too; it calls up nested minor loops. The second half is uniformly random.
+    Zhang et al. 2013, section V-B, have targets between -63 and 1814 1/m.
 
     Parameters
     ----------

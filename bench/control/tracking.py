@@ -11,8 +11,14 @@ Rules for all of them:
   what was wished (`state`).
 * A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
   next complete reading, estimators take no value in. A missing output does not keep the memory from following
-  the measured input. How long to put up with missing readings is for the caller to say.
+  the measured input. Controllers with a hysteresis model also take for missing what is further outside the
+  model's range than that is wide. How long to put up with missing readings is for the caller to say.
 * A target that cannot be met is replaced by the closest output, and `reach` says so.
+* Between targets the set-point belongs to the controller: who moves the actuator by other means makes a new
+  controller, from the memory that it has then.
+
+The inverse and its use in open loop: Zhang, Merced, Sepúlveda, Tan, *Modeling and inverse compensation of
+nonmonotonic hysteresis in VO2-coated microactuators*, IEEE/ASME Transactions on Mechatronics, 2013.
 """
 
 from __future__ import annotations
@@ -22,11 +28,9 @@ from collections.abc import Generator
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
-import numpy as np
-
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.inverse import Inverse, Inversion, Reach
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, _checks
+from bench.hysteresis import MemoryCurve, Preisach, _checks
 
 # Part of the output at stake within which a clipped answer still counts as met.
 _CLOSE = 1e-9
@@ -149,6 +153,9 @@ class Reading(NamedTuple):
 Script = Generator[Command, Reading, None]
 """What a controller does for one target: yields commands, is sent readings, goes on holding for ever."""
 
+Move = Generator[Command, Reading, Reading]
+"""A part of a script, which returns its last reading."""
+
 
 @dataclass(frozen=True)
 class Arrival:
@@ -184,24 +191,47 @@ def check_positive(parameters: object, *names: str) -> None:
 
 
 class Actuator:
-    """What every controller keeps: limits, memory, the last set-point, whether the target can be met."""
+    """What every controller keeps: limits, memory, the last set-point, whether the target can be met.
+
+    Parameters
+    ----------
+    input_range : tuple of float
+        Range of the set-points, input units.
+    limits : tuple of float or None
+        A narrower range, input units.
+    model : Preisach or None
+        The model whose memory is kept.
+    state : MemoryCurve or None
+        Memory at the first reading; default the model's initial one.
+
+    Raises
+    ------
+    ValueError
+        If the limits do not increase or have nothing in common with the range.
+    """
 
     def __init__(
         self,
         input_range: tuple[float, float],
-        limits: tuple[float, float] | None,
-        state: MemoryCurve | None,
+        limits: tuple[float, float] | None = None,
+        model: Preisach | None = None,
+        state: MemoryCurve | None = None,
     ) -> None:
-        low, high = input_range
+        low, high = _checks.increasing("limits", input_range).tolist()
         if limits is not None:
             least, greatest = _checks.increasing("limits", limits).tolist()
             low, high = max(low, least), min(high, greatest)
             if low >= high:
-                raise ValueError(f"limits: expected an overlap with the model's range {input_range}, got {limits}")
-        self._low, self._high = low, high
+                raise ValueError(f"limits: expected an overlap with the range {input_range}, got {limits}")
+        self._low, self._high = float(low), float(high)
         self._state = state
-        self._setpoint = self._clip(0.5 * (low + high) if state is None else state.input)
-        self._started = state is not None
+        self._plausible_input = self._plausible_output = (-math.inf, math.inf)
+        if model is not None:
+            self._state = model.initial_state() if state is None else state
+            self._plausible_input = _widened(*model.input_range)
+            self._plausible_output = _widened(*model.output_range())
+        self._setpoint = self._clip(0.5 * (low + high) if self._state is None else self._state.input)
+        self._started = self._state is not None
         self._reach = Reach.MET
 
     @property
@@ -224,7 +254,8 @@ class Actuator:
 
     def _observe(self, measured_input: float) -> bool:
         """Move the memory by what the actuator did; return whether there is something to go by."""
-        if not math.isfinite(measured_input):
+        low, high = self._plausible_input
+        if not (math.isfinite(measured_input) and low <= measured_input <= high):
             return False
         if self._state is not None:
             self._state = self._state.step(measured_input)
@@ -232,6 +263,11 @@ class Actuator:
             # Without a memory, the first reading says where the actuator is.
             self._setpoint, self._started = self._clip(measured_input), True
         return True
+
+    def _is_known(self, output: float) -> bool:
+        """Return whether there is a plausible reading of the output."""
+        low, high = self._plausible_output
+        return math.isfinite(output) and low <= output <= high
 
     def _answer(self, operator: Preisach, found: Inversion, target: float) -> tuple[float, ...]:
         """Return the set-points of an inversion within the limits, and note whether they meet the target."""
@@ -244,6 +280,11 @@ class Actuator:
         return setpoints
 
 
+def _widened(low: float, high: float) -> tuple[float, float]:
+    """Return a range with its own width added at both ends."""
+    return 2.0 * low - high, 2.0 * high - low
+
+
 class Scripted(Actuator):
     """A target controller as a script: a generator that yields commands and is sent readings."""
 
@@ -253,10 +294,11 @@ class Scripted(Actuator):
     def __init__(
         self,
         input_range: tuple[float, float],
-        limits: tuple[float, float] | None,
-        state: MemoryCurve | None,
+        limits: tuple[float, float] | None = None,
+        model: Preisach | None = None,
+        state: MemoryCurve | None = None,
     ) -> None:
-        super().__init__(input_range, limits, state)
+        super().__init__(input_range, limits, model, state)
         self._target = math.nan
         self._script: Script | None = None
         self._done = False
@@ -281,7 +323,7 @@ class Scripted(Actuator):
             If the target is not finite.
         """
         self._target = _checks.number("target", target)
-        self._script, self._done = None, False
+        self._script, self._done, self._reach = None, False, Reach.MET
         return self.update(t, measured_input, output)
 
     def update(self, t: float, measured_input: float, output: float) -> Command:
@@ -295,7 +337,7 @@ class Scripted(Actuator):
         if math.isnan(self._target):
             raise RuntimeError("update: expected a target first, by aim")
         known = self._observe(measured_input)
-        if not known or (self._needs_output and not math.isfinite(output)):
+        if not known or (self._needs_output and not self._is_known(output)):
             return Command(self._setpoint, self._poll, self._done)
         reading = Reading(t, measured_input, output)
         if self._script is None:
@@ -311,8 +353,7 @@ class Scripted(Actuator):
 
     def _command(self, setpoint: float, wait: float, done: bool = False) -> Command:
         """Return a command whose set-point is within the limits."""
-        if math.isfinite(setpoint):
-            self._setpoint = self._clip(setpoint)
+        self._setpoint = self._clip(setpoint)
         return Command(self._setpoint, wait, done)
 
     def _hold(self, wait: float) -> Script:
@@ -320,27 +361,25 @@ class Scripted(Actuator):
         while True:
             yield Command(self._setpoint, wait, done=True)
 
-    def _arrive(self, setpoint: float, arrival: Arrival) -> Generator[Command, Reading, list[Reading]]:
-        """Go to a set-point and return the readings since the actuator came there."""
-        inside: list[Reading] = []
-        started: float | None = None
+    def _arrive(self, setpoint: float, arrival: Arrival) -> Move:
+        """Go to a set-point and return the reading with which the actuator has arrived."""
+        # Clocks start with the first reading: until then readings may have been missing.
+        started = since = math.nan
         while True:
             reading = yield self._command(setpoint, arrival.poll)
-            # The clock starts with the first reading: until then readings may have been missing.
-            started = reading.time - arrival.poll if started is None else started
+            if math.isnan(started):
+                started = reading.time - arrival.poll
             if abs(reading.input - self._setpoint) < arrival.tolerance:
-                inside.append(reading)
-                # Times are sums of floats.
-                if reading.time - inside[0].time >= arrival.hold - 1e-9:
-                    return inside
+                since = reading.time if math.isnan(since) else since
             else:
-                inside.clear()
-                if reading.time - started >= arrival.patience:
-                    return [reading]
+                since = math.nan
+            # Times are sums of floats.
+            if reading.time - since >= arrival.hold - 1e-9 or reading.time - started >= arrival.patience:
+                return reading
 
 
 class OpenLoopInverse(Scripted):
-    """Sets what the exact inverse says, and waits (Zhang et al. 2013, section IV).
+    """Sets what the exact inverse says, and waits (Zhang et al. 2013, section V).
 
     Where the inverse has two elements the actuator is sent to the first, an end of the transition, waits
     there, and then goes to the second, found again from what the actuator really did.
@@ -369,9 +408,7 @@ class OpenLoopInverse(Scripted):
     ) -> None:
         if not 0.0 < wait < math.inf:
             raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
-        super().__init__(
-            inverse.operator.input_range, limits, inverse.operator.initial_state() if state is None else state
-        )
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
         self._wait = wait
 
@@ -390,142 +427,6 @@ class OpenLoopInverse(Scripted):
             (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
             yield self._command(second, self._wait)
         yield from self._hold(self._poll)
-
-
-class LookUp(Scripted):
-    """Sets what the single-valued inverse of a polynomial says: the model without hysteresis, for comparison.
-
-    A polynomial need not be monotone. The table is its running maximum from the lowest point of the range up
-    to the highest one (running minimum, if the lowest comes after the highest), which has one input for each
-    output. Targets beyond are given the input of the lowest or highest point, and `reach` says so.
-
-    Parameters
-    ----------
-    polynomial : Polynomial
-        The model.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the range of the model. The table spans no more.
-    wait : float
-        Time for the actuator to settle, s.
-    points : int
-        Number of points of the table.
-    """
-
-    _needs_output = False
-
-    def __init__(
-        self,
-        polynomial: Polynomial,
-        limits: tuple[float, float] | None = None,
-        *,
-        wait: float = 8.0,
-        points: int = 4001,
-    ) -> None:
-        if not 0.0 < wait < math.inf:
-            raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
-        if points < 2:
-            raise ValueError(f"points: expected at least 2, got {points}")
-        super().__init__(polynomial.input_range, limits, None)
-        self._polynomial = polynomial
-        self._wait = wait
-        inputs = np.linspace(*self.limits, points)
-        outputs = polynomial.evaluate(inputs)
-        lowest, highest = int(outputs.argmin()), int(outputs.argmax())
-        step = 1 if lowest <= highest else -1
-        rising = slice(lowest, highest + step if highest + step >= 0 else None, step)
-        envelope = np.maximum.accumulate(outputs[rising])
-        # Of a level stretch only the first input: one input for each output.
-        new = np.concatenate([[True], np.diff(envelope) > 0.0])
-        self._outputs, self._inputs = envelope[new], inputs[rising][new]
-        self._measured = math.nan
-
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        predicted = self._polynomial.evaluate([self._measured]).item() if self._started else math.nan
-        return Trace(reference=self._target, predicted=predicted)
-
-    def _observe(self, measured_input: float) -> bool:
-        known = super()._observe(measured_input)
-        if known:
-            self._measured = measured_input
-        return known
-
-    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
-        self._reach = Reach.MET
-        if target > self._outputs[-1]:
-            self._reach = Reach.TOO_HIGH
-        elif target < self._outputs[0]:
-            self._reach = Reach.TOO_LOW
-        yield self._command(float(np.interp(target, self._outputs, self._inputs)), self._wait)
-        yield from self._hold(self._poll)
-
-
-@dataclass(frozen=True)
-class IntegralParameters:
-    """Numbers of the integral controllers.
-
-    Parameters
-    ----------
-    gain : float
-        Input units per second for one output unit of error; negative for an actuator whose output falls.
-        On a branch of slope s the closed loop has the time constant 1 / (gain s), which should not be
-        shorter than the input takes to settle: the default gives 1.4 s at 280 (1/m)/K, the steepest of a
-        VO2 film, and 14 s where it is a tenth of that.
-    period : float
-        Time between two corrections, s.
-    duration : float
-        Time for each target, s; not used where the reference moves.
-    """
-
-    gain: float = 0.0025
-    period: float = 0.5
-    duration: float = 8.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, "period", "duration")
-        if not math.isfinite(self.gain) or self.gain == 0.0:
-            raise ValueError(f"gain: expected a number other than 0, got {self.gain}")
-
-
-class IntegralControl(Scripted):
-    """Integral action without a model: the comparison for what the inverse is worth.
-
-    The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
-    error turns: it cannot wind up.
-
-    Parameters
-    ----------
-    limits : tuple of float
-        Least and greatest set-point, input units.
-    parameters : IntegralParameters
-        Gain and times.
-    """
-
-    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
-        super().__init__(tuple(_checks.increasing("limits", limits).tolist()), None, None)
-        self._parameters = parameters or IntegralParameters()
-
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        return Trace(reference=self._target)
-
-    def _run(self, target: float, reading: Reading) -> Script:
-        p = self._parameters
-        for _ in range(max(1, round(p.duration / p.period))):
-            error = target - reading.output
-            wished = self._setpoint + p.gain * p.period * error
-            self._reach = saturation(wished, self._low, self._high, error)
-            reading = yield self._command(wished, p.period)
-        yield from self._hold(self._poll)
-
-
-def saturation(wished: float, low: float, high: float, error: float) -> Reach:
-    """Return what a wish beyond the limits says of the target."""
-    if low <= wished <= high:
-        return Reach.MET
-    return Reach.TOO_HIGH if error > 0.0 else Reach.TOO_LOW
 
 
 @dataclass(frozen=True)
@@ -549,7 +450,7 @@ class CorrectionParameters:
         When the actuator has arrived at a set-point.
     """
 
-    corrections: int = 4
+    corrections: int = 3
     close_enough: float = 5.0
     walk_variance: float = 3.0
     reading_variance: float = 1.0
@@ -562,10 +463,7 @@ class CorrectionParameters:
 
 
 class Correcting(Scripted):
-    """The closed loop that `ClosedLoopInverse` is and others fall back to.
-
-    Parameters as of `ClosedLoopInverse`.
-    """
+    """The moves that `ClosedLoopInverse` consists of and that others fall back to; parameters as there."""
 
     def __init__(
         self,
@@ -574,9 +472,7 @@ class Correcting(Scripted):
         limits: tuple[float, float] | None,
         parameters: CorrectionParameters,
     ) -> None:
-        super().__init__(
-            inverse.operator.input_range, limits, inverse.operator.initial_state() if state is None else state
-        )
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
         self._correction = parameters
         self._poll = parameters.arrival.poll
@@ -601,27 +497,27 @@ class Correcting(Scripted):
         assert self._state is not None
         return self._inverse.operator.value(self._state)
 
-    def _towards(self, target: float) -> Generator[Command, Reading, list[Reading]]:
-        """Go where the model has the output at `target`, through saturation if need be; return readings there."""
+    def _towards(self, target: float) -> Move:
+        """Go where the model has the output at `target`, through saturation if need be."""
         assert self._state is not None
         operator = self._inverse.operator
         arrival = self._correction.arrival
         first, *rest = self._answer(operator, self._inverse.invert(self._state, target), target)
-        readings = yield from self._arrive(first, arrival)
+        reading = yield from self._arrive(first, arrival)
         if rest:
             (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
-            readings = yield from self._arrive(second, arrival)
-        return readings
+            reading = yield from self._arrive(second, arrival)
+        return reading
 
-    def _correct(self, target: float, corrections: int) -> Generator[Command, Reading, None]:
-        """Correct by the disturbance that is measured where the actuator has come to."""
-        readings = yield from self._towards(target - self._estimator.value)
-        for _ in range(corrections):
-            output = readings[-1].output
-            self._estimator.update(output - self._model())
-            if abs(target - output) <= self._correction.close_enough:
+    def _correct(self, target: float) -> Move:
+        """Go to the target and correct by the disturbance that is measured where the actuator has come to."""
+        reading = yield from self._towards(target - self._estimator.value)
+        for _ in range(self._correction.corrections):
+            self._estimator.update(reading.output - self._model())
+            if abs(target - reading.output) <= self._correction.close_enough:
                 break
-            readings = yield from self._towards(target - self._estimator.value)
+            reading = yield from self._towards(target - self._estimator.value)
+        return reading
 
 
 class ClosedLoopInverse(Correcting):
@@ -653,6 +549,6 @@ class ClosedLoopInverse(Correcting):
     ) -> None:
         super().__init__(inverse, state, limits, parameters or CorrectionParameters())
 
-    def _run(self, target: float, reading: Reading) -> Script:
-        yield from self._correct(target, self._correction.corrections)
+    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
+        yield from self._correct(target)
         yield from self._hold(self._poll)

@@ -43,7 +43,7 @@ def increasing(name: str, values: ArrayLike, least: int = 2) -> Floats:
     return array
 
 
-def number(name: str, value: float) -> float:
+def number(name: str, value: Any) -> float:  # noqa: ANN401 - whatever somebody gave
     """Return `value` as a finite float; a text is none, whatever it says."""
     try:
         if isinstance(value, str):

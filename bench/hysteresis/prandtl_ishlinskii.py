@@ -284,7 +284,7 @@ class PrandtlIshlinskii:
         """
         if not math.isfinite(value):
             raise ValueError(f"value: expected a finite number, got {value}")
-        thresholds, weights = self._lists
+        thresholds, _ = self._lists
         if len(state) != len(thresholds):
             raise ValueError(f"state: expected {len(thresholds)} play states, got {len(state)}")
         x = self._inner(value)

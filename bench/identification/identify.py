@@ -3,27 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.hysteresis import (
+    DeadZones,
+    MemoryCurve,
     Operator,
     Polynomial,
+    PrandtlIshlinskii,
     Preisach,
     QuadraticTerm,
-    Reversible,
+    Regressor,
     ThermalExpansion,
     _checks,
     uniform_levels,
 )
 from bench.hysteresis._checks import Floats
-from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
+from bench.hysteresis.prandtl_ishlinskii import PlayState
+from bench.identification.inspection import check_data, measure_coverage, swept_cells
+from bench.identification.least_squares import (
+    Certificate,
+    Fit,
+    Flags,
+    Indices,
+    Layout,
+    fit,
+    fit_minimum_norm,
+    fit_on,
+)
 from bench.identification.measures import Errors, measure_errors
 
 ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic"]
+Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
+
+# Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
+_LEAST_SLOPE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +55,8 @@ class Identification:
     model : Operator
         The identified operator.
     residuals : ndarray, shape (N,)
-        Measured minus model output for every sample, the skipped ones too, output units.
+        Measured output minus `model.evaluate(inputs, initial_state)` for every sample, the skipped ones too,
+        output units.
     errors : Errors
         Measures over the samples after `skip`.
     uncertainties : ndarray, shape (K + q,)
@@ -46,6 +65,10 @@ class Identification:
         Optimality, conditioning and coverage of the fit.
     skip : int
         Number of first samples left out of the cost.
+    initial_state : object
+        State before the first sample from which the model was fitted.
+    warnings : tuple of str
+        What is odd about the data or not covered by them.
     """
 
     model_name: str
@@ -55,6 +78,8 @@ class Identification:
     uncertainties: Floats
     certificate: Certificate
     skip: int
+    initial_state: Any = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,9 +91,9 @@ class ModelSpec:
     summary : str
         What it is, in one line.
     template : callable
-        Takes the inputs and the keyword options of `identify`; returns the operator with zero coefficients.
+        Takes the inputs and the keyword options of `identify`; returns the operator before the fit.
     constrained : bool
-        Whether the density must not be negative; otherwise the least-norm solution is taken.
+        Whether the coefficients must not be negative; otherwise the least-norm solution is taken.
     """
 
     summary: str
@@ -84,6 +109,7 @@ def identify(
     weights: ArrayLike | None = None,
     skip: int = 0,
     smoothing: float = 0.0,
+    initial: Initial | None = None,
     **options: Any,  # noqa: ANN401 - each template names and types its own
 ) -> Identification:
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
@@ -94,10 +120,25 @@ def identify(
     `preisach-signed`           density of either sign, least norm; options as `preisach`
     `preisach-nonmonotonic`     nonnegative density and thermal term (Zhang et al. 2013, eq. 12); options
                                 `levels` (20), `plane` (30, 70), `reference` (20), `input_range`
+    `prandtl-ishlinskii`        nonnegative weights of plays; options `plays` (15), `maximum` (half the range of
+                                the inputs: thresholds are i maximum / plays), `origin` (0), `dead_zones` (0:
+                                number of thresholds of a map after the plays), `input_range`
     `polynomial`                without memory; options `degree` (12), `input_range`
     ==========================  ==============================================================================
 
-    `input_unit` and `output_unit` are options of each. Every Preisach model starts from negative saturation.
+    `input_unit` and `output_unit` are options of each.
+
+    The memory before the first sample (`initial`) is one of
+
+    - None: the operator's own initial state, negative saturation for a Preisach model, relaxed for plays;
+    - "negative", "positive": saturation at the low or the high end of the operating range;
+    - "skip": unknown; the first samples are left out of the cost until the inputs have overwritten every part
+      of the memory that they overwrite at all (what they never do is constant, and the bias takes it);
+    - "estimate": unknown and estimated, for Preisach models with a nonnegative density. Each cell that is swept
+      later on but whose start is unknown gets two nonnegative coefficients instead of one, the density of
+      relays that were on and of those that were off: the on-fraction then is free between 0 and 1 and the
+      problem stays linear. The staircase that agrees best with these fractions becomes the initial memory, and
+      the density is fitted again from there.
 
     Parameters
     ----------
@@ -111,19 +152,82 @@ def identify(
         Number of first samples left out of the cost because their memory is unknown.
     smoothing : float
         Weight of the roughness penalty of `fit`; only for nonnegative densities.
+    initial : {"negative", "positive", "skip", "estimate"} or None
+        The memory before the first sample, as above.
     **options
         As listed above; `levels` is the number of intervals or the increasing levels themselves.
 
     Returns
     -------
     Identification
-        Model, residuals, errors and certificate.
+        Model, residuals, errors, certificate and warnings.
 
     Raises
     ------
     ValueError
         If the name is unknown, an option does not belong to it, or the data are unfit; see `fit`.
     """
+    problem = prepare(model_name, inputs, outputs, weights, skip, smoothing, initial, options)
+    solution = problem.fit(smoothing)
+    model = problem.template.with_coefficients(solution.coefficients, solution.bias)
+    predicted = model.evaluate(problem.inputs, problem.state)
+    return Identification(
+        model_name=model_name,
+        model=model,
+        residuals=problem.outputs - predicted,
+        errors=measure_errors(problem.outputs[problem.skip :], predicted[problem.skip :]),
+        uncertainties=solution.uncertainties,
+        certificate=solution.certificate,
+        skip=problem.skip,
+        initial_state=problem.state,
+        warnings=problem.warnings(),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A measured sequence set up for a model: everything but the smoothing."""
+
+    model_name: str
+    inputs: Floats
+    outputs: Floats
+    weights: Floats
+    skip: int
+    template: Operator[Any]
+    state: Any
+    regressor: Regressor
+
+    def fit(self, smoothing: float, weights: Floats | None = None) -> Fit:
+        """Return the coefficients for the problem's weights or others."""
+        w = self.weights if weights is None else weights
+        if MODELS[self.model_name].constrained:
+            signs = _signs(self.template, self.regressor)
+            return fit(
+                self.regressor, self.outputs, nonnegative=signs, weights=w, skip=self.skip, smoothing=smoothing
+            )
+        return fit_minimum_norm(self.regressor, self.outputs, weights=w, skip=self.skip)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what is odd about the data or not covered by them."""
+        found = check_data(self.inputs, self.outputs)
+        if isinstance(self.template, Preisach):
+            coverage = measure_coverage(self.template, self.inputs, self.state)
+            if coverage.never.size:
+                found.append(coverage.summary())
+        return tuple(found)
+
+
+def prepare(
+    model_name: str,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    weights: ArrayLike | None,
+    skip: int,
+    smoothing: float,
+    initial: Initial | None,
+    options: dict[str, Any],
+) -> Problem:
+    """Return the problem that `identify` solves; its arguments are those of `identify`."""
     if model_name not in MODELS:
         raise ValueError(f"model_name: expected one of {', '.join(sorted(MODELS))}, got {model_name!r}")
     spec = MODELS[model_name]
@@ -131,32 +235,168 @@ def identify(
     measured = _checks.samples("outputs", outputs)
     if measured.size != sequence.size:
         raise ValueError(f"outputs: expected {sequence.size} values, one for each input, got {measured.size}")
+    w = np.ones(sequence.size) if weights is None else _checks.samples("weights", weights)
+    if initial not in (None, "negative", "positive", "skip", "estimate"):
+        raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
     if smoothing and not spec.constrained:
         raise ValueError(f"smoothing: {model_name} takes the least-norm solution instead")
+    options = dict(options)
+    dead_zones = options.pop("dead_zones", 0) if spec.template is _prandtl_ishlinskii else 0
     try:
         template = spec.template(sequence, **options)
     except TypeError as error:
         raise ValueError(f"options of {model_name}: {error}") from None
-    regressor = template.regressor(sequence)
-    solution: Fit
-    if spec.constrained:
-        term: Reversible | None = getattr(template, "reversible", None)
-        signs = np.ones(regressor.shape[1], dtype=bool)
-        signs[regressor.base.size :] = term is not None and term.nonnegative
-        solution = fit(regressor, measured, nonnegative=signs, weights=weights, skip=skip, smoothing=smoothing)
+    state: Any = None
+    if initial == "skip":
+        skip = max(skip, _unknown_until(template, sequence))
+    elif initial == "estimate":
+        if not isinstance(template, Preisach) or not spec.constrained:
+            raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
+        state = _estimate(template, sequence, measured, w, skip, smoothing)
+    elif initial is not None and isinstance(template, Preisach):
+        low, high = template.input_range
+        negative = initial == "negative"
+        state = MemoryCurve((), low, -1) if negative else MemoryCurve((), high, 1)
+    elif initial is not None and isinstance(template, PrandtlIshlinskii):
+        state = template.saturated_state(-1 if initial == "negative" else 1)
+    state = template.initial_state() if state is None else state
+    if isinstance(template, PrandtlIshlinskii) and dead_zones:
+        template = _with_dead_zones(template, dead_zones, sequence, measured, w, skip, state)
+    regressor = template.regressor(sequence, state)
+    return Problem(model_name, sequence, measured, w, skip, template, state, regressor)
+
+
+def _signs(template: Operator[Any], regressor: Regressor) -> Flags:
+    """Return which coefficients must not be negative."""
+    signs = np.ones(regressor.shape[1], dtype=bool)
+    if isinstance(template, Preisach):
+        signs[regressor.base.size :] = template.reversible is not None and template.reversible.nonnegative
+    return signs
+
+
+def _unknown_until(template: Operator[Any], inputs: Floats) -> int:
+    """Return the first sample from which the inputs have overwritten all the memory that they ever do."""
+    top, bottom = np.maximum.accumulate(inputs), np.minimum.accumulate(inputs)
+    if isinstance(template, Preisach):
+        low, high = float(template.levels[0]), float(template.levels[-1])
+    elif isinstance(template, PrandtlIshlinskii):
+        low, high = -np.inf, np.inf
     else:
-        solution = fit_minimum_norm(regressor, measured, weights=weights, skip=skip)
-    model = template.with_coefficients(solution.coefficients, solution.bias)
-    predicted = model.evaluate(sequence)
-    return Identification(
-        model_name=model_name,
-        model=model,
-        residuals=measured - predicted,
-        errors=measure_errors(measured[skip:], predicted[skip:]),
-        uncertainties=solution.uncertainties,
-        certificate=solution.certificate,
-        skip=skip,
+        return 0
+    # A relay is known once α <= top or β >= bottom: none that will be switched may be left.
+    rising = (top >= min(top[-1], high)) | (bottom <= low)
+    falling = (bottom <= max(bottom[-1], low)) | (top >= high)
+    return int(np.argmax(rising & falling))
+
+
+def _estimate(
+    template: Preisach, inputs: Floats, outputs: Floats, weights: Floats, skip: int, smoothing: float
+) -> MemoryCurve:
+    """Return the initial memory that the outputs suggest; see `identify`."""
+    low, high = template.input_range
+    off = template.regressor(inputs, MemoryCurve((), low, -1))
+    on = template.regressor(inputs, MemoryCurve((), high, 1))
+    count = off.base.size
+    # The first input tells all relays but those around it: α above and β below.
+    rows_of, columns_of = np.tril_indices(template.order)
+    around = (template.levels[rows_of + 1] > inputs[0]) & (template.levels[columns_of] < inputs[0])
+    unknown = np.flatnonzero(around & (swept_cells(off) | swept_cells(on)))
+    place = np.full(count, -1)
+    place[unknown] = count + np.arange(unknown.size)
+    rows = np.concatenate([_rows(off), _rows(on)])
+    cells = np.concatenate([off.cells, place[on.cells]])
+    changes = np.concatenate([off.changes, on.changes])
+    kept = cells >= 0
+    order = np.argsort(rows[kept], kind="stable")
+    both = Regressor(
+        base=np.concatenate([off.base, on.base[unknown]]),
+        starts=np.searchsorted(rows[kept][order], np.arange(inputs.size + 1)),
+        cells=cells[kept][order].astype(np.int32),
+        changes=changes[kept][order],
+        extra=off.extra,
     )
+    layout = Layout(
+        template.order,
+        np.concatenate([np.arange(count), unknown]),
+        np.repeat([0, 1], [count, unknown.size]),
+    )
+    signs = np.ones(both.shape[1], dtype=bool)
+    signs[: both.base.size] = True
+    signs[both.base.size :] = _signs(template, off)[count:]
+    x = fit_on(layout, both, outputs, signs, weights, skip, smoothing).coefficients
+    # How much more mass was on than off: the staircase should take in what is positive.
+    balance = np.zeros(count)
+    balance[unknown] = (x[count : count + unknown.size] - x[unknown]) * template.cell_areas()[unknown]
+    return _staircase(template, balance, float(inputs[0]))
+
+
+def _rows(regressor: Regressor) -> Indices:
+    """Return the row of each sparse entry."""
+    return np.repeat(np.arange(regressor.shape[0]), np.diff(regressor.starts))
+
+
+def _staircase(template: Preisach, balance: Floats, present: float) -> MemoryCurve:
+    """Return the memory at input `present` whose on-region has the greatest sum of `balance`, to whole cells."""
+    levels, order = template.levels, template.order
+    low = template.input_range[0]
+    memory = MemoryCurve((), min(low, present), -1)
+    k = int(np.searchsorted(levels, present, side="right")) - 1
+    if not 0 <= k < order:
+        return memory.step(present)
+    plane = np.zeros((order, order))
+    plane[np.tril_indices(order)] = balance
+    # worth[j, h]: column j on up to level k + h; the staircase must not rise from one column to the next.
+    worth = np.zeros((k + 1, order - k + 1))
+    np.cumsum(plane[k:, : k + 1].T, axis=1, out=worth[:, 1:])
+    best = np.empty_like(worth)
+    best[0] = worth[0]
+    for j in range(1, k + 1):
+        best[j] = worth[j] + np.maximum.accumulate(best[j - 1][::-1])[::-1]
+    heights = [int(np.argmax(best[k]))]
+    for j in range(k - 1, -1, -1):
+        heights.append(heights[-1] + int(np.argmax(best[j, heights[-1] :])))
+    heights.reverse()
+    for j, height in enumerate(heights):
+        if j and height < heights[j - 1]:
+            memory = memory.step(float(levels[j]))
+        if height and (not j or height < heights[j - 1]):
+            memory = memory.step(float(levels[k + height]))
+    return memory.step(present)
+
+
+def _with_dead_zones(
+    template: PrandtlIshlinskii,
+    count: int,
+    inputs: Floats,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    state: PlayState,
+) -> PrandtlIshlinskii:
+    """Return the operator with play weights, and dead zones after the plays whose slopes are still to be fitted.
+
+    Kuhnen 2003, section 5: the error is taken between the plays and the dead zones, plays(u) - S⁻¹(y), which is
+    linear in the play weights and the slopes of S⁻¹ together. The slope of the interval that holds the median
+    output is 1: a factor can be moved from the plays to the dead zones.
+    """
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"dead_zones: expected an integer >= 0, got {count!r}")
+    middle = float(np.median(outputs))
+    edges = np.linspace(outputs.min(), outputs.max(), count + 2)[1:-1] - middle
+    if not (np.diff(edges, prepend=-np.inf) > 0.0).all():
+        raise ValueError("outputs: constant; dead zones need outputs that vary")
+    shares = DeadZones(edges, np.ones(count + 1)).columns(outputs - middle)
+    reference = int(np.searchsorted(edges, 0.0))
+    others = np.delete(np.arange(count + 1), reference)
+    plain = template.regressor(inputs, state)
+    joint = replace(plain, extra=np.ascontiguousarray(np.column_stack([plain.extra, -shares[:, others]])))
+    target = shares[:, reference] + _LEAST_SLOPE * shares[:, others].sum(axis=1)
+    found = fit(joint, target, weights=weights, skip=skip)
+    slopes = np.ones(count + 1)
+    slopes[others] = _LEAST_SLOPE + found.coefficients[plain.shape[1] :]
+    to_plays = DeadZones(edges, slopes)
+    after = DeadZones(to_plays(edges) - found.bias, 1.0 / slopes)
+    return replace(template, weights=found.coefficients[: plain.shape[1]], after=after)
 
 
 def _lattice(levels: int | ArrayLike, plane: tuple[float, float]) -> Floats:
@@ -246,11 +486,41 @@ def _polynomial(
     return Polynomial(np.zeros(degree), span, input_unit=input_unit, output_unit=output_unit)
 
 
+def _prandtl_ishlinskii(
+    inputs: Floats,
+    *,
+    plays: int = 15,
+    maximum: float | None = None,
+    origin: float = 0.0,
+    input_range: tuple[float, float] | None = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> PrandtlIshlinskii:
+    if plays < 1:
+        raise ValueError(f"plays: expected at least 1, got {plays}")
+    low, high = _input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
+    if high <= low:
+        raise ValueError(f"maximum: expected a positive number, got {maximum}")
+    return PrandtlIshlinskii(
+        0.5 * (high - low) * np.arange(plays) / plays,
+        np.zeros(plays),
+        origin=origin,
+        input_range=_operating(inputs, (np.inf, -np.inf), input_range),
+        input_unit=input_unit,
+        output_unit=output_unit,
+    )
+
+
 MODELS: dict[str, ModelSpec] = {
     "preisach": ModelSpec("Preisach operator with a nonnegative density", _preisach, constrained=True),
     "preisach-signed": ModelSpec("Preisach operator with a density of either sign", _preisach, constrained=False),
     "preisach-nonmonotonic": ModelSpec(
         "nonnegative Preisach operator and a quadratic thermal term, as for VO2", _nonmonotonic, constrained=True
+    ),
+    "prandtl-ishlinskii": ModelSpec(
+        "Prandtl-Ishlinskii operator with nonnegative weights, and dead zones on request",
+        _prandtl_ishlinskii,
+        constrained=True,
     ),
     "polynomial": ModelSpec("single-valued polynomial, without memory", _polynomial, constrained=False),
 }

@@ -138,12 +138,25 @@ def fit(
     ValueError
         If a length does not fit, a number is not finite, a weight is negative, or nothing is left to fit.
     """
+    return fit_on(Layout.of(regressor.base.size), regressor, outputs, nonnegative, weights, skip, smoothing)
+
+
+def fit_on(
+    layout: Layout,
+    regressor: Regressor,
+    outputs: ArrayLike,
+    nonnegative: ArrayLike = True,
+    weights: ArrayLike | None = None,
+    skip: int = 0,
+    smoothing: float = 0.0,
+) -> Fit:
+    """Return what `fit` does, for sparse columns that lie in the plane as told."""
     y, w = _cost(regressor, outputs, weights, skip)
     constrained = np.broadcast_to(np.asarray(nonnegative, dtype=bool), (regressor.shape[1],))
     if not smoothing >= 0.0 or not np.isfinite(smoothing):
         raise ValueError(f"smoothing: expected a finite number >= 0, got {smoothing}")
     with _one_thread():
-        return _ActiveSet(regressor, y, w, constrained, Layout.of(regressor.base.size), smoothing).solve()
+        return _ActiveSet(regressor, y, w, constrained, layout, smoothing).solve()
 
 
 def fit_minimum_norm(
@@ -261,6 +274,8 @@ class _Factor:
         from scipy.linalg.lapack import dpotrf
 
         old, more = cross.shape
+        if not more:
+            return None
         if old + more > self.upper.shape[0]:
             room = max(64, old + more + (old + more) // 2)
             grown = np.zeros((room, room))
@@ -305,11 +320,12 @@ class _Factor:
         one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
         return float(one), float(two)
 
-    def inverse_diagonal(self) -> Floats:
-        from scipy.linalg.lapack import dtrtri
+    def inverse(self) -> Floats:
+        """Return the lower half of the inverse of the Gram block."""
+        from scipy.linalg.lapack import dpotri
 
-        inverse, _ = dtrtri(self.compact, lower=1)
-        return np.asarray((inverse**2).sum(axis=0))
+        lower, _ = dpotri(self.compact, lower=1)
+        return np.asarray(lower)
 
     def condition(self, gram: Floats) -> float:
         from scipy.linalg.lapack import dpocon
@@ -507,6 +523,11 @@ class _ActiveSet:
             barred.append(self.leave(leave))
 
     def solve(self) -> Fit:
+        self.minimise()
+        return self.result()
+
+    def minimise(self) -> None:
+        """Find the passive set and the coefficients."""
         free = np.flatnonzero(~self.constrained & self.usable)
         first = np.concatenate([free[free >= self.cells], free[free < self.cells]])
         if self.penalty is not None:
@@ -547,7 +568,6 @@ class _ActiveSet:
             if self.passive.size < entered or entered < before:
                 barred[:] = False
             barred[dependent] = True
-        return self.result()
 
     def gain(self) -> float:
         """Return by how much the settled passive set lowers the cost, doubled."""
@@ -572,7 +592,7 @@ class _ActiveSet:
         layout, parents = self.layout.coarser()
         count, r = layout.cells.size, self.regressor
         merged = Regressor(
-            base=np.bincount(parents, r.base, minlength=count),
+            base=np.bincount(parents, r.base, minlength=count).astype(np.float64),
             starts=r.starts,
             cells=parents[r.cells].astype(np.int32),
             changes=r.changes,
@@ -583,7 +603,7 @@ class _ActiveSet:
         constrained[count:] = self.constrained[self.cells :]
         # A Laplacian of twice the step is four times as great, on a quarter of the cells.
         coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, 0.25 * self.smoothing, absolute=True)
-        coarse.solve()
+        coarse.minimise()
         values = (coarse.x / coarse.norms)[:count]
         chosen = signed.copy()
         chosen[: self.cells] &= self.layout.around(values[parents] > 0.0)
@@ -611,20 +631,15 @@ class _ActiveSet:
             g = better
         return g
 
-    def effective(self) -> float:
+    def effective(self, inverse: Floats) -> float:
         """Return the number of coefficients that the data determine: the passive ones less what smoothness does."""
-        if self.penalty is None or not self.passive.size:
+        if self.penalty is None:
             return float(self.passive.size)
-        from scipy.linalg.lapack import dpotri
-
-        inverse, _ = dpotri(self.factor.compact, lower=1)
         inside = np.flatnonzero(self.passive < self.cells)
         cells = self.passive[inside]
         block = self.penalty[cells][:, cells].tocoo()
         rows, columns = inside[block.row], inside[block.col]
-        # Only the lower half of the inverse is there.
-        entries = inverse[np.maximum(rows, columns), np.minimum(rows, columns)]
-        return float(self.passive.size - block.data @ entries)
+        return float(self.passive.size - block.data @ inverse[np.maximum(rows, columns), np.minimum(rows, columns)])
 
     def result(self) -> Fit:
         passive = self.passive
@@ -634,15 +649,13 @@ class _ActiveSet:
         violation = np.where(held, np.maximum(g, 0.0), np.abs(g))
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
-        weighted = self.w > 0.0
-        spare = int(weighted.sum()) - 1.0 - self.effective()
         uncertainties = np.full(self.x.size, np.nan)
+        inverse = self.factor.inverse() if passive.size else np.zeros((0, 0))
+        spare = np.count_nonzero(self.w) - 1.0 - self.effective(inverse)
         if spare > 0.5:
             variance = float(self.w @ self.residual() ** 2) / spare
             uncertainties[:] = 0.0
-            if passive.size:
-                uncertainties[passive] = np.sqrt(variance * self.factor.inverse_diagonal())
-                uncertainties[passive] /= self.norms[passive]
+            uncertainties[passive] = np.sqrt(variance * np.diag(inverse)) / self.norms[passive]
         certificate = Certificate(
             kkt_residual=kkt,
             passive=passive.size,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import _checks
+from bench.hysteresis import Operator, _checks
+from bench.hysteresis._checks import Floats
 
 
 @dataclass(frozen=True)
@@ -69,3 +72,80 @@ def measure_errors(measured: ArrayLike, predicted: ArrayLike) -> Errors:
         average=float(error.mean()),
         span=float(np.ptp(truth)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """How one model does on a measured sequence.
+
+    Parameters
+    ----------
+    raw : Errors
+        Errors as they are.
+    rezeroed : Errors
+        Errors after re-zeroing the sensor: the constant offset that leaves the least RMS error is taken off.
+    offset : float
+        That offset, the mean of the residuals, output units.
+    residuals : ndarray, shape (N,)
+        Measured minus model output, raw, output units.
+    """
+
+    raw: Errors
+    rezeroed: Errors
+    offset: float
+    residuals: Floats
+
+
+def compare(
+    models: Mapping[str, Operator[Any]],
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    *,
+    states: Mapping[str, Any] | None = None,
+    skip: int = 0,
+) -> dict[str, Comparison]:
+    """Return how well each of several models predicts one measured sequence.
+
+    Between sessions the offset of a sensor moves: the error with and without it are two different numbers.
+
+    Parameters
+    ----------
+    models : mapping of str to Operator
+        The models by name.
+    inputs, outputs : array_like, shape (N,)
+        The measured sequence.
+    states : mapping of str to state, or None
+        State before the first sample for models that shall not start from their initial state.
+    skip : int
+        Number of first samples left out of errors and offset.
+
+    Raises
+    ------
+    ValueError
+        If there is no model, a state belongs to none, the lengths differ, a sequence is empty or not finite, or
+        nothing is left after `skip`.
+    """
+    sequence = _checks.samples("inputs", inputs)
+    measured = _checks.samples("outputs", outputs)
+    if measured.size != sequence.size:
+        raise ValueError(f"outputs: expected {sequence.size} values, one for each input, got {measured.size}")
+    if not models:
+        raise ValueError("models: expected at least one, got none")
+    if not 0 <= skip < sequence.size:
+        raise ValueError(f"skip: expected 0 <= skip < {sequence.size}, got {skip}")
+    starts = {} if states is None else states
+    strangers = sorted(set(starts) - set(models))
+    if strangers:
+        raise ValueError(f"states: expected names of models, got {', '.join(strangers)}")
+    result = {}
+    for name, model in models.items():
+        predicted = model.evaluate(sequence, starts.get(name))
+        residuals = measured - predicted
+        offset = float(residuals[skip:].mean())
+        result[name] = Comparison(
+            raw=measure_errors(measured[skip:], predicted[skip:]),
+            rezeroed=measure_errors(measured[skip:], predicted[skip:] + offset),
+            offset=offset,
+            residuals=residuals,
+        )
+    return result

@@ -1,4 +1,4 @@
-"""The VO2 paper: characterization, identification and validation on the rig `vo2`.
+"""The VO2 paper on the rig `vo2`: characterization, identification, validation, and tracking with every controller.
 
 J. Zhang, E. Merced, N. Sepúlveda, X. Tan, *Modeling and Inverse Compensation of Nonmonotonic Hysteresis in
 VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "Zhang et al. 2013".
@@ -6,7 +6,8 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.clock import Stopwatch
-from bench.errors import BenchError
-from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors
+from bench.errors import BenchError, DataError
+from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
@@ -26,8 +27,12 @@ from bench.modelling import IdentifiedFile, errors_json, identify_file, predict
 from bench.protocol import find_protocol
 from bench.report import export_run
 from bench.runs import Run, RunResult, carry_out
+from bench.tracking_results import FollowingResult, TargetResults, following_result, target_results
 
 Floats = npt.NDArray[np.float64]
+
+TRACKING_OFFSET = 0.12
+"""The same in the tracking sessions, K."""
 
 INPUT = "tec_temperature"
 OUTPUT = "curvature"
@@ -62,13 +67,58 @@ class PaperModel:
     validation: float
 
 
+PROPOSED = "preisach-nonmonotonic"
+
 MODELS = (
-    PaperModel(
-        "nonmonotonic", "proposed model", "preisach-nonmonotonic", {"levels": 20, "plane": (30.0, 70.0)}, 46.8, 108.1
-    ),
+    PaperModel("nonmonotonic", "proposed model", PROPOSED, {"levels": 20, "plane": (30.0, 70.0)}, 46.8, 108.1),
     PaperModel("signed", "signed Preisach", "preisach-signed", {"levels": 20, "plane": (21.0, 84.0)}, 80.3, 108.8),
     PaperModel("polynomial", "polynomial, degree 12", "polynomial", {"degree": 12}, 483.0, 478.1),
 )
+
+
+@dataclass(frozen=True)
+class TrackingSession:
+    """One controller at 60 targets, and what the paper says of it.
+
+    Attributes
+    ----------
+    key : str
+        Name in the JSON.
+    title : str
+        Name in tables and figures.
+    controller : str
+        Name of the controller.
+    model : str
+        Model that it takes.
+    paper_max, paper_rms : float or None
+        The paper's errors, 1/m (section V-B).
+    """
+
+    key: str
+    title: str
+    controller: str
+    model: str
+    paper_max: float | None = None
+    paper_rms: float | None = None
+
+
+TRACKING = (
+    TrackingSession(
+        "open_loop_inverse", "open-loop inverse", "open-loop-inverse", "preisach-nonmonotonic", 78.0, 26.7
+    ),
+    TrackingSession("polynomial", "polynomial look-up", "polynomial", "polynomial", 734.2, 320.6),
+    TrackingSession("integral", "integral, no inverse", "integral", "preisach-nonmonotonic"),
+    TrackingSession("closed_loop_inverse", "closed-loop inverse", "closed-loop-inverse", "preisach-nonmonotonic"),
+    TrackingSession("latched", "latched", "latched", "preisach-nonmonotonic"),
+)
+
+FOLLOWING = {
+    "open_loop_inverse": "open-loop-inverse",
+    "integral": "integral",
+    "closed_loop_inverse": "closed-loop-inverse",
+}
+PERIODS = (60, 200)
+"""Periods of the sine that is followed, s."""
 
 _PAPER_PARAMETERS = {
     "c0": (1026.7, "1/m"),
@@ -110,71 +160,111 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
     stopwatch = Stopwatch()
     folder = out / f"reproduce-vo2-seed-{seed}"
     (folder / "figures").mkdir(parents=True, exist_ok=True)
-    offset = SESSION_OFFSET if seed % 2 == 0 else -SESSION_OFFSET
+    sign = 1.0 if seed % 2 == 0 else -1.0
+    # Every session has its own noise: no two, of this campaign or of one with another seed, share theirs.
+    seeds = (2 * seed + k % 2 + 100_000 * (k // 2) for k in itertools.count())
 
-    characterization = _session(rig, "damped-oscillation", {}, 2 * seed, folder, live, console)
-    validation = _session(
-        rig, "random-validation", {"emulation.session_offset": str(offset)}, 2 * seed + 1, folder, live, console
-    )
+    def session(protocol: str, settings: Mapping[str, str], offset: float) -> RunResult:
+        overrides = {"emulation.session_offset": str(sign * offset)}
+        return _session(rig, protocol, settings, overrides, next(seeds), folder, live, console)
+
+    characterization = session("damped-oscillation", {}, 0.0)
+    validation = session("random-validation", {}, SESSION_OFFSET)
     models = {entry.key: _identify(entry, characterization.folder, folder) for entry in MODELS}
     with Record(validation.folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]
     predictions = {key: predict(model.file, inputs) for key, model in models.items()}
 
-    figures = _draw(models, inputs, outputs, predictions, folder / "figures")
+    sequence = {"sequence_seed": str(seed + 1)}
+    tracking_runs = {
+        entry.key: session(
+            "tracking",
+            {"model": str(folder / f"{entry.model}.json"), "controller": entry.controller, **sequence},
+            TRACKING_OFFSET,
+        )
+        for entry in TRACKING
+    }
+    proposed = str(folder / f"{PROPOSED}.json")
+    following_runs = {
+        (period, key): session(
+            "following", {"model": proposed, "controller": controller, "period": str(period)}, TRACKING_OFFSET
+        )
+        for period in PERIODS
+        for key, controller in FOLLOWING.items()
+    }
+    reached = {key: _reached(run) for key, run in tracking_runs.items()}
+    followed = {key: _followed(run) for key, run in following_runs.items()}
+
+    runs = [characterization, validation, *tracking_runs.values(), *following_runs.values()]
     for run in (characterization, validation):
         with Record(run.folder) as record:
             finished = float(record.meta["finished"])
         # The proposed model last: the recording shows the density of the newest.
         for model in reversed(models.values()):
             add_model(run.folder, model.file.name, finished, model.file.to_json())
-    recordings = [export_run(run.folder, "rrd", None)[0] for run in (characterization, validation)]
+    for run in (*tracking_runs.values(), *following_runs.values()):
+        add_model(run.folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
+    recordings = [export_run(run.folder, "rrd", None)[0] for run in runs]
+    figures = _draw(models, inputs, outputs, predictions, folder / "figures")
+    figures += _draw_tracking(reached, followed, folder / "figures")
 
-    identified = {key: errors_json(model.identification.errors) for key, model in models.items()}
-    validated = {key: errors_json(measure_errors(outputs, predicted)) for key, predicted in predictions.items()}
-    kkt = {key: model.identification.certificate.kkt_residual for key, model in models.items()}
-    parameters = _parameters(models["nonmonotonic"].file.operator)
-    laboratory = sum(run.outcome.laboratory_seconds for run in (characterization, validation))
-    wall = stopwatch.seconds()
-    _print_errors(identified, validated, kkt, offset, console)
-    _print_parameters(parameters, console)
-    console.print(
-        f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
-        highlight=False,
-    )
-    for title, paths in (
-        ("runs", [characterization.folder, validation.folder]),
-        ("models", [folder / f"{entry.model}.json" for entry in MODELS]),
-        ("recordings (open with `rerun FILE`)", recordings),
-        ("figures", figures),
-    ):
-        console.print(f"[bold]{title}[/]")
-        for path in paths:
-            console.print(f"  {path}", highlight=False, soft_wrap=True)
-    return {
+    laboratory = sum(run.outcome.laboratory_seconds for run in runs)
+    result = {
         "seed": seed,
-        "session_offset": offset,
-        "identification": identified,
-        "validation": validated,
-        "kkt": kkt,
-        "parameters": parameters,
+        "session_offset": sign * SESSION_OFFSET,
+        "tracking_offset": sign * TRACKING_OFFSET,
+        "identification": {key: errors_json(model.identification.errors) for key, model in models.items()},
+        "validation": {
+            key: errors_json(measure_errors(outputs, predicted)) for key, predicted in predictions.items()
+        },
+        "kkt": {key: model.identification.certificate.kkt_residual for key, model in models.items()},
+        "parameters": _parameters(models["nonmonotonic"].file.operator),
+        "tracking": {key: results.summary() for key, results in reached.items()},
+        "continuous": {
+            f"period_{period}": {key: followed[period, key].summary() for key in FOLLOWING} for period in PERIODS
+        },
         "laboratory_seconds": laboratory,
-        "wall_seconds": wall,
+        "wall_seconds": stopwatch.seconds(),
         "folder": str(folder),
         "figures": [str(path) for path in figures],
         "recordings": [str(path) for path in recordings],
     }
+    _print_result(result, console)
+    return result
+
+
+def _reached(run: RunResult) -> TargetResults:
+    with Record(run.folder) as record:
+        results = target_results(record, OUTPUT)
+    if results is None:
+        raise DataError(f"{run.folder}: has no targets")
+    return results
+
+
+def _followed(run: RunResult) -> FollowingResult:
+    with Record(run.folder) as record:
+        result = following_result(record, OUTPUT)
+    if result is None:
+        raise DataError(f"{run.folder}: has no reference")
+    return result
 
 
 def _session(
-    rig: str, protocol: str, overrides: Mapping[str, str], seed: int, folder: Path, live: bool, console: Console
+    rig: str,
+    protocol: str,
+    settings: Mapping[str, str],
+    overrides: Mapping[str, str],
+    seed: int,
+    folder: Path,
+    live: bool,
+    console: Console,
 ) -> RunResult:
     definition = find_protocol(protocol)
     result = carry_out(
         Run(
             protocol=definition,
-            parameters=definition.parse({}),
+            parameters=definition.parse(settings),
             rig=rig,
             overrides=overrides,
             seed=seed,
@@ -267,37 +357,110 @@ def _draw(
     return list(paths.values())
 
 
-def _print_errors(
-    identified: Mapping[str, Mapping[str, float]],
-    validated: Mapping[str, Mapping[str, float]],
-    kkt: Mapping[str, float],
-    offset: float,
-    console: Console,
-) -> None:
-    for title, measured, paper in (
-        ("identification, errors in 1/m (Figs. 5, 7 and 9)", identified, {m.key: m.identification for m in MODELS}),
+def _draw_tracking(
+    reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult], folder: Path
+) -> list[Path]:
+    curvature, error = "curvature / (1/m)", "error / (1/m)"
+    titles = {entry.key: entry.title for entry in TRACKING}
+    paths = [folder / "figure-12-open-loop.png", folder / "figure-12-closed-loop.png"]
+    for path, keys in zip(
+        paths, (("open_loop_inverse", "polynomial"), ("closed_loop_inverse", "latched")), strict=True
+    ):
+        plot_tracking(
+            path,
+            reached[keys[0]].targets,
+            {titles[key]: reached[key].outputs for key in keys},
+            output_label=curvature,
+            error_label=error,
+        )
+    for period in PERIODS:
+        paths.append(folder / f"following-period-{period}.png")
+        first = followed[period, "closed_loop_inverse"]
+        plot_tracking(
+            paths[-1],
+            first.reference,
+            {
+                titles[key]: np.interp(first.times, followed[period, key].times, followed[period, key].output)
+                for key in FOLLOWING
+            },
+            horizontal=first.times,
+            horizontal_label="time / s",
+            output_label=curvature,
+            error_label=error,
+        )
+    return paths
+
+
+def _print_result(result: Mapping[str, Any], console: Console) -> None:
+    for key, title, papers in (
+        ("identification", "identification, errors in 1/m (Figs. 5, 7 and 9)", [m.identification for m in MODELS]),
         (
-            f"validation, errors in 1/m (Fig. 10; session offset {offset:+g} K)",
-            validated,
-            {m.key: m.validation for m in MODELS},
+            "validation",
+            f"validation, errors in 1/m (Fig. 10; session offset {result['session_offset']:+g} K)",
+            [m.validation for m in MODELS],
         ),
     ):
-        table = Table("model", title=title, title_justify="left")
-        for column in ("paper max", "bench max", "bench RMS", "KKT"):
-            table.add_column(column, justify="right", no_wrap=True)
-        for entry in MODELS:
-            errors = measured[entry.key]
-            certificate = f"{kkt[entry.key]:.0e}" if measured is identified else "–"
-            table.add_row(
-                entry.title, f"{paper[entry.key]:g}", f"{errors['max']:.1f}", f"{errors['rms']:.1f}", certificate
+        errors = [
+            (
+                entry.title,
+                f"{paper:g}",
+                f"{result[key][entry.key]['max']:.1f}",
+                f"{result[key][entry.key]['rms']:.1f}",
             )
-        console.print(table)
+            for entry, paper in zip(MODELS, papers, strict=True)
+        ]
+        console.print(_table(title, ("model", "paper max", "bench max", "bench RMS"), errors))
+    residuals = ", ".join(f"{entry.title} {result['kkt'][entry.key]:.0e}" for entry in MODELS)
+    console.print(f"KKT residuals: {residuals}", highlight=False)
+    rows: list[tuple[str, ...]] = [
+        (name, f"{paper:g}", f"{result['parameters'][name]:.2f}", unit)
+        for name, (paper, unit) in _PAPER_PARAMETERS.items()
+    ]
+    console.print(_table("the proposed model's parameters", ("", "paper", "bench", "unit"), rows))
+    rows = []
+    for session in TRACKING:
+        entry = result["tracking"][session.key]
+        paper = [f"{value:g}" if value is not None else "–" for value in (session.paper_max, session.paper_rms)]
+        rows.append(
+            (
+                session.title,
+                *paper,
+                *(f"{entry[key]:.2f}" for key in ("max", "rms", "median")),
+                f"{entry['seconds_per_target']:.1f}",
+            )
+        )
+    columns: tuple[str, ...] = ("controller", "paper max", "paper RMS", "max", "RMS", "median", "s/target")
+    title = f"tracking of 60 targets, errors in 1/m (Fig. 12; session offset {result['tracking_offset']:+g} K)"
+    console.print(_table(title, columns, rows))
+    rows = [
+        (
+            next(session.title for session in TRACKING if session.key == key),
+            *(
+                f"{result['continuous'][f'period_{period}'][key][what]:.1f}"
+                for period in PERIODS
+                for what in ("max", "rms")
+            ),
+        )
+        for key in FOLLOWING
+    ]
+    columns = ("controller", *(f"{what}, {period} s" for period in PERIODS for what in ("max", "RMS")))
+    console.print(_table("following a modulated sine at 2 Hz, errors in 1/m", columns, rows))
+    laboratory, wall = result["laboratory_seconds"], result["wall_seconds"]
+    console.print(
+        f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
+        highlight=False,
+    )
+    console.print(f"runs, models and recordings: {result['folder']}", highlight=False, soft_wrap=True)
+    console.print(f"figures: {result['folder']}/figures", highlight=False, soft_wrap=True)
+    console.print("open a recording with `rerun FILE`:", highlight=False)
+    for path in result["recordings"]:
+        console.print(f"  {path}", highlight=False, soft_wrap=True)
 
 
-def _print_parameters(parameters: Mapping[str, float], console: Console) -> None:
-    table = Table("", title="the proposed model's parameters", title_justify="left")
-    for column in ("paper", "bench", "unit"):
-        table.add_column(column, justify="right")
-    for name, (paper, unit) in _PAPER_PARAMETERS.items():
-        table.add_row(name, f"{paper:g}", f"{parameters[name]:.2f}", unit)
-    console.print(table)
+def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table

@@ -6,7 +6,7 @@ import pytest
 # Rig files of these tests name their drivers as `heater_laboratory:HeaterTEC`.
 sys.path.insert(0, str(Path(__file__).parent))
 
-from heater_laboratory import RIG  # noqa: E402
+from heater_laboratory import RIG
 
 
 @pytest.fixture

@@ -176,7 +176,7 @@ class HeaterTEC(_Wired, TECAmplifier):
     def mode(self) -> TECMode:
         return TECMode.TEMPERATURE
 
-    def select_mode(self, mode: TECMode) -> None:
+    def select_mode(self, _mode: TECMode) -> None:
         raise DeviceError(self.name, "knows temperature mode only")
 
     @property

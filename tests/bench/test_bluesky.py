@@ -58,7 +58,7 @@ class TestScan:
         }
         assert all(key["dtype"] == "number" and key["shape"] == [] for key in keys.values())
 
-    def test_values(self, documents, rig):
+    def test_values(self, documents):
         data = [event["data"] for event in documents["event"]]
         temperatures = [entry["tec_temperature"] for entry in data]
         assert temperatures == pytest.approx([40.0, 45.0, 50.0, 55.0, 60.0], abs=0.1)

@@ -27,7 +27,7 @@ class TestForward:
 
     def test_numbers_of_the_working_range(self):
         assert float(curvature_to_deflection(1846.0, LENGTH)) == pytest.approx(80.97e-6, abs=0.005e-6)
-        assert 1846.0 * LENGTH**2 / 2 == pytest.approx(83.07e-6, abs=0.005e-6)
+        assert pytest.approx(83.07e-6, abs=0.005e-6) == 1846.0 * LENGTH**2 / 2
 
     @given(st.floats(1e-12, 1e-3))
     def test_small_angle_limit(self, curvature):
@@ -75,7 +75,8 @@ class TestInverse:
     def test_is_odd(self, share):
         up = float(deflection_to_curvature(share * LENGTH, LENGTH))
         down = float(deflection_to_curvature(-share * LENGTH, LENGTH))
-        assert up == -down > 0
+        assert up > 0
+        assert down == -up
 
     def test_grows_up_to_the_end_of_the_range(self):
         deflections = np.linspace(-1.0, 1.0, 20001)[1:-1] * LARGEST_DEFLECTION * LENGTH

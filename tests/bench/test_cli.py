@@ -58,7 +58,9 @@ def write_loop(path, rows=400):
 
 
 class TestHelp:
-    @pytest.mark.parametrize("command", ["", "list", "run", "identify", "predict", "report", "export", "reproduce"])
+    @pytest.mark.parametrize(
+        "command", ["", "list", "run", "identify", "predict", "invert", "report", "export", "reproduce"]
+    )
     def test_every_command_has_help(self, bench, command):
         code, out, _ = bench(*command.split(), "--help")
         assert code == 0

@@ -20,7 +20,7 @@ from bench.clock import Stopwatch, WallClock
 from bench.dashboard import QUEUED_TICKS, Dashboard, DashboardLayout, picture, rebuild
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve, Preisach, uniform_levels
+from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.model_file import ModelFile
 
@@ -140,7 +140,8 @@ def keep_journal(folder: Path, entries: list[Tick | StepRecord | Event]) -> Path
     journal._db.execute("COMMIT")
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
-    add_model(folder, "polynomial", 1.0, {"format": "bench-model", "version": 1, "no": "density"})
+    polynomial = Polynomial(np.array([1.0, 2.0]), (20.0, 90.0), input_unit="°C", output_unit="1/m")
+    add_model(folder, "polynomial", 1.0, ModelFile("polynomial", polynomial, None).to_json())
     add_model(folder, "preisach", 2.0, make_model().to_json())
     return folder
 

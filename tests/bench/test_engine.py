@@ -7,6 +7,7 @@ import pytest
 from heater_protocols import Settle, Stairs, settle, stairs
 
 from bench.clock import ScaledClock, VirtualClock
+from bench.control.tracking import Command, Trace
 from bench.engine import ABORT, RESUME, Engine, check_before_moving
 from bench.errors import (
     AbortError,
@@ -18,7 +19,18 @@ from bench.errors import (
 )
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal, Record
-from bench.protocol import Dwell, Note, Phase, ProtocolParameters, Step, UntilSteady, protocol
+from bench.protocol import (
+    TRACES,
+    Control,
+    Dwell,
+    Note,
+    Phase,
+    ProtocolParameters,
+    Step,
+    UntilSteady,
+    plan,
+    protocol,
+)
 from bench.rig import Rig, load_rig
 
 
@@ -51,12 +63,12 @@ class Watcher:
 class Bench:
     """A rig with its journal and engine; `record` reads back what was written."""
 
-    def __init__(self, folder, path, clock=None, seed=1, observers=(), ask=None):
+    def __init__(self, folder, path, clock=None, seed=1, observers=(), ask=None, traces=False):
         self.folder = folder
         self.clock = clock or VirtualClock()
         self.rig = Rig(load_rig(path), self.clock, seed)
         self.tec, self.probe = self.rig.devices["tec"], self.rig.devices["probe"]
-        self.journal = Journal(folder / FILE_NAME, self.rig.signals, {})
+        self.journal = Journal(folder / FILE_NAME, self.rig.signals + TRACES * traces, {})
         self.interrupts = Interrupts()
         self.watcher = Watcher()
         self.engine = Engine(self.rig, self.journal, (*observers, self.watcher), self.interrupts, ask)
@@ -450,7 +462,7 @@ class BrokenObserver(Watcher):
         for method in methods:
             setattr(self, method, self.fail)
 
-    def fail(self, *arguments):
+    def fail(self, *_):
         raise OSError(5, "Input/output error")
 
 
@@ -510,6 +522,140 @@ class TestSettling:
         assert "tec_setpoint" in outcome.reason
 
 
+class Integrator:
+    """A loop that moves the plate until its thermometer says what it should."""
+
+    def __init__(self, target, wait=4.0, tolerance=0.05):
+        self.target, self.wait, self.tolerance = target, wait, tolerance
+        self.setpoint = math.nan
+        self.times = []
+        self.trace = Trace(reference=target)
+
+    def begin(self, t, measured_input, output):
+        self.setpoint = measured_input
+        return self.update(t, measured_input, output)
+
+    def update(self, t, _, output):
+        self.times.append(t)
+        self.trace = Trace(self.target, output, self.target - output, 0.01)
+        done = abs(self.target - output) < self.tolerance
+        if not done:
+            self.setpoint += 0.8 * (self.target - output)
+        return Command(self.setpoint, self.wait, done)
+
+
+def control(loop, **keys):
+    def go(parameters):
+        yield Control(
+            **{
+                "loop": loop,
+                "actuator": "tec",
+                "input": "tec_temperature",
+                "output": "probe_temperature",
+                "limits": (15.0, 80.0),
+                "timeout": 600.0,
+                "label": "reach",
+                **keys,
+            }
+        )
+
+    return define(go)
+
+
+class TestControl:
+    def test_reaches_its_target(self, bench):
+        b, loop = bench(("[devices.probe]", "[devices.probe]\noffset = -2.0")), Integrator(50.0)
+        outcome = b.run(control(loop))
+        assert (outcome.status, outcome.steps) == ("completed", 1), outcome.reason
+        b.assert_safe()
+        np.testing.assert_allclose(np.diff(loop.times), 4.0)
+        with b.record() as run:
+            (entry,) = run.step_records()
+            assert entry.label == "reach"
+            assert entry.setpoints == {"tec": loop.setpoint}
+            assert entry.setpoints["tec"] == pytest.approx(52.0, abs=0.1)
+            assert run.steps()["probe_temperature"][0] == pytest.approx(50.0, abs=0.05)
+            # A tick at each reading of the loop and the telemetry in between.
+            assert len(run.telemetry()) == len(loop.times) + 7 * (len(loop.times) - 1)
+
+    def test_what_the_controller_thinks_is_recorded(self, bench):
+        b = bench(traces=True)
+        outcome = b.run(control(Integrator(50.0)))
+        assert outcome.status == "completed", outcome.reason
+        with b.record() as run:
+            ticks = run.telemetry()
+            assert ticks[TRACES[0].name][0] == 50.0
+            assert set(ticks[TRACES[0].name][1:]) == {50.0}
+            assert run.steps()[TRACES[0].name].tolist() == [50.0]
+
+    def test_beyond_its_limits_nothing_is_sent(self, bench):
+        b = bench()
+        outcome = b.run(control(Integrator(300.0)))
+        assert isinstance(outcome.error, LimitError)
+        assert "beyond 15 to 80" in outcome.reason
+        assert b.tec.sent == []
+        b.assert_safe()
+
+    def test_a_controller_that_loses_itself(self, bench):
+        b = bench()
+        outcome = b.run(control(Integrator(math.nan)))
+        assert isinstance(outcome.error, LimitError)
+        assert b.tec.sent == []
+
+    def test_times_out(self, bench):
+        b = bench()
+        outcome = b.run(control(Integrator(50.0, tolerance=0.0), timeout=100.0))
+        assert isinstance(outcome.error, SettleTimeoutError)
+        assert "within 100 s" in outcome.reason
+        assert outcome.laboratory_seconds <= 100.0
+        b.assert_safe()
+
+    @pytest.mark.timeout(30)
+    @pytest.mark.parametrize("wait", [0.0, -1.0, math.nan])
+    def test_one_that_does_not_wait_is_stopped(self, bench, wait):
+        b = bench()
+        assert b.run(control(Integrator(50.0, wait=wait, tolerance=0.0))).status == "failed"
+        b.assert_safe()
+
+    @pytest.mark.parametrize("key", ["actuator", "input", "output"])
+    def test_what_is_not_there_is_named(self, bench, key):
+        b = bench()
+        outcome = b.run(control(Integrator(50.0), **{key: "absent"}))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert "absent" in outcome.reason
+        assert b.tec.sent == []
+
+    def test_an_interlock_ends_it(self, bench):
+        b = bench(("high = 90.0", "high = 41.0"))
+        assert isinstance(b.run(control(Integrator(50.0))).error, InterlockError)
+        b.assert_safe()
+
+    def test_limits_are_checked_before_anything_moves(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            check_before_moving(rig, control(Integrator(50.0)), Nothing())
+            with pytest.raises(ConfigurationError, match="rig heater allows 10 to 95 °C"):
+                check_before_moving(rig, control(Integrator(50.0), limits=(15.0, 100.0)), Nothing())
+            with pytest.raises(ConfigurationError, match="absent"):
+                check_before_moving(rig, control(Integrator(50.0), output="absent"), Nothing())
+
+    @pytest.mark.parametrize(
+        "keys", [{"limits": (2.0, 1.0)}, {"limits": (math.nan, 1.0)}, {"timeout": 0.0}, {"timeout": math.nan}]
+    )
+    def test_nonsense_is_refused(self, keys):
+        with pytest.raises(ConfigurationError, match="Control: expected finite limits"):
+            plan(control(Integrator(50.0), **keys), Nothing())
+
+    @pytest.mark.timeout(60)
+    def test_a_protocol_that_controls_for_ever_has_no_plan(self):
+        def endless(parameters):
+            message = next(control(Integrator(50.0)).generator(parameters))
+            while True:
+                yield message
+
+        with pytest.raises(ConfigurationError, match="endless does not end"):
+            plan(define(endless), Nothing())
+
+
 class TestInterrupted:
     def request(self, **flags):
         """A protocol that sets flags of the interrupts in its second step."""
@@ -566,7 +712,7 @@ class TestInterrupted:
 
     def test_abort_in_the_middle_of_a_hold(self, bench):
         class Late(Watcher):
-            def telemetry(_, t, step, values):
+            def telemetry(_, t, *__):
                 if t >= 3.0:
                     self.b.interrupts.abort_reason = "SIGTERM"
 
@@ -577,7 +723,7 @@ class TestInterrupted:
 
     def test_abort_while_settling(self, bench):
         class Late(Watcher):
-            def telemetry(_, t, step, values):
+            def telemetry(_, t, *__):
                 if t >= 3.0:
                     self.b.interrupts.abort_reason = "SIGTERM"
 

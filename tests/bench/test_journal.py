@@ -290,7 +290,7 @@ class TestUnusable:
             db.execute("UPDATE meta SET value = ? WHERE key = 'schema'", (json.dumps(version),))
         db.commit()
         db.close()
-        with pytest.raises(DataError, match="schema version .*; this bench reads version 1"):
+        with pytest.raises(DataError, match=r"schema version .*; this bench reads version 1"):
             Record(path)
 
     @pytest.mark.parametrize(

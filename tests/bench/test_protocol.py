@@ -108,7 +108,7 @@ class TestParse:
         try:
             assert isinstance(ramp.parse(settings), Parameters)
         except ConfigurationError as error:
-            assert str(error)
+            assert str(error)  # noqa: PT017 - either way is right
 
 
 class TestHelp:
@@ -276,7 +276,7 @@ class TestPlan:
             yield Step({"tec": 20.0}, Dwell(1.0))
             yield Step({"tec": value}, Dwell(1.0))
 
-        with pytest.raises(ConfigurationError, match="protocol odd .*tec"):
+        with pytest.raises(ConfigurationError, match=r"protocol odd .*tec"):
             plan(define(odd), Nothing())
 
 
@@ -307,7 +307,7 @@ def soak(parameters: Parameters) -> Messages:
     def test_by_name(self, tmp_path):
         path = self.write(tmp_path, self.SECOND)
         assert find_protocol(f"{path}:other").name == "other"
-        with pytest.raises(ConfigurationError, match="choose one by .*mine.py:NAME; it has: soak, other"):
+        with pytest.raises(ConfigurationError, match=r"choose one by .*mine\.py:NAME; it has: soak, other"):
             find_protocol(path)
         with pytest.raises(ConfigurationError, match="has no protocol 'third'; it has: soak, other"):
             find_protocol(f"{path}:third")
@@ -338,7 +338,7 @@ def soak(parameters: Parameters) -> Messages:
         with pytest.raises(ConfigurationError, match="does not exist"):
             find_protocol(str(tmp_path / "absent.py"))
         (tmp_path / "folder.py").mkdir()
-        with pytest.raises(ConfigurationError, match="folder.py"):
+        with pytest.raises(ConfigurationError, match=r"folder\.py"):
             find_protocol(str(tmp_path / "folder.py"))
 
     @pytest.mark.parametrize(
@@ -363,13 +363,13 @@ def soak(parameters: Parameters) -> Messages:
         ],
     )
     def test_every_kind_of_error_names_the_file(self, tmp_path, text):
-        with pytest.raises(ConfigurationError, match="mine.py"):
+        with pytest.raises(ConfigurationError, match=r"mine\.py"):
             find_protocol(self.write(tmp_path, text))
 
     def test_not_text(self, tmp_path):
         path = tmp_path / "mine.py"
         path.write_bytes(b"\xff\xfe\x00\x01")
-        with pytest.raises(ConfigurationError, match="mine.py"):
+        with pytest.raises(ConfigurationError, match=r"mine\.py"):
             find_protocol(str(path))
 
 
@@ -447,7 +447,7 @@ class TestPackaged:
     @pytest.mark.parametrize("settling", ["60", "3600"])
     def test_creep_that_settles_too_long(self, settling):
         definition = find_protocol("creep")
-        with pytest.raises(ConfigurationError, match="settling must be shorter than duration"):
+        with pytest.raises(ConfigurationError, match="settling must leave"):
             plan(definition, definition.parse({"settling": settling}))
 
     def test_creep_that_settles_almost_as_long_as_it_watches(self):
@@ -456,7 +456,7 @@ class TestPackaged:
         try:
             assert plan(definition, parameters).steps == 243
         except ConfigurationError as error:
-            assert "settling" in str(error)
+            assert "settling" in str(error)  # noqa: PT017 - either way is right
 
     @pytest.mark.parametrize("name", ["creep", "damped-oscillation", "random-validation"])
     @given(data=st.data())
@@ -479,7 +479,7 @@ class TestPackaged:
         try:
             expected = plan(definition, definition.parse(settings))
         except ConfigurationError as error:
-            assert str(error).startswith(f"protocol {name}")
+            assert str(error).startswith(f"protocol {name}")  # noqa: PT017 - either way is right
         else:
             for low, high in expected.extremes.values():
                 assert -20.0 <= low <= high <= 150.0

@@ -1,4 +1,5 @@
 import io
+import signal
 import sqlite3
 import threading
 
@@ -10,6 +11,7 @@ from rich.console import Console
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.journal import Event, Record, StepRecord
+from bench.protocol import Dwell, Step, find_protocol, protocol
 from bench.rig import load_rig
 from bench.runs import RIG_FILE_NAME, Run, carry_out, run_card
 from bench.terminal import ProgressDisplay, ask_operator
@@ -126,6 +128,52 @@ class TestCarryOut:
         result = carry_out(make(), console)
         assert not result.outcome.is_safe
         assert result.outcome.safe_state == {"tec": "OSError: [Errno 5] Input/output error", "probe": "safe"}
+
+    @pytest.mark.parametrize("clock", ["x20", "x100"])
+    def test_the_packaged_rig_on_a_fast_clock(self, tmp_path, console, clock):
+        # Nothing slow may happen while the TEC is on, as its watchdog waits for the next word.
+        creep = find_protocol("creep")
+        run = Run(creep, creep.parse({"duration": "8"}), "vo2", tmp_path, clock=clock, recording=False)
+        outcome = carry_out(run, console).outcome
+        assert outcome.status == "completed", outcome.reason
+        assert outcome.is_safe
+
+    @pytest.mark.timeout(60)
+    def test_ctrl_c_waits_for_no_console(self, make, console, capfd):
+        # Whatever was interrupted may hold the console's locks, or wait for another that holds them.
+        held, release, released = threading.Event(), threading.Event(), threading.Event()
+
+        def hold():
+            with console._lock:
+                held.set()
+                release.wait(10.0)
+                released.set()
+
+        def press(parameters):
+            for event in (held, release, released):
+                event.clear()
+            holder = threading.Thread(target=hold)
+            holder.start()
+            held.wait(10.0)
+            signal.raise_signal(signal.SIGINT)
+            seen.append(released.is_set())
+            release.set()
+            holder.join()
+            yield Step({"tec": 30.0}, Dwell(1.0))
+
+        seen = []
+        press.__annotations__ = {"parameters": Stairs}
+        press.__doc__ = "Press."
+        definition = protocol(needs=("tec",))(press)
+        # The dry runs before press the keys as well.
+        former = signal.signal(signal.SIGINT, lambda *_: None)
+        try:
+            outcome = carry_out(make(protocol=definition, parameters=Stairs()), console).outcome
+        finally:
+            signal.signal(signal.SIGINT, former)
+        assert seen == [False] * len(seen)
+        assert outcome.status == "aborted"
+        assert "pausing at the next step" in capfd.readouterr().err
 
     def test_a_failure_is_told_with_its_reason(self, make, console):
         result = carry_out(make(("high = 90.0", "high = 41.0"), parameters=Stairs(dwell=10.0)), console)

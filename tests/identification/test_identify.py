@@ -100,7 +100,13 @@ def test_given_levels_and_ranges():
 @pytest.mark.parametrize(
     ("name", "inputs", "outputs", "options", "message"),
     [
-        ("spline", [0.0, 1.0], [0.0, 1.0], {}, "model_name: expected one of polynomial, preisach"),
+        (
+            "spline",
+            [0.0, 1.0],
+            [0.0, 1.0],
+            {},
+            "model_name: expected one of polynomial, prandtl-ishlinskii, preisach",
+        ),
         ("preisach", [0.0, 1.0], [0.0], {}, "outputs: expected 2 values"),
         ("preisach", [], [], {}, "inputs: expected at least one"),
         ("preisach", [0.0, math.nan], [0.0, 1.0], {}, "inputs: expected finite"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, nnls
 
 from bench.hysteresis import Preisach, QuadraticTerm, Regressor, ThermalExpansion, uniform_levels
-from bench.identification import fit, fit_minimum_norm, ramps
+from bench.identification import fit, fit_minimum_norm, least_squares, ramps
 
 
 def oscillation(count=25, step=0.05):
@@ -185,7 +185,6 @@ def test_smoothing_fills_gaps_and_lowers_roughness():
 
     assert roughness(smooth) < 0.3 * roughness(plain)
     assert smooth.certificate.kkt_residual < 1e-10
-    assert np.isnan(smooth.uncertainties).all()
     # Half of the plane unswept: smoothness carries the density over.
     half = operator.regressor([-1.0, -0.4, 0.0, -0.6, -0.2, -1.0])
     carried = fit(half, half.product(np.ones(55)), smoothing=1e-6)
@@ -209,6 +208,59 @@ def test_smoothed_solution_satisfies_its_own_conditions():
     stacked = np.vstack([a, math.sqrt(0.05 * mean_square) * laplacian])
     expected, _ = nnls(stacked, np.concatenate([b, np.zeros(15)]))
     np.testing.assert_allclose(found.coefficients, expected, atol=1e-9)
+
+
+def test_smoothed_uncertainties_are_those_of_the_penalised_normal_equations():
+    operator, inputs, outputs = problem(order=5, noise=0.3)
+    regressor = operator.regressor(inputs)
+    found = fit(regressor, outputs, nonnegative=False, smoothing=0.05)
+    a, b = centred(regressor.dense(), outputs)
+    gram = a.T @ a
+    mean_square = np.diag(gram).mean()
+    rows, columns = np.tril_indices(5)
+    distance = np.abs(rows[:, None] - rows) + np.abs(columns[:, None] - columns)
+    laplacian = np.diag((distance == 1).sum(axis=1)) - (distance == 1)
+    inverse = np.linalg.inv(gram + 0.05 * mean_square * laplacian @ laplacian)
+    residual = b - a @ found.coefficients
+    spare = len(b) - 1 - np.trace(inverse @ gram)
+    expected = np.sqrt(np.diag(inverse) * (residual @ residual) / spare)
+    np.testing.assert_allclose(found.uncertainties, expected, rtol=1e-9)
+    assert (found.uncertainties < fit(regressor, outputs, nonnegative=False).uncertainties).all()
+
+
+@pytest.mark.parametrize(("order", "smoothing"), [(25, 1e-3), (31, 1e-5), (48, 1e-2)])
+def test_smoothing_from_a_coarser_plane_equals_that_from_scratch(order, smoothing, monkeypatch):
+    operator, inputs, outputs = problem(order=order, noise=0.2)
+    regressor = operator.regressor(inputs)
+    found = fit(regressor, outputs, smoothing=smoothing)
+    monkeypatch.setattr(least_squares, "_COARSEST", 1000)
+    expected = fit(regressor, outputs, smoothing=smoothing)
+    assert found.certificate.kkt_residual < 1e-10
+    np.testing.assert_allclose(found.coefficients, expected.coefficients, atol=1e-6)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.integers(1, 30))
+def test_factor_follows_the_columns(seed, size):
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(40, size))
+    gram = matrix.T @ matrix
+    factor = least_squares._Factor()
+    chosen = np.empty(0, dtype=np.int64)
+    for _ in range(8):
+        new = np.setdiff1d(rng.permutation(size)[: rng.integers(0, size + 1)], chosen)
+        assert factor.append(gram[np.ix_(chosen, new)], gram[np.ix_(new, new)]) is None
+        chosen = np.concatenate([chosen, new])
+        gone = np.flatnonzero(rng.random(chosen.size) < 0.4)
+        factor.delete(gone)
+        chosen = np.delete(chosen, gone)
+        block = gram[np.ix_(chosen, chosen)]
+        np.testing.assert_allclose(factor.compact @ factor.compact.T, block, atol=1e-10)
+        right = rng.normal(size=chosen.size)
+        np.testing.assert_allclose(block @ factor.solve(right), right, atol=1e-6)
+        one, two = factor.lengths(right, 2.0 * right)
+        assert one**2 == pytest.approx(right @ block @ right, abs=1e-9)
+        assert two == pytest.approx(2.0 * one)
 
 
 def test_minimum_norm_equals_the_pseudo_inverse():

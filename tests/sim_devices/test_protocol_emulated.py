@@ -49,18 +49,21 @@ class TestAddress:
         finally:
             protocol_emulated.unregister("here")
 
-    def test_is_not_given_twice(self, echo, clock):
+    @pytest.mark.usefixtures("echo")
+    def test_is_not_given_twice(self, clock):
         with pytest.raises(ValueError, match="emulated://echo is taken"):
             protocol_emulated.register("echo", Echo(), clock)
 
-    def test_is_free_again_after_unregistering(self, echo, clock):
+    @pytest.mark.usefixtures("echo")
+    def test_is_free_again_after_unregistering(self, clock):
         protocol_emulated.unregister("echo")
         protocol_emulated.unregister("echo")
         assert protocol_emulated.register("echo", Echo(), clock) == "emulated://echo"
 
-    def test_an_unknown_name_lists_the_known(self, echo):
+    @pytest.mark.usefixtures("echo")
+    def test_an_unknown_name_lists_the_known(self):
         with pytest.raises(
-            serial.SerialException, match="no emulated instrument at emulated://ehco; there are: .*emulated://echo"
+            serial.SerialException, match=r"no emulated instrument at emulated://ehco; there are: .*emulated://echo"
         ):
             serial.serial_for_url("emulated://ehco")
 
@@ -142,7 +145,7 @@ class TestTime:
 
     def test_the_instrument_gets_its_request_when_the_last_byte_has_gone(self, clock):
         class Watch:
-            def receive(self, data):
+            def receive(self, _):
                 self.at = clock.now()
                 return b"12345"
 
@@ -193,7 +196,8 @@ class TestTime:
 
 
 class TestLine:
-    def test_a_port_that_is_not_open(self, echo):
+    @pytest.mark.usefixtures("echo")
+    def test_a_port_that_is_not_open(self):
         port = serial.serial_for_url("emulated://echo", do_not_open=True)
         assert not port.is_open
         for use in (
@@ -236,7 +240,8 @@ class TestLine:
         port.write(b"abc\n")
         assert port.read(4) == b"cba\n"
 
-    def test_two_ports_do_not_mix(self, clock, echo):
+    @pytest.mark.usefixtures("echo")
+    def test_two_ports_do_not_mix(self, clock):
         class Other:
             def receive(self, data):
                 return data.upper()

@@ -122,7 +122,7 @@ class TestDeadlines:
     def test_one_that_sets_another(self, world):
         log = []
         second = Alarm(world, log, "second", [])
-        Alarm(world, log, "first", [1.0], then=lambda alarm: second.times.append(1.5))
+        Alarm(world, log, "first", [1.0], then=lambda _: second.times.append(1.5))
         at(world, 4.0)
         assert [(name, time) for name, _, time, _ in log] == [("first", 1.0), ("second", 1.5)]
 

@@ -1,0 +1,97 @@
+"""References: their ranges, their repeatability, and whether an input can follow them."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.control.inverse import Inverse
+from bench.control.references import fastest_slope, modulated_sine, tracking_targets
+from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
+
+
+class TestTargets:
+    @given(st.integers(0, 1000), st.integers(1, 200))
+    def test_stay_within_the_range(self, seed, count):
+        targets = tracking_targets(np.random.default_rng(seed), -63.0, 1814.0, count)
+        assert targets.size == count
+        assert targets.min() >= -63.0
+        assert targets.max() <= 1814.0
+
+    def test_start_large_decay_and_are_random_then(self):
+        first = tracking_targets(np.random.default_rng(1), -1.0, 1.0, 60)
+        second = tracking_targets(np.random.default_rng(2), -1.0, 1.0, 60)
+        assert (first[:30] == second[:30]).all()
+        assert (first[30:] != second[30:]).all()
+        assert np.abs(first[:6]).max() == pytest.approx(1.0)
+        assert np.abs(first[24:30]).max() < 0.25
+        assert (tracking_targets(np.random.default_rng(1), -1.0, 1.0, 60) == first).all()
+
+    def test_wrong_arguments(self):
+        with pytest.raises(ValueError, match="low, high"):
+            tracking_targets(np.random.default_rng(1), 1.0, 1.0)
+        with pytest.raises(ValueError, match="count"):
+            tracking_targets(np.random.default_rng(1), 0.0, 1.0, 0)
+
+
+class TestSine:
+    def test_range_start_and_modulation(self):
+        times = np.arange(0.0, 1000.0, 0.5)
+        reference = modulated_sine(times, 200.0, 1500.0, 60.0)
+        assert reference[0] == pytest.approx(850.0)
+        assert reference[1] > reference[0]
+        assert reference.min() >= 200.0
+        assert reference.max() <= 1500.0
+        peaks = reference[1:-1][(reference[1:-1] > reference[:-2]) & (reference[1:-1] >= reference[2:])]
+        assert peaks.max() > 1450.0
+        assert peaks.min() < 1200.0
+
+    @pytest.mark.parametrize(
+        ("arguments", "match"),
+        [
+            (([0.0], 1.0, 0.0, 60.0), "low, high"),
+            (([0.0], 0.0, 1.0, 0.0), "period"),
+            (([0.0], 0.0, 1.0, math.nan), "period"),
+            (([0.0], 0.0, 1.0, 60.0, 1.5), "depth"),
+            (([math.nan], 0.0, 1.0, 60.0), "times"),
+        ],
+    )
+    def test_wrong_arguments(self, arguments, match):
+        with pytest.raises(ValueError, match=match):
+            modulated_sine(*arguments)
+
+
+class TestFastestSlope:
+    def test_of_a_line_is_the_slope_of_the_reference(self):
+        levels = uniform_levels(0.0, 10.0, 4)
+        line = Preisach(levels, np.zeros(10), 0.0, QuadraticTerm(2.0))
+        times = np.linspace(0.0, 4.0, 401)
+        slope = fastest_slope(Inverse(line), times, 5.0 + 4.0 * np.sin(times))
+        assert slope.rate == pytest.approx(2.0, rel=1e-3)
+        assert slope.time == pytest.approx(0.0, abs=0.02) or slope.time == pytest.approx(math.pi, abs=0.02)
+        assert slope.within(2.1)
+        assert not slope.within(1.9)
+
+    def test_a_plate_follows_slow_sines_and_not_fast_ones(self, models):
+        inverse = Inverse(models.film)
+        rates = []
+        for period in (200.0, 60.0, 2.0):
+            times = np.arange(0.0, 5.0 * period, period / 400.0)
+            rates.append(fastest_slope(inverse, times, modulated_sine(times, 200.0, 1500.0, period)))
+        assert rates[0].rate < rates[1].rate < rates[2].rate
+        assert rates[0].within(15.0)
+        assert rates[1].within(15.0)
+        assert not rates[2].within(15.0)
+        # A reversal crosses the loop, however slow the reference.
+        assert 1.0 < rates[0].jump < 6.0
+        assert rates[0].jump == pytest.approx(rates[1].jump, rel=0.05)
+
+    def test_references_that_cannot_be_met(self, models):
+        with pytest.raises(ValueError, match=r"reference: expected values within .* got 2000.0 at 1.0 s"):
+            fastest_slope(Inverse(models.film), [0.0, 1.0, 2.0], [100.0, 2000.0, 100.0])
+        with pytest.raises(ValueError, match="one for each time"):
+            fastest_slope(Inverse(models.film), [0.0, 1.0, 2.0], [100.0, 200.0])
+        with pytest.raises(ValueError, match="times"):
+            fastest_slope(Inverse(models.film), [0.0, 2.0, 1.0], [100.0, 200.0, 100.0])
