@@ -37,7 +37,7 @@ from pydantic_core import PydanticUndefined
 
 from bench.control.loops import Loop
 from bench.devices import Signal
-from bench.errors import ConfigurationError
+from bench.errors import BenchError, ConfigurationError
 
 PROTOCOL_PACKAGE = "protocols"
 _LONGEST_PLAN = 1_000_000
@@ -446,7 +446,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 )
     except StopIteration:
         return Plan(steps, seconds, at_most, extremes, frozenset(watched))
-    except ConfigurationError:
+    except BenchError:
         raise
     except ValueError as error:
         raise ConfigurationError(f"protocol {definition.name}: {error}") from error

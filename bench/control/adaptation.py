@@ -18,8 +18,8 @@ class Adapter:
     """A model, the memory of its plant, and how the next measurement changes the model.
 
     `update` returns a new adapter; nothing is changed in place, so that an earlier model can be taken up again.
-    The density follows a projected normalised gradient on output differences (Tan and Baras 2004, section IV,
-    IEEE Transactions on Control Systems Technology 12): with x = density * area of each cell and φ the change of
+    The density follows a projected normalised gradient on output differences (Tan and Baras, Recursive
+    identification of hysteresis in smart materials, American Control Conference 2004): with x = density * area of each cell and φ the change of
     its (on - off) part between two measurements,
 
         x := max(0, x + step φ (Δoutput - Δpredicted) / (|φ|² + 2 noise² / (uncertainty m)²)),

@@ -145,9 +145,10 @@ def fastest_slope(
     followed = inverse.follow(wanted, state)
     if not followed.met.all():
         at = int(np.argmin(followed.met))
+        low, high = inverse.operator.output_range()
         raise ValueError(
-            f"reference: expected values within the model's range {inverse.operator.output_range()}, "
-            f"got {wanted[at]} at {moments[at]} s"
+            f"reference: expected values within the model's range, {low:g} to {high:g} "
+            f"{inverse.operator.output_unit}, got {wanted[at]:g} at {moments[at]:g} s"
         )
     moves = np.diff(followed.setpoints)
     rates = np.abs(moves) / np.diff(moments)

@@ -22,8 +22,8 @@ PlayState: TypeAlias = tuple[float, ...]
 class DeadZones:
     """A rising piecewise linear map with S(0) = 0, the superposition of one-sided dead zones.
 
-    Kuhnen 2003 (European Journal of Control 9, section 3) writes it as a sum of weights times
-    max(x - r, 0) for thresholds r > 0, min(x - r, 0) for r < 0, and x. The slope between two thresholds is the
+    Kuhnen 2003 (European Journal of Control 9, 407-418) writes it as a sum of weights times max(x - r, 0) for
+    thresholds r > 0, min(x - r, 0) for r < 0, and x. The slope between two thresholds is the
     sum of the weights that are active there, and the slopes are what is kept here: the map rises if and only
     if none is negative, and its inverse is again such a map.
 
@@ -357,7 +357,7 @@ class PrandtlIshlinskii:
         """Return the operator that gives the input back: itself a Prandtl-Ishlinskii operator.
 
         Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the
-        running sums W (Kuhnen 2003, eqs. 13 to 16). Its states come from `inverse_state`; its operating range is
+        running sums W (Kuhnen 2003). Its states come from `inverse_state`; its operating range is
         this operator's `output_range`.
 
         Raises

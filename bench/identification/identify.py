@@ -375,7 +375,7 @@ def _with_dead_zones(
 ) -> PrandtlIshlinskii:
     """Return the operator with play weights, and dead zones after the plays whose slopes are still to be fitted.
 
-    Kuhnen 2003, section 5: the error is taken between the plays and the dead zones, plays(u) - S⁻¹(y), which is
+    After Kuhnen 2003: the error is taken between the plays and the dead zones, plays(u) - S⁻¹(y), which is
     linear in the play weights and the slopes of S⁻¹ together. The slope of the interval that holds the median
     output is 1: a factor can be moved from the plays to the dead zones.
     """

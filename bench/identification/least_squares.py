@@ -559,13 +559,12 @@ class _ActiveSet:
             if entering.size > room:
                 entering = entering[np.argpartition(-g[entering], room)[:room]]
             self.learn(entering)
-            before = self.passive.size
             dependent = self.enter(entering)
             entered = self.passive.size
             dependent = np.concatenate([dependent, self.settle(bold)])
             bold, gain = bold and self.gain() > gain, self.gain()
             # A column depends on a certain passive set only.
-            if self.passive.size < entered or entered < before:
+            if self.passive.size < entered:
                 barred[:] = False
             barred[dependent] = True
 

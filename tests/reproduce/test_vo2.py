@@ -1,4 +1,4 @@
-"""The VO2 paper from bytes on the wire to identified models, through the command line, over eight seeds."""
+"""The VO2 paper from bytes on the wire to tracking, through the command line, over six seeds and more."""
 
 import json
 from pathlib import Path
@@ -13,33 +13,23 @@ from bench.model_file import load_model
 MODELS = ("nonmonotonic", "signed", "polynomial")
 
 
+def bench(*arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in arguments])
+    assert not stopped.value.code
+
+
+# Worker and fixture are of one seed, so that no campaign is run twice.
 @pytest.fixture(
-    scope="module", params=[pytest.param(seed, marks=pytest.mark.xdist_group(f"vo2-{seed}")) for seed in range(8)]
+    scope="module", params=[pytest.param(seed, marks=pytest.mark.xdist_group(f"vo2-{seed}")) for seed in range(6)]
 )
 def campaign(request, tmp_path_factory):
     out = tmp_path_factory.mktemp(f"vo2-{request.param}")
-    command = [
-        "reproduce",
-        "vo2",
-        "--seed",
-        str(request.param),
-        "--out",
-        str(out),
-        "--json",
-        str(out / "result.json"),
-    ]
-    with pytest.raises(SystemExit) as stopped:
-        main(command)
-    assert not stopped.value.code
+    bench("reproduce", "vo2", "--seed", request.param, "--out", out, "--json", out / "result.json")
     return json.loads((out / "result.json").read_text())
 
 
-def test_it_is_a_day_in_the_laboratory(campaign):
-    assert campaign["laboratory_seconds"] > 4000 * 8
-
-
-def test_identification_is_as_good_as_the_paper_and_in_its_order(campaign):
-    errors = campaign["identification"]
+def check_identification(errors):
     assert errors["nonmonotonic"]["max"] <= 60
     assert errors["nonmonotonic"]["rms"] <= 7
     assert errors["signed"]["max"] > errors["nonmonotonic"]["max"]
@@ -47,11 +37,19 @@ def test_identification_is_as_good_as_the_paper_and_in_its_order(campaign):
     assert errors["polynomial"]["max"] >= 8 * errors["nonmonotonic"]["max"]
 
 
+def test_it_is_more_than_eleven_hours_in_the_laboratory(campaign):
+    assert campaign["laboratory_seconds"] > 11 * 3600
+
+
+def test_identification_is_as_good_as_the_paper_s_and_in_its_order(campaign):
+    check_identification(campaign["identification"])
+
+
 def test_validation_holds_in_a_session_with_an_offset(campaign):
     assert abs(campaign["session_offset"]) == 0.2
     errors = campaign["validation"]
     assert errors["nonmonotonic"]["max"] <= 110
-    assert errors["nonmonotonic"]["rms"] < errors["signed"]["rms"] < errors["polynomial"]["rms"]
+    assert errors["nonmonotonic"]["max"] < errors["signed"]["max"] < errors["polynomial"]["max"]
 
 
 def test_every_fit_is_certified(campaign):
@@ -66,20 +64,85 @@ def test_parameters_are_near_the_paper_s(campaign):
     assert parameters["κ min"] < parameters["κ−"] < parameters["κ+"] < parameters["κ max"]
 
 
+def test_open_loop_inverse_tracks_as_the_paper_s(campaign):
+    errors = campaign["tracking"]
+    assert errors["open_loop_inverse"]["rms"] <= 42
+    assert errors["open_loop_inverse"]["max"] <= 90
+    assert errors["polynomial"]["rms"] > 5 * errors["open_loop_inverse"]["rms"]
+
+
+def test_closed_loop_beats_the_open_one_within_seven_seconds_a_target(campaign):
+    errors = campaign["tracking"]["closed_loop_inverse"]
+    assert errors["rms"] <= 8
+    assert errors["seconds_per_target"] <= 7
+    assert campaign["tracking"]["integral"]["rms"] > 2 * errors["rms"]
+
+
+def test_latched_is_an_order_of_magnitude_better(campaign):
+    errors = campaign["tracking"]["latched"]
+    assert errors["rms"] <= 2
+    assert errors["max"] <= 15
+    assert errors["median"] <= 0.2
+    assert errors["rms"] < 0.1 * campaign["tracking"]["open_loop_inverse"]["rms"]
+
+
+def test_a_slow_sine_is_followed(campaign):
+    assert campaign["continuous"]["period_200"]["closed_loop_inverse"]["rms"] <= 5
+    for period in ("period_60", "period_200"):
+        errors = campaign["continuous"][period]
+        assert errors["closed_loop_inverse"]["rms"] < 0.5 * min(
+            errors["open_loop_inverse"]["rms"], errors["integral"]["rms"]
+        )
+
+
 def test_everything_that_it_says_is_there(campaign):
     folder = Path(campaign["folder"])
     assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
     model = load_model(folder / "preisach-nonmonotonic.json")
     runs = sorted(folder.glob("vo2-*/journal.sqlite"))
-    assert len(runs) == 2
+    assert len(runs) == 13
     for run in runs:
         with Record(run) as record:
             assert record.status == "completed"
-            assert len(record.models()) == len(MODELS)
+            assert record.meta["safe_state"] == {"tec": "safe", "psd": "safe"}
+            assert "preisach-nonmonotonic" in record.models()
             steps = record.steps()
             # The model that was saved is the one that the table speaks of.
-            if "random" in record.path.parent.name:
+            if record.meta["protocol"] == "random-validation":
                 error = steps["curvature"] - model.operator.evaluate(steps["tec_temperature"])
                 assert np.max(np.abs(error)) == pytest.approx(
                     campaign["validation"]["nonmonotonic"]["max"], rel=1e-12
                 )
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.xdist_group(f"vo2-steps-{seed}")) for seed in (6, 7)]
+)
+def test_the_same_step_by_step(tmp_path, seed):
+    """Run, identify, run in another session, predict: what an operator types."""
+    columns = ("--input", "tec_temperature", "--output", "curvature")
+    runs = {}
+    for name, protocol, laboratory_seed, offset in (
+        ("identification", "damped-oscillation", 2 * seed, 0.0),
+        ("validation", "random-validation", 2 * seed + 1, 0.2 if seed % 2 == 0 else -0.2),
+    ):
+        bench(
+            "run", protocol, "--rig", "vo2", "--clock", "virtual", "--seed", laboratory_seed, "--out", tmp_path,
+            "--override", f"emulation.session_offset={offset}", "--json", tmp_path / "run.json",
+        )  # fmt: skip
+        runs[name] = json.loads((tmp_path / "run.json").read_text())["folder"]
+    identified, validated = {}, {}
+    for key, model, options in (
+        ("nonmonotonic", "preisach-nonmonotonic", ["--levels", 20]),
+        ("signed", "preisach-signed", ["--levels", 20, "--plane", 21, 84]),
+        ("polynomial", "polynomial", ["--degree", 12]),
+    ):
+        path, result = tmp_path / f"{key}.json", tmp_path / "result.json"
+        bench(
+            "identify", runs["identification"], *columns, "--model", model, *options, "--out", path, "--json", result
+        )
+        identified[key] = json.loads(result.read_text())
+        bench("predict", path, runs["validation"], *columns, "--out", tmp_path / "out.csv", "--json", result)
+        validated[key] = json.loads(result.read_text())
+    check_identification(identified)
+    assert validated["nonmonotonic"]["max"] <= 110

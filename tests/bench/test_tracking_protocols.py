@@ -1,0 +1,254 @@
+"""Tracking and following through the command line, and what they refuse before anything moves."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_levels
+from bench.identification import identify
+from bench.identification.excitation import damped_oscillation
+from bench.journal import Record
+from bench.model_file import ModelFile
+from bench.tracking_results import following_result, target_results
+
+VO2 = ["--rig", "vo2", "--clock", "virtual"]
+
+
+@pytest.fixture
+def bench(capsys):
+    """Run a command in this process; return exit code, standard output and standard error."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stopped:
+            main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def operator():
+    """A model near the emulated specimen, made of the paper's numbers rather than of a campaign."""
+    levels = uniform_levels(30.0, 70.0, 20)
+    middle = 0.5 * (levels[1:] + levels[:-1])
+    rows, columns = np.tril_indices(20)
+    alpha, width = middle[rows], middle[rows] - middle[columns]
+    density = np.exp(-0.5 * ((alpha - 63.5) / 3.0) ** 2 - 0.5 * ((width - 4.0) / 2.0) ** 2)
+    plain = Preisach(levels, density)
+    density *= 2034.0 / 2.0 / (density @ plain.cell_areas())
+    return Preisach(
+        levels, density, bias=1025.0, reversible=ThermalExpansion(3.0, 4.3), input_range=(21.0, 84.0),
+        input_unit="°C", output_unit="1/m",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def models(operator, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    inputs = damped_oscillation()
+    fitted = identify("polynomial", inputs, operator.evaluate(inputs), input_unit="°C", output_unit="1/m").model
+    paths = {"preisach": folder / "preisach.json", "polynomial": folder / "polynomial.json"}
+    ModelFile("preisach-nonmonotonic", operator, operator.initial_state().advance(inputs)).save(paths["preisach"])
+    ModelFile("polynomial", fitted, None).save(paths["polynomial"])
+    other = json.loads(paths["preisach"].read_text())
+    other["operator"]["output_unit"] = "µm"
+    paths["micrometres"] = folder / "micrometres.json"
+    paths["micrometres"].write_text(json.dumps(other))
+    wide = Preisach(uniform_levels(10.0, 70.0, 20), operator.density, input_unit="°C", output_unit="1/m")
+    paths["wide"] = folder / "wide.json"
+    ModelFile("preisach", wide, None).save(paths["wide"])
+    return paths
+
+
+def write_table(path, header, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+    return path
+
+
+class TestTracking:
+    def test_users_own_targets_are_reached_and_recorded(self, bench, models, tmp_path):
+        targets = [300.0, 1200.0, 700.0, 1500.0]
+        file = write_table(tmp_path / "targets.csv", ["target [1/m]"], [[target] for target in targets])
+        code, out, _ = bench(
+            "run", "tracking", *VO2, "--set", f"model={models['preisach']}", "--set", "controller=latched",
+            "--set", f"targets={file}", "--seed", 3, "--out", tmp_path, "--json", tmp_path / "run.json",
+        )  # fmt: skip
+        assert code == 0
+        assert "memory of the specimen is unknown" in re.sub(r"\s+", " ", out)
+        folder = Path(json.loads((tmp_path / "run.json").read_text())["folder"])
+        with Record(folder) as record:
+            results = target_results(record, "curvature")
+            names = [signal.name for signal in record.signals]
+            ticks = record.telemetry()
+        np.testing.assert_array_equal(results.targets, targets)
+        assert np.max(np.abs(results.outputs - results.targets)) < 3.0
+        assert {"reference", "predicted", "disturbance", "disturbance_uncertainty"} <= set(names)
+        at_work = np.isfinite(ticks["reference"])
+        assert set(ticks["reference"][at_work]) == set(targets)
+        assert np.all(ticks["disturbance_uncertainty"][at_work & np.isfinite(ticks["disturbance"])] > 0)
+
+        code, out, _ = bench("report", folder, "--json", tmp_path / "report.json")
+        assert code == 0
+        report = json.loads((tmp_path / "report.json").read_text())
+        assert report["tracking"]["max"] == pytest.approx(float(np.max(np.abs(results.outputs - results.targets))))
+
+    def test_set_points_stay_within_what_is_allowed(self, bench, models, tmp_path):
+        # 1835 1/m and -90 1/m lie beyond saturation: the whole range is travelled for them.
+        file = write_table(tmp_path / "targets.csv", ["target"], [[900.0], [1835.0], [-90.0], [5000.0]])
+        code, _, _ = bench(
+            "run", "tracking", *VO2, "--set", f"model={models['preisach']}", "--set", "controller=open-loop-inverse",
+            "--set", f"targets={file}", "--set", "reset=25", "--set", "hottest=75", "--out", tmp_path,
+            "--json", tmp_path / "run.json",
+        )  # fmt: skip
+        assert code == 0
+        with Record(Path(json.loads((tmp_path / "run.json").read_text())["folder"])) as record:
+            setpoints = record.telemetry()["tec_setpoint"]
+        sent = setpoints[np.isfinite(setpoints)]
+        assert sent.min() >= 25.0
+        assert sent.max() <= 75.0
+
+    @pytest.mark.parametrize(
+        ("settings", "code", "words"),
+        [
+            ([], 2, ["model", "missing"]),
+            (["model=none.json"], 3, ["none.json"]),
+            (["model={micrometres}"], 3, ["µm", "1/m"]),
+            (["model={polynomial}"], 3, ["closed-loop-inverse", "Preisach"]),
+            (["model={preisach}", "controller=polynomial"], 3, ["polynomial"]),
+            (["model={preisach}", "controller=magic"], 2, ["controller", "latched"]),
+            (["model={preisach}", "hottest=120"], 2, ["120", "95 °C"]),
+            (["model={preisach}", "reset=40"], 2, ["reset", "saturate"]),
+            (["model={wide}"], 2, ["reset", "saturate"]),
+            (["model={preisach}", "targets={gap}"], 3, ["gap.csv", "row 2", "empty"]),
+            (["model={preisach}", "targets={text}"], 3, ["text.csv", "row 1", "'high'"]),
+            (["model={preisach}", "targets={wrong}"], 3, ["no column 'target'"]),
+        ],
+    )
+    def test_what_does_not_fit_is_refused_before_anything_moves(self, bench, models, tmp_path, settings, code, words):
+        write_table(tmp_path / "gap.csv", ["target", "comment"], [[300.0, ""], ["", "gap"], [500.0, ""]])
+        write_table(tmp_path / "text.csv", ["target"], [["high"]])
+        write_table(tmp_path / "wrong.csv", ["goal"], [[1.0]])
+        places = {**models, **{name: tmp_path / f"{name}.csv" for name in ("gap", "text", "wrong")}}
+        options = [part for text in settings for part in ("--set", text.format(**places))]
+        out = tmp_path / "out"
+        found, _, err = bench("run", "tracking", *VO2, *options, "--out", out)
+        assert found == code
+        assert "Traceback" not in err
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
+        assert not out.exists()
+
+
+class TestFollowing:
+    def test_a_users_own_reference_is_followed(self, bench, models, tmp_path):
+        times = np.arange(0.0, 121.0, 1.0)
+        reference = 700.0 + 400.0 * np.sin(2 * np.pi * times / 120.0)
+        file = write_table(
+            tmp_path / "reference.csv", ["time [s]", "reference [1/m]"], zip(times, reference, strict=True)
+        )
+        code, _, _ = bench(
+            "run", "following", *VO2, "--set", f"model={models['preisach']}", "--set", f"reference={file}",
+            "--seed", 4, "--out", tmp_path, "--json", tmp_path / "run.json",
+        )  # fmt: skip
+        assert code == 0
+        with Record(Path(json.loads((tmp_path / "run.json").read_text())["folder"])) as record:
+            result = following_result(record, "curvature")
+        assert result.times[-1] == pytest.approx(120.0, abs=0.6)
+        np.testing.assert_allclose(result.reference, np.interp(result.times, times, reference), atol=1.0)
+        assert result.summary()["rms"] < 40.0
+
+    @pytest.mark.parametrize(
+        ("settings", "code", "words"),
+        [
+            (["period=5", "duration=20"], 2, ["K/s", "3 K/s at most"]),
+            (["high=2500"], 2, ["range", "1/m"]),
+            (["reference={unsorted}"], 2, ["unsorted.csv", "row 3", "increase"]),
+            (["reference={gap}"], 3, ["gap.csv", "row 2", "reference"]),
+            (["controller=latched"], 2, ["controller", "closed-loop-inverse"]),
+        ],
+    )
+    def test_what_cannot_be_followed_is_refused_before_anything_moves(
+        self, bench, models, tmp_path, settings, code, words
+    ):
+        write_table(tmp_path / "unsorted.csv", ["time", "reference"], [[0, 500], [2, 510], [1, 520], [3, 530]])
+        write_table(tmp_path / "gap.csv", ["time", "reference"], [[0, 500], [1, ""], [2, 520], [3, 530]])
+        places = {name: tmp_path / f"{name}.csv" for name in ("unsorted", "gap")}
+        options = [part for text in settings for part in ("--set", text.format(**places))]
+        out = tmp_path / "out"
+        found, _, err = bench(
+            "run", "following", *VO2, "--set", f"model={models['preisach']}", *options, "--out", out
+        )
+        assert found == code
+        assert "Traceback" not in err
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
+        assert not out.exists()
+
+
+class TestInvert:
+    def read(self, path):
+        with path.open() as file:
+            return list(csv.DictReader(file))
+
+    def test_set_points_meet_the_targets_from_the_memory_that_they_leave(self, bench, operator, models, tmp_path):
+        targets = [500.0, 1200.0, 300.0, 1835.0, -80.0, 3000.0, -500.0, 900.0]
+        file = write_table(tmp_path / "targets.csv", ["wish [1/m]"], [[target] for target in targets])
+        code, out, _ = bench(
+            "invert", models["preisach"], file, "--column", "wish", "--out", tmp_path / "out.csv",
+            "--json", tmp_path / "result.json",
+        )  # fmt: skip
+        assert code == 0
+        assert "6 met, 1 too high, 1 too low" in out
+        rows = self.read(tmp_path / "out.csv")
+        assert list(rows[0]) == ["target [1/m]", "passing [°C]", "setpoint [°C]", "predicted [1/m]", "flag"]
+        state: MemoryCurve = operator.initial_state()
+        for target, row in zip(targets, rows, strict=True):
+            if row["passing [°C]"]:
+                state = state.step(float(row["passing [°C]"]))
+            state, output = operator.step(state, float(row["setpoint [°C]"]))
+            assert output == pytest.approx(float(row["predicted [1/m]"]), abs=1e-9)
+            if row["flag"] == "met":
+                assert output == pytest.approx(target, abs=1e-9)
+        assert [row["flag"] for row in rows].count("too high") == 1
+        result = json.loads((tmp_path / "result.json").read_text())
+        assert result["met"] == 6
+        assert result["largest_residual"] <= 1e-9
+
+    def test_any_model_file_can_be_inverted(self, bench, models, tmp_path):
+        file = write_table(tmp_path / "targets.csv", ["target"], [[500.0], [5000.0]])
+        code, _, _ = bench("invert", models["polynomial"], file, "--column", "target", "--out", tmp_path / "out.csv")
+        assert code == 0
+        rows = self.read(tmp_path / "out.csv")
+        assert [row["flag"] for row in rows] == ["met", "too high"]
+
+    def test_stored_memory_and_policy_change_the_answer(self, bench, models, tmp_path):
+        file = write_table(tmp_path / "targets.csv", ["target"], [[500.0], [400.0]])
+        answers = []
+        for options in ([], ["--continue-memory"]):
+            bench("invert", models["preisach"], file, "--column", "target", "--out", tmp_path / "out.csv", *options)
+            answers.append([row["setpoint [°C]"] for row in self.read(tmp_path / "out.csv")])
+        assert answers[0] != answers[1]
+
+    @pytest.mark.parametrize(
+        ("header", "cell", "options", "words"),
+        [
+            ("target", "much", [], ["row 1", "'much'"]),
+            ("target [mm]", "1", [], ["mm", "1/m"]),
+            ("goal", "1", [], ["no column 'target'"]),
+        ],
+    )
+    def test_trouble_is_one_message(self, bench, models, tmp_path, header, cell, options, words):
+        file = write_table(tmp_path / "targets.csv", [header], [[cell]])
+        code, _, err = bench("invert", models["preisach"], file, "--column", "target", *options)
+        assert code == 3
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
