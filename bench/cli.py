@@ -251,6 +251,17 @@ def identify_(
     skip: Annotated[
         int, typer.Option(metavar="ROWS", help="First rows that drive the memory but do not count in the fit.")
     ] = 0,
+    initial: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
+            "reach, or estimate it.",
+        ),
+    ] = None,
+    cross_validate: Annotated[
+        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw loops, errors and density there.")] = None,
     json_file: JsonOption = None,
@@ -274,7 +285,12 @@ def identify_(
         reversible=reversible,
         smoothing=smoothing,
         skip=skip,
+        initial=initial,
+        cross_validated=cross_validate,
     )
+    if found.trials is not None:
+        console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
+        console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
@@ -337,6 +353,87 @@ def predict_(
         )
     console.print(f"{inputs.size} rows: {out}", highlight=False, soft_wrap=True)
     write_json(json_file, result)
+
+
+@app.command("compare")
+def compare_(
+    models: Annotated[list[Path], typer.Argument(metavar="A.json B.json", help="Model files.")],
+    data: Annotated[
+        Path, typer.Option("--data", metavar="FILE", help="CSV file with a header, or the folder of a run.")
+    ],
+    input_column: Annotated[
+        str | None, typer.Option("--input", metavar="COLUMN", help="What drives; the first model's if not given.")
+    ] = None,
+    output_column: Annotated[
+        str | None, typer.Option("--output", metavar="COLUMN", help="What answers; the first model's if not given.")
+    ] = None,
+    skip: Annotated[
+        int, typer.Option(min=0, metavar="ROWS", help="First rows that drive the memory but do not count.")
+    ] = 0,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the residuals there.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare models on measurements that they may not have seen.
+
+    Shows each model's errors raw, and after re-zeroing the sensor: between sessions a sensor's offset moves, and
+    what a model is worth then is another number.
+    """
+    from bench.modelling import compare_models
+
+    result = compare_models(models, data, input_column, output_column, skip=skip)
+    table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
+    table.add_column("model")
+    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
+        table.add_column(column, justify="right")
+    for name, entry in result.comparisons.items():
+        raw, mended = entry.raw, entry.rezeroed
+        table.add_row(
+            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
+            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+        )  # fmt: skip
+    console.print(table)
+    if figures is not None:
+        from bench.report import draw_comparison
+
+        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, soft_wrap=True)
+    write_json(json_file, result.to_json())
+
+
+@app.command()
+def design(
+    plane: Annotated[tuple[float, float], typer.Option(metavar="LOW HIGH", help="Ends of the Preisach plane.")] = (
+        30.0,
+        70.0,
+    ),
+    operating: Annotated[
+        tuple[float, float], typer.Option("--range", metavar="LOW HIGH", help="Operating range; contains the plane.")
+    ] = (21.0, 84.0),
+    levels: Annotated[int, typer.Option(min=2, max=60, help="Discretization levels of the plane.")] = 20,
+    dwell: Annotated[float, typer.Option(min=0.0, help="Settling time at each set-point, s.")] = 8.0,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
+
+    The damped oscillation of the papers, first-order reversal curves, and the shortest sequence that covers every
+    cell. Each is a protocol: damped-oscillation, first-order-reversals, covering.
+    """
+    from bench.modelling import assess_designs
+
+    result = assess_designs(plane, operating, levels, dwell)
+    table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
+    for column in ("set-points", "cells covered", "rank / coefficients", "condition", "laboratory time"):
+        table.add_column(column, justify="right")
+    for name, entry in result.items():
+        table.add_row(
+            name,
+            str(entry.setpoints),
+            f"{entry.covered} of {entry.cells}",
+            f"{entry.rank} of {entry.coefficients}",
+            f"{entry.condition:.2g}",
+            f"{entry.time / 3600:.2f} h",
+        )
+    console.print(table)
+    write_json(json_file, {name: vars(entry) for name, entry in result.items()})
 
 
 class PolicyOption(Enum):

@@ -16,14 +16,22 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
 --------------------------------------------------------------------
 `/signals/QUANTITY`, `/readings/QUANTITY`
     One vector a unit: quick readings of each tick, and the reading of each step.
+`/control/tracking`, `/control/error`, `/control/disturbance`
+    Of a run under control, one vector each: reference, predicted output and output; output less reference; the
+    estimated disturbance. Each has a band of two standard deviations of that estimate. nan while no controller
+    is at work.
 `/loop/data/path`, `/loop/data/now`
-    Output against input: the line from each step to the next, and the last point.
+    Output against input: the line from each point to the next, and the last point.
 `/plane/data/memory`, `/plane/data/input`, `/plane/density`
-    The Preisach plane: the memory curve after each step, the input on the diagonal, the model's density.
+    The Preisach plane: the memory curve at each point, the input on the diagonal, the model's density.
 `/state/phase`, `/state/run`
     Where the protocol stands: changes only.
 `/events`, `/card`
     What happened, and the run card.
+
+The points of loop and plane are the readings of the steps and, while a controller is at work, the ticks. Every
+tick moves the memory, but a point is drawn only if it is `_REDRAW_SECONDS` after the last and can be told from
+it with the eye; the line to it leads through what was left out.
 """
 
 from __future__ import annotations
@@ -33,11 +41,11 @@ import queue
 import socket
 import subprocess
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +60,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.journal import Event, Record, StepRecord
 from bench.model_file import parse_model
+from bench.protocol import TRACES
 from bench.runs import run_card
 
 QUEUED_TICKS = 20_000
@@ -75,6 +84,15 @@ _LOOPBACK = "127.0.0.1"
 _WIDTH = 1.15
 """Width of the drawn loop and plane where their height is 1."""
 
+_REDRAW_SECONDS = 0.1
+_VISIBLE = 0.002
+"""Part of an axis that the eye can tell; a controller at its target moves by less."""
+
+_CLOSE = 0.01
+"""Part of the output's range that the close view of the error shows to either side of none."""
+
+_TRACE_NAMES = tuple(signal.name for signal in TRACES)
+
 Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
@@ -85,6 +103,11 @@ _RISING: Colour = (255, 122, 72)
 _FALLING: Colour = (78, 160, 255)
 _MARKER: Colour = (150, 248, 228)
 _SETPOINT: Colour = (150, 158, 168)
+_OUTPUT: Colour = (255, 122, 72)
+_PREDICTED: Colour = (150, 110, 190)
+_ERROR: Colour = (255, 206, 84)
+_DISTURBANCE: Colour = (64, 208, 206)
+_BAND: Colour = (122, 132, 148)
 _PALETTE: tuple[Colour, ...] = (
     (255, 122, 72),
     (78, 160, 255),
@@ -209,13 +232,16 @@ class Dashboard:
         The run card, Markdown.
     properties : mapping
         Plain values that the viewer shows as properties of the recording.
+    controls : str
+        Name of the signal that the run's controllers control, empty if there are none; their traces are then
+        among the signals.
     port : int
         Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any.
 
     Raises
     ------
     ConfigurationError
-        If the file exists, the layout names a signal that there is not, or no port is free.
+        If the file exists, the layout or `controls` names a signal that there is not, or no port is free.
     ValueError
         If there is neither a file nor a live view.
     """
@@ -231,11 +257,12 @@ class Dashboard:
         live: bool,
         card: str,
         properties: Mapping[str, object],
+        controls: str = "",
         port: int = 9876,
     ) -> None:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
-        self._writer = _Writer(signals, layout, run_id)
+        self._writer = _Writer(signals, layout, controls, run_id)
         self.uri: str | None = None
         """Address for a viewer, None without a live view."""
         server = None
@@ -366,27 +393,16 @@ def rebuild(record: Record, path: Path) -> None:
     try:
         table = meta.get("dashboard")
         layout = DashboardLayout(title=meta["rig_title"], **table) if table else None
-        writer = _Writer(record.signals, layout, str(meta["run"]))
+        writer = _Writer(record.signals, layout, meta.get("controls", ""), str(meta["run"]))
         card, title = run_card(meta), f"{meta['rig_title']}: {meta['protocol']}"
         properties = {key: meta[key] for key in ("rig", "protocol", "seed")}
     except (ConfigurationError, KeyError, TypeError) as error:
         raise DataError(f"{record.path} does not say what its dashboard was: {error}") from error
     writer.open(_file_sink(path), None, title, card, properties)
     try:
-        telemetry = record.telemetry()
-        for start in range(0, len(telemetry), _CHUNK_ROWS):
-            rows = slice(start, start + _CHUNK_ROWS)
-            writer.ticks(
-                telemetry["t"][rows],
-                telemetry["step"][rows].astype(np.int64),
-                np.column_stack([telemetry[signal.name][rows] for signal in record.signals]),
-            )
-        # A step is told at its end, before what follows from it.
-        entries: list[tuple[float, _Entry]] = [(step.finished, step) for step in record.step_records()]
-        entries += [(event.t, event) for event in record.events()]
-        entries.sort(key=lambda entry: entry[0])
+        entries = _entries(record)
         for start in range(0, len(entries), _CHUNK_ROWS):
-            writer.write([entry for _, entry in entries[start : start + _CHUNK_ROWS]])
+            writer.write(entries[start : start + _CHUNK_ROWS])
         writer.write([_Model(name, *density) for name, density in _densities(record)])
         if "status" in meta:
             writer.write([_End(str(meta["status"]), str(meta.get("reason", "")))])
@@ -471,35 +487,30 @@ class _End:
     reason: str
 
 
-_Tick = tuple[float, int, tuple[float, ...]]
+_Tick = tuple[float, int, Sequence[float]]
 _Entry = _Tick | StepRecord | Event | _Model | _End
 
 
 class _Writer:
     """Turns what happened into Rerun's columns; used by one thread at a time."""
 
-    def __init__(self, signals: Sequence[Signal], layout: DashboardLayout | None, run_id: str) -> None:
+    def __init__(self, signals: Sequence[Signal], layout: DashboardLayout | None, controls: str, run_id: str) -> None:
         self._signals = tuple(signals)
         self._layout = layout
         self._axes: tuple[int, int] | None = None
-        if layout is not None:
-            names = [signal.name for signal in self._signals]
-            for key, name in (("input", layout.input), ("output", layout.output)):
-                if name not in names:
-                    raise ConfigurationError(
-                        f"dashboard: {key}: there is no signal {name!r}; there are: {', '.join(names)}"
-                    )
-            self._axes = names.index(layout.input), names.index(layout.output)
         ranges = {}
         if layout is not None:
+            self._axes = _column(signals, "input", layout.input), _column(signals, "output", layout.output)
             ranges = {layout.input: layout.input_range, layout.output: layout.output_range}
-        self._groups = _group_by_unit(self._signals, ranges)
+        self._control = _Control.of(signals, controls, ranges.get(controls)) if controls else None
+        self._groups = _group_by_unit(self._signals, ranges, _TRACE_NAMES if controls else ())
         self._run_id = run_id
         self._streams: list[rr.RecordingStream] = []
         self._live: rr.RecordingStream | None = None
         self._unseen = 0
         self._memory: MemoryCurve | None = None
-        self._point: tuple[float, float] | None = None
+        self._path: list[tuple[float, float]] = []
+        self._drawn = -math.inf
         self._states: dict[str, str] = {}
         self._phases: list[str] = []
         self._step = 0
@@ -532,6 +543,9 @@ class _Writer:
         for group in self._groups:
             for kind in ("signals", "readings"):
                 self._log(f"{kind}/{group.path}", group.style)
+        if self._control is not None:
+            for name, style in self._control.styles().items():
+                self._log(f"control/{name}", style)
         self._log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
         if self._layout is not None and self._axes is not None:
             x, y = (self._signals[column] for column in self._axes)
@@ -542,9 +556,6 @@ class _Writer:
     def write(self, entries: Sequence[_Entry]) -> None:
         """Write entries in the order in which they happened."""
         ticks = [entry for entry in entries if isinstance(entry, tuple)]
-        if ticks:
-            t, step, values = zip(*ticks, strict=True)
-            self.ticks(np.array(t), np.array(step), np.array(values, dtype=np.float64))
         steps: list[StepRecord] = []
         events: list[tuple[int, Event]] = []
         changes: list[tuple[str, float, int, str]] = []
@@ -567,14 +578,11 @@ class _Writer:
                 self._draw_model(entry)
             elif isinstance(entry, _End):
                 self._set_property("outcome", {"status": entry.status, "reason": entry.reason})
+        self._write_ticks(ticks)
         self._write_steps(steps)
+        self._draw_points(self._points(entries))
         self._write_events(events)
         self._write_changes(changes)
-
-    def ticks(self, t: Floats, step: npt.NDArray[np.int64], values: Floats) -> None:
-        """Write ticks: times in s, shape (n,), step numbers, shape (n,), and values, shape (n, signals)."""
-        self._scalars("signals", _times(t, step), values)
-        self._t = float(t[-1])
 
     def warn(self, text: str) -> None:
         """Say in the log what the matter is with the dashboard itself."""
@@ -610,35 +618,74 @@ class _Writer:
         if self._live is not None:
             self._live.disconnect()
 
+    def _write_ticks(self, ticks: Sequence[_Tick]) -> None:
+        if not ticks:
+            return
+        t, step, rows = zip(*ticks, strict=True)
+        values, times = np.array(rows, dtype=np.float64), _times(t, step)
+        self._scalars("signals", times, values)
+        if self._control is not None:
+            for name, series in self._control.series(values).items():
+                self._send_vectors(f"control/{name}", times, series)
+        self._t = max(self._t, t[-1])
+
     def _write_steps(self, steps: Sequence[StepRecord]) -> None:
         if not steps:
             return
-        values = np.array([step.values for step in steps], dtype=np.float64)
         times = _times([step.finished for step in steps], [step.step for step in steps])
-        self._scalars("readings", times, values)
-        if self._layout is None or self._axes is None:
+        self._scalars("readings", times, np.array([step.values for step in steps], dtype=np.float64))
+
+    def _points(self, entries: Iterable[_Entry]) -> Iterator[_Point]:
+        """Yield where loop and memory curve go: to each reading and, under control, to each tick."""
+        if self._axes is None:
             return
-        segments, colours, drawn, memories, inputs = [], [], [], [], []
-        for step, (x, y) in zip(steps, values[:, self._axes].tolist(), strict=True):
-            if not (math.isfinite(x) and math.isfinite(y)):
+        x, y = self._axes
+        for entry in entries:
+            if isinstance(entry, StepRecord):
+                yield _Point(entry.finished, entry.step, entry.values[x], entry.values[y], True)
+            elif isinstance(entry, tuple) and self._control is not None and self._control.is_at_work(entry[2]):
+                yield _Point(entry[0], entry[1], entry[2][x], entry[2][y], False)
+
+    def _draw_points(self, points: Iterable[_Point]) -> None:
+        if self._layout is None:
+            return
+        paths, colours, drawn, memories, inputs = [], [], [], [], []
+        for point in points:
+            here = x, y = point.x, point.y
+            if not math.isfinite(x):
                 continue
-            previous = self._point or (x, y)
-            segments.append([previous, (x, y)])
-            colours.append(_RISING if x >= previous[0] else _FALLING)
-            self._point = (x, y)
             self._memory = self._memory.step(x) if self._memory else MemoryCurve.from_negative_saturation(x)
+            if not math.isfinite(y):
+                continue
+            self._path = self._path or [here]
+            if not (point.is_reading or self._is_visible(here)):
+                continue
+            self._path.append(here)
+            if not point.is_reading and point.t - self._drawn < _REDRAW_SECONDS:
+                continue
+            paths.append(self._path)
+            colours.append(_RISING if x >= self._path[0][0] else _FALLING)
             memories.append(self._memory.corners(*self._layout.plane))
             inputs.append(memories[-1][-1])
-            drawn.append(step)
+            drawn.append(point)
+            self._path, self._drawn = [here], point.t
         if not drawn:
             return
-        times = _times([step.finished for step in drawn], [step.step for step in drawn])
-        points = [segment[1] for segment in segments]
+        times = _times([point.t for point in drawn], [point.step for point in drawn])
         send = self._send
-        send("loop/data/path", times, rr.LineStrips2D.columns(strips=segments, colors=colours))
-        send("loop/data/now", times, rr.Points2D.columns(positions=points))
+        send("loop/data/path", times, rr.LineStrips2D.columns(strips=paths, colors=colours))
+        send("loop/data/now", times, rr.Points2D.columns(positions=[path[-1] for path in paths]))
         send("plane/data/memory", times, rr.LineStrips2D.columns(strips=memories))
         send("plane/data/input", times, rr.Points2D.columns(positions=inputs))
+
+    def _is_visible(self, point: tuple[float, float]) -> bool:
+        """Return whether a point can be told from the one that was drawn last."""
+        assert self._layout is not None
+        ranges = self._layout.plane, self._layout.output_range
+        return any(
+            abs(new - old) > _VISIBLE * (high - low)
+            for new, old, (low, high) in zip(point, self._path[0], ranges, strict=True)
+        )
 
     def _write_events(self, events: Sequence[tuple[int, Event]]) -> None:
         if not events:
@@ -670,9 +717,11 @@ class _Writer:
 
     def _scalars(self, kind: str, times: list[rr.TimeColumn], values: Floats) -> None:
         for group in self._groups:
-            columns = rr.Scalars.columns(scalars=(values[:, group.columns] * group.factor).ravel())
-            lengths = np.full(len(values), len(group.columns))
-            self._send(f"{kind}/{group.path}", times, columns.partition(lengths))
+            self._send_vectors(f"{kind}/{group.path}", times, values[:, group.columns] * group.factor)
+
+    def _send_vectors(self, path: str, times: list[rr.TimeColumn], vectors: Floats) -> None:
+        columns = rr.Scalars.columns(scalars=vectors.ravel())
+        self._send(path, times, columns.partition(np.full(len(vectors), vectors.shape[1])))
 
     def _send(self, path: str, times: list[rr.TimeColumn], columns: Iterable[rr.ComponentColumn]) -> None:
         columns = list(columns)
@@ -760,17 +809,16 @@ class _Writer:
         )
 
     def _blueprint(self) -> rrb.Blueprint:
-        forever = rrb.TimeRangeBoundary.infinite()
-        whole_run = rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
+        whole_run = _whole_run()
         series = [
-            rrb.TimeSeriesView(
-                origin=f"/signals/{group.path}",
-                name=group.title,
-                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(group.columns) > 1),
-                axis_x=whole_run,
-            )
+            _plot(f"/signals/{group.path}", group.title, rrb.Corner2D.RightBottom if len(group.columns) > 1 else None)
             for group in self._groups
         ]
+        left = rrb.Vertical(*series, row_shares=[group.height for group in self._groups])
+        if self._control is not None:
+            driven = [self._axes is not None and self._axes[0] in group.columns for group in self._groups]
+            others = rrb.Tabs(*series, active_tab=driven.index(True) if any(driven) else 0)
+            left = rrb.Vertical(*self._control.views(), others, row_shares=[5, 4, 4, 4])
         state = rrb.StateTimelineView(origin="/state", name="Protocol", time_view=whole_run)
         log = rrb.TextLogView(
             origin="/events",
@@ -808,7 +856,7 @@ class _Writer:
             right = rrb.Vertical(rrb.Horizontal(*views), below, row_shares=[8, 7])
         return rrb.Blueprint(
             rrb.Horizontal(
-                rrb.Vertical(*series, row_shares=[group.height for group in self._groups]),
+                left,
                 right,
                 column_shares=[2, 3],
             ),
@@ -828,6 +876,85 @@ class _Group:
     factor: float
     height: int
     style: rr.SeriesLines
+
+
+class _Point(NamedTuple):
+    """A point of the loop: a reading that was waited for, or a tick under control."""
+
+    t: float
+    step: int
+    x: float
+    y: float
+    is_reading: bool
+
+
+@dataclass(frozen=True)
+class _Control:
+    """What there is to see of controllers: columns of their signals, and how to show them."""
+
+    output: int
+    traces: tuple[int, ...]
+    extent: tuple[float, float] | None
+    factor: float
+    unit: str
+
+    @classmethod
+    def of(cls, signals: Sequence[Signal], controls: str, extent: tuple[float, float] | None) -> _Control:
+        output = _column(signals, "controls", controls)
+        factor, unit = _prefixed(signals[output].unit, extent or _likely_extent(signals[output]))
+        traces = tuple(_column(signals, "controls", name) for name in _TRACE_NAMES)
+        return cls(output, traces, extent, factor, unit)
+
+    def is_at_work(self, values: Sequence[float]) -> bool:
+        """Return whether a controller was at work when a tick was taken."""
+        return math.isfinite(values[self.traces[0]])
+
+    def series(self, values: Floats) -> dict[str, Floats]:
+        """Return what is plotted of ticks: by plot, one row a tick, one column a line, in its unit."""
+        reference, predicted, disturbance, uncertainty = self.factor * values[:, self.traces].T
+        output = self.factor * values[:, self.output]
+        band = 2.0 * uncertainty
+        if self.extent is not None:
+            # Before the first estimate there is only a notion of how large disturbances are at all.
+            band[band > self.factor * (self.extent[1] - self.extent[0])] = np.nan
+        around = np.where(np.isfinite(reference), 0.0, np.nan)
+        return {
+            "tracking": np.column_stack([reference - band, reference + band, predicted, output, reference]),
+            "error": np.column_stack([output - reference, around - band, around + band]),
+            "disturbance": np.column_stack([disturbance - band, disturbance + band, disturbance]),
+        }
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Return how the lines of `series` look."""
+        lines = {
+            # The last line is on top. Lines of one name are one entry of the legend.
+            "tracking": [
+                *[("reference ± 2σ", _BAND, 0.75)] * 2,
+                ("predicted", _PREDICTED, 1.0),
+                ("output", _OUTPUT, 2.0),
+                ("reference ± 2σ", _INK, 1.0),
+            ],
+            "error": [("output − reference", _ERROR, 1.0), *[("± 2σ", _BAND, 1.0)] * 2],
+            "disturbance": [*[("± 2σ", _BAND, 0.75)] * 2, ("disturbance", _DISTURBANCE, 1.75)],
+        }
+        return {
+            name: rr.SeriesLines(names=names, colors=colours, widths=widths)
+            for name, (names, colours, widths) in ((name, zip(*look, strict=True)) for name, look in lines.items())
+        }
+
+    def views(self) -> list[rrb.TimeSeriesView | rrb.Tabs]:
+        """Return the plots of `series`, from top to bottom."""
+        error: rrb.TimeSeriesView | rrb.Tabs = _plot("/control/error", f"Error ± 2σ [{self.unit}]")
+        if self.extent is not None:
+            # A new target lies far away; next to the way there, what remains at the target would not be seen.
+            most = _CLOSE * self.factor * (self.extent[1] - self.extent[0])
+            close = _plot("/control/error", f"Error ± 2σ, close [{self.unit}]", y=(-most, most))
+            error = rrb.Tabs(close, error, active_tab=0)
+        return [
+            _plot("/control/tracking", f"Tracking [{self.unit}]", rrb.Corner2D.LeftTop),
+            error,
+            _plot("/control/disturbance", f"Disturbance ± 2σ [{self.unit}]"),
+        ]
 
 
 @dataclass(frozen=True)
@@ -862,14 +989,16 @@ class _Frame:
         return -(value - low) / (high - low)
 
 
-def _group_by_unit(signals: Sequence[Signal], ranges: Mapping[str, tuple[float, float]]) -> list[_Group]:
+def _group_by_unit(
+    signals: Sequence[Signal], ranges: Mapping[str, tuple[float, float]], omitted: Collection[str]
+) -> list[_Group]:
+    shown_signals = [(i, signal) for i, signal in enumerate(signals) if signal.name not in omitted]
     groups = []
-    for unit in dict.fromkeys(signal.unit for signal in signals):
-        columns = [i for i, signal in enumerate(signals) if signal.unit == unit]
+    for unit in dict.fromkeys(signal.unit for _, signal in shown_signals):
+        columns = [i for i, signal in shown_signals if signal.unit == unit]
         members = [signals[i] for i in columns]
         extents = [ranges[signal.name] for signal in members if signal.name in ranges]
-        # Without a range, the digits that are worth showing tell how large the numbers are.
-        factor, shown = _prefixed(unit, extents[0] if extents else (0.0, 10.0 ** (3 - members[0].precision)))
+        factor, shown = _prefixed(unit, extents[0] if extents else _likely_extent(members[0]))
         quantity = _QUANTITIES.get(unit, unit)
         title = quantity if len(members) > 1 else members[0].description
         style = rr.SeriesLines(
@@ -883,6 +1012,35 @@ def _group_by_unit(signals: Sequence[Signal], ranges: Mapping[str, tuple[float, 
     return groups
 
 
+def _column(signals: Sequence[Signal], key: str, name: str) -> int:
+    names = [signal.name for signal in signals]
+    if name not in names:
+        raise ConfigurationError(f"dashboard: {key}: there is no signal {name!r}; there are: {', '.join(names)}")
+    return names.index(name)
+
+
+def _likely_extent(signal: Signal) -> tuple[float, float]:
+    """Return how large the numbers of a signal are, as the digits that are worth showing tell."""
+    return 0.0, 10.0 ** (3 - signal.precision)
+
+
+def _plot(
+    origin: str, name: str, legend: rrb.Corner2D | None = None, y: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=_whole_run(),
+        axis_y=None if y is None else rrb.ScalarAxis(range=y),
+    )
+
+
+def _whole_run() -> rrb.TimeAxis:
+    forever = rrb.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
+
+
 def _colour(name: str, position: int) -> Colour:
     return _SETPOINT if name.endswith("_setpoint") else _PALETTE[position % len(_PALETTE)]
 
@@ -890,6 +1048,21 @@ def _colour(name: str, position: int) -> Colour:
 def _state_after(event: Event) -> str | None:
     """Return the state of the run that an event leads to, if it does."""
     return event.text if event.kind == "end" else _STATE_OF_EVENT.get(event.kind)
+
+
+def _entries(record: Record) -> list[_Entry]:
+    """Return what an engine told of a run, in its order."""
+    telemetry = record.telemetry()
+    rows = np.column_stack([telemetry[signal.name] for signal in record.signals]).tolist()
+    times, steps = telemetry["t"].tolist(), telemetry["step"].astype(np.int64).tolist()
+    # Of what happened in one instant, the ticks of a step come first, then its end, then what follows from it.
+    dated: list[tuple[tuple[float, float, int], _Entry]] = [
+        ((t, step, 0), (t, step, row)) for t, step, row in zip(times, steps, rows, strict=True)
+    ]
+    dated += [((step.finished, step.step, 1), step) for step in record.step_records()]
+    dated += [((event.t, math.inf, 0), event) for event in record.events()]
+    dated.sort(key=lambda entry: entry[0])
+    return [entry for _, entry in dated]
 
 
 def _densities(record: Record) -> Iterator[tuple[str, tuple[Floats, Floats]]]:

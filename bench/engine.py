@@ -16,6 +16,7 @@ from typing import Protocol
 
 from bench.control.estimators import DriftEstimator, agility_for, preload
 from bench.control.tracking import Command
+from bench.devices import Actuator
 from bench.errors import (
     AbortError,
     BenchError,
@@ -206,12 +207,14 @@ class Engine:
         for name in (message.input, message.output):
             if name not in self._names:
                 raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+        actuator = self._actuator(message.actuator)
         started = self._clock.now()
         latest = started + message.timeout
         low, high = message.limits
         command: Command | None = None
         try:
             while True:
+                asked = self._clock.now()
                 values = self._values(self._rig.measure)
                 now = self._clock.now()
                 ask = message.loop.begin if command is None else message.loop.update
@@ -232,16 +235,18 @@ class Engine:
                     raise LimitError(
                         message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"
                     )
-                self._send({message.actuator: command.setpoint})
+                if command.setpoint != actuator.setpoint:
+                    self._send({message.actuator: command.setpoint})
                 if not command.wait > 0:
                     raise ConfigurationError(f"the controller of {message.output} asked to wait {command.wait} s")
-                end = now + command.wait
+                # From reading to reading: what a reading takes is part of the wait, not beside it.
+                end = asked + command.wait
                 if end > latest:
                     raise SettleTimeoutError(
                         f"{message.output} did not reach its reference {trace.reference:g} "
                         f"within {message.timeout:g} s"
                     )
-                self._hold_until(end, now)
+                self._hold_until(end, asked)
         finally:
             self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
 
@@ -264,12 +269,16 @@ class Engine:
         self._tell(lambda observer: observer.step(record))
         return Reading(record.step, finished, record.settled, values)
 
-    def _send(self, setpoints: Mapping[str, float]) -> None:
+    def _actuator(self, name: str) -> Actuator:
         actuators = self._rig.actuators
+        if name not in actuators:
+            known = ", ".join(actuators) or "none"
+            raise ConfigurationError(f"{name} is no device that takes a set-point; there are: {known}")
+        return actuators[name]
+
+    def _send(self, setpoints: Mapping[str, float]) -> None:
+        actuators = {name: self._actuator(name) for name in setpoints}
         for name, value in setpoints.items():
-            if name not in actuators:
-                known = ", ".join(actuators) or "none"
-                raise ConfigurationError(f"{name} is no device that takes a set-point; there are: {known}")
             actuators[name].check(value)
         for name, value in setpoints.items():
             actuators[name].set(value)

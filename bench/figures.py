@@ -14,7 +14,7 @@ mpl.use("Agg")
 
 from matplotlib.figure import Figure
 
-from bench.hysteresis import Preisach
+from bench.hysteresis import MemoryCurve, Preisach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -192,6 +192,40 @@ def plot_density(path: Path, model: Preisach) -> None:
         )
         unit = f"({model.output_unit or '1'})/({model.input_unit or '1'})²"
         figure.colorbar(image, ax=axes, label=f"density / {unit}")
+        figure.savefig(path)
+
+
+def plot_coverage(path: Path, model: Preisach, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
+    """Draw which cells of a plane were swept, and the memory curve at the end.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    model : Preisach
+        The operator.
+    swept : ndarray of bool, shape (K,)
+        By cell.
+    memory : MemoryCurve
+        The staircase that is drawn over the cells.
+    """
+    levels = np.asarray(model.levels)
+    matrix = np.full((levels.size - 1, levels.size - 1), np.nan)
+    matrix[np.tril_indices(levels.size - 1)] = swept
+    corners = memory.corners(float(levels[0]), float(levels[-1]))
+    with mpl.rc_context({**_STYLE, "axes.grid": False}):
+        figure = Figure(figsize=(4.6, 4.2), layout="constrained")
+        axes = figure.subplots()
+        axes.pcolormesh(levels, levels, np.ma.masked_invalid(matrix), cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
+        axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
+        axes.plot(corners[:, 0], corners[:, 1], color=_COLORS[0], linewidth=1.5, label="memory curve")
+        axes.set(
+            xlabel=f"β / {model.input_unit or '1'}",
+            ylabel=f"α / {model.input_unit or '1'}",
+            aspect="equal",
+            title=f"green: swept ({np.mean(swept):.0%} of the cells)",
+        )
+        axes.legend(loc="lower right")
         figure.savefig(path)
 
 

@@ -10,7 +10,8 @@ Version 1 is an object with these keys:
     The operator: its `type`, levels, densities or coefficients, ranges and units, as the operator itself
     writes them.
 `memory`
-    The operator's state at the end of the data that it was identified from; null for one without memory.
+    The operator's state at the end of the data that it was identified from: the memory curve of a Preisach
+    operator, the list of play states of a Prandtl-Ishlinskii one; null for one without memory.
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
 """
@@ -19,16 +20,20 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Operator, operator_from_json
+from bench.hysteresis import MemoryCurve, Operator, PrandtlIshlinskii, operator_from_json
 
 FORMAT = "bench-model"
 VERSION = 1
+
+
+Memory = MemoryCurve | tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -41,15 +46,16 @@ class ModelFile:
         Under which name the operator was identified.
     operator : Operator
         The model itself.
-    memory : MemoryCurve or None
-        Its state at the end of the data that it was identified from.
+    memory : MemoryCurve, tuple of float, or None
+        Its state at the end of the data that it was identified from: a memory curve, the states of the plays, or
+        None for a model without memory.
     provenance : mapping
         Where it comes from.
     """
 
     name: str
     operator: Operator[Any]
-    memory: MemoryCurve | None
+    memory: Memory | None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -59,7 +65,7 @@ class ModelFile:
             "version": VERSION,
             "name": self.name,
             "operator": self.operator.to_json(),
-            "memory": None if self.memory is None else self.memory.to_json(),
+            "memory": self.memory.to_json() if isinstance(self.memory, MemoryCurve) else self.memory,
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -118,10 +124,26 @@ def parse_model(content: object, source: str) -> ModelFile:
         return ModelFile(
             name=str(content["name"]),
             operator=operator,
-            memory=None if memory is None else MemoryCurve.from_json(memory),
+            memory=_parse_memory(memory, operator),
             provenance=dict(content["provenance"]),
         )
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None
+
+
+def _parse_memory(memory: object, operator: Operator[Any]) -> Memory | None:
+    if memory is None:
+        return None
+    if isinstance(operator, PrandtlIshlinskii):
+        if not isinstance(memory, list) or not all(
+            isinstance(value, int | float) and math.isfinite(value) for value in memory
+        ):
+            raise ValueError(f"memory: expected a list of finite numbers, got {memory!r}")
+        if len(memory) != operator.thresholds.size:
+            raise ValueError(f"memory: expected {operator.thresholds.size} play states, got {len(memory)}")
+        return tuple(float(value) for value in memory)
+    if not isinstance(memory, dict):
+        raise TypeError(f"memory: expected an object, got {memory!r}")
+    return MemoryCurve.from_json(memory)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,40 @@ from bench.control.baselines import LookUp
 from bench.control.inverse import Inverse, Reach
 from bench.controllers import Policy
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Polynomial, Preisach
-from bench.identification import MODELS, Errors, Identification, identify
+from bench.hysteresis import (
+    MemoryCurve,
+    Operator,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    ThermalExpansion,
+    uniform_levels,
+)
+from bench.identification import (
+    MODELS,
+    Assessment,
+    Comparison,
+    Coverage,
+    CrossValidation,
+    Errors,
+    Identification,
+    assess,
+    compare,
+    covering_sequence,
+    cross_validate,
+    damped_oscillation,
+    first_order_reversals,
+    identify,
+    measure_coverage,
+)
 from bench.measurements import FEWEST_ROWS, check_excitation, read_columns
-from bench.model_file import ModelFile
+from bench.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
+
+
+SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+"""Weights of the roughness penalty that cross-validation tries."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +65,10 @@ class IdentifiedFile:
         What is odd about the data, though usable.
     inputs, outputs : ndarray, shape (N,)
         The measurements.
+    coverage : Coverage or None
+        Which cells of the Preisach plane the input has swept; None for a model without one.
+    trials : CrossValidation or None
+        The table by which smoothing was chosen, if it was.
     """
 
     file: ModelFile
@@ -43,6 +76,8 @@ class IdentifiedFile:
     warnings: tuple[str, ...]
     inputs: Floats
     outputs: Floats
+    coverage: Coverage | None = None
+    trials: CrossValidation | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
@@ -59,7 +94,9 @@ class IdentifiedFile:
             "passive": certificate.passive,
             "active": certificate.active,
             "condition": certificate.condition,
-            "coverage": certificate.coverage,
+            "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
+            "largest_uncertainty": _largest(found.uncertainties),
+            "smoothing": self.trials.best.smoothing if self.trials else None,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
@@ -90,6 +127,8 @@ def identify_file(
     reversible: str | None = None,
     smoothing: float = 0.0,
     skip: int = 0,
+    initial: str | None = None,
+    cross_validated: bool = False,
 ) -> IdentifiedFile:
     """Identify a model from a CSV file or a run.
 
@@ -107,6 +146,11 @@ def identify_file(
         Weight of the roughness penalty.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
+    initial : str, optional
+        What is known of the memory at the first row: `negative` or `positive` saturation, or unknown, and then
+        `skip` the rows that it could reach or `estimate` it; None leaves the model's own default.
+    cross_validated : bool
+        Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
 
     Raises
     ------
@@ -129,12 +173,24 @@ def identify_file(
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
+    if initial is not None:
+        options["initial"] = initial
+    trials: CrossValidation | None = None
     try:
+        if cross_validated:
+            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, skip=skip, **options)
+            smoothing = trials.best.smoothing
         found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
-    state = found.model.initial_state()
-    memory = state.advance(inputs) if isinstance(found.model, Preisach) else None
+    warnings += found.warnings
+    coverage: Coverage | None = None
+    memory: MemoryCurve | tuple[float, ...] | None = None
+    if isinstance(found.model, Preisach):
+        memory = found.initial_state.advance(inputs)
+        coverage = measure_coverage(found.model, inputs, found.initial_state)
+    elif isinstance(found.model, PrandtlIshlinskii):
+        memory = found.model.advance(found.initial_state, inputs)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -144,7 +200,13 @@ def identify_file(
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
     }
-    return IdentifiedFile(ModelFile(model, found.model, memory, provenance), found, warnings, inputs, outputs)
+    file = ModelFile(model, found.model, memory, provenance)
+    return IdentifiedFile(file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials)
+
+
+def _largest(uncertainties: Floats) -> float | None:
+    known = uncertainties[np.isfinite(uncertainties)]
+    return float(known.max()) if known.size else None
 
 
 def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) -> Floats:
@@ -201,7 +263,8 @@ def invert_targets(
     Parameters
     ----------
     model : ModelFile
-        Any model: Preisach models are inverted exactly with their memory, a polynomial by its look-up table.
+        Any model: Preisach and Prandtl-Ishlinskii models are inverted exactly with their memory, a polynomial by
+        its look-up table.
     targets : ndarray, shape (N,)
         Output units, finite.
     policy : {"nearest", "paper"}
@@ -216,11 +279,25 @@ def invert_targets(
     """
     operator = model.operator
     if isinstance(operator, Preisach):
-        found = Inverse(operator, policy).follow(targets, model.memory if continue_memory else None)
+        start = model.memory if continue_memory and isinstance(model.memory, MemoryCurve) else None
+        found = Inverse(operator, policy).follow(targets, start)
         setpoints, passing, predicted = found.setpoints, found.saturating, found.outputs
         reached = [
             Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW
             for met, target, output in zip(found.met.tolist(), targets.tolist(), predicted.tolist(), strict=True)
+        ]
+    elif isinstance(operator, PrandtlIshlinskii):
+        state = operator.initial_state()
+        if continue_memory and isinstance(model.memory, tuple):
+            state = model.memory
+        low, high = operator.output_range()
+        reachable = np.clip(targets, low, high)
+        setpoints = operator.inverse().evaluate(reachable, operator.inverse_state(state))
+        passing = np.full(targets.size, np.nan)
+        predicted = operator.evaluate(setpoints, state)
+        reached = [
+            Reach.TOO_HIGH if target > high else Reach.TOO_LOW if target < low else Reach.MET
+            for target in targets.tolist()
         ]
     elif isinstance(operator, Polynomial):
         table = LookUp(operator)
@@ -230,7 +307,7 @@ def invert_targets(
         predicted = operator.evaluate(setpoints)
         reached = [reach for _, reach in answers]
     else:
-        raise DataError(f"models of the kind {model.name} cannot be inverted; a Preisach model or a polynomial can")
+        raise DataError(f"models of the kind {model.name} cannot be inverted")
     flags = tuple(reach.value for reach in reached)
     return InvertedTargets(targets, setpoints, passing, predicted, flags)
 
@@ -271,5 +348,110 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
-        ("cells swept", f"{100 * certificate.coverage:.1f} %"),
+        ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
+        ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
     )
+
+
+@dataclass(frozen=True)
+class ComparedModels:
+    """How several models do on one set of measurements.
+
+    Attributes
+    ----------
+    comparisons : mapping of str to Comparison
+        By the model file's name.
+    unit : str
+        Unit of the output.
+    """
+
+    comparisons: Mapping[str, Comparison]
+    unit: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
+        return {
+            name: {"raw": errors_json(entry.raw), "rezeroed": errors_json(entry.rezeroed), "offset": entry.offset}
+            for name, entry in self.comparisons.items()
+        }
+
+
+def compare_models(
+    paths: Sequence[Path], data: Path, input_column: str | None, output_column: str | None, *, skip: int = 0
+) -> ComparedModels:
+    """Compare model files on measurements.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Model files.
+    data : Path
+        CSV file or run.
+    input_column, output_column : str or None
+        Columns; those that the first model was identified from if None.
+    skip : int
+        First rows that drive the memory but do not count.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be used, or units do not fit.
+    ConfigurationError
+        If `skip` leaves nothing.
+    """
+    files = [load_model(path) for path in paths]
+    names = [
+        given or str(files[0].provenance.get(key, ""))
+        for key, given in (("input", input_column), ("output", output_column))
+    ]
+    columns = read_columns(data, names)
+    inputs, outputs = (columns.values[name] for name in names)
+    if not 0 <= skip < inputs.size:
+        raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
+    operators: dict[str, Operator[Any]] = {}
+    for path, file in zip(paths, files, strict=True):
+        check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
+        check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
+        name = path.stem if path.stem not in operators else str(path)
+        operators[name] = file.operator
+    return ComparedModels(compare(operators, inputs, outputs, skip=skip), files[0].operator.output_unit)
+
+
+def assess_designs(
+    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
+) -> dict[str, Assessment]:
+    """Return what each excitation sequence tells about a plane, by the name of its protocol.
+
+    Parameters
+    ----------
+    plane, operating : (float, float)
+        Ends of the Preisach plane and of the operating range, input units.
+    levels : int
+        Number of intervals M of the plane.
+    dwell : float
+        Settling time at each set-point, s.
+
+    Raises
+    ------
+    ConfigurationError
+        If the ranges do not fit.
+    """
+    low, high = operating
+    try:
+        grid = uniform_levels(*plane, levels)
+        # The thermal term stands for any reversible part whose two slopes are to be found as well.
+        operator = Preisach(
+            grid,
+            np.zeros(levels * (levels + 1) // 2),
+            reversible=ThermalExpansion(low=plane[0], high=plane[1]),
+            input_range=operating,
+        )
+        span = high - low
+        sequences = {
+            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
+            "first-order-reversals": first_order_reversals(grid, operating),
+            "covering": covering_sequence(grid, operating),
+        }
+        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
+    except ValueError as error:
+        raise ConfigurationError(f"design: {error}") from None

@@ -13,13 +13,13 @@ from rich.markdown import Markdown
 from rich.table import Table as Columns
 
 from bench.errors import ConfigurationError, DataError
-from bench.figures import plot_density, plot_errors, plot_loops, plot_signals
-from bench.hysteresis import Preisach
+from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
+from bench.hysteresis import MemoryCurve, Preisach
 from bench.identification import measure_errors
 from bench.journal import Record, Table
 from bench.measurements import header_with_unit, write_csv
 from bench.model_file import ModelFile, load_model, parse_model
-from bench.modelling import IdentifiedFile, errors_json, predict
+from bench.modelling import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.runs import RECORDING_NAME, run_card
 from bench.tracking_results import results_json
 
@@ -121,6 +121,14 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
     return paths
 
 
+def draw_comparison(result: ComparedModels, out: Path) -> Path:
+    """Draw the residuals of compared models; return the file."""
+    path = _make_folder(out) / "residuals.png"
+    residuals = {name: entry.residuals for name, entry in result.comparisons.items()}
+    plot_errors(path, residuals, error_label=f"error / {result.unit or '1'}")
+    return path
+
+
 def _picture(record: Record, folder: Path) -> Path:
     from bench.dashboard import picture, rebuild
 
@@ -154,6 +162,9 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     if isinstance(operator, Preisach):
         paths.append(folder / f"{name}-density.png")
         plot_density(paths[-1], operator)
+        if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
+            paths.append(folder / f"{name}-coverage.png")
+            plot_coverage(paths[-1], operator, found.coverage.swept, found.file.memory)
     return paths
 
 

@@ -176,6 +176,7 @@ def _dashboard(run: Run, rig: Rig, signals: Sequence[Signal], meta: Mapping[str,
         live=run.live,
         card=run_card(meta),
         properties={"rig": rig.file.name, "protocol": run.protocol.name, "seed": run.seed},
+        controls=run.protocol.controls,
     )
 
 

@@ -93,7 +93,10 @@ def following(parameters: Parameters) -> Messages:
 def _reference(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
     if not parameters.reference:
         times = np.arange(0.0, parameters.duration + 0.5 / parameters.rate, 1.0 / parameters.rate)
-        return times, modulated_sine(times, parameters.low, parameters.high, parameters.period)
+        # From its trough, where it stands still: a plate at rest cannot start at full speed.
+        return times, modulated_sine(
+            times + 0.75 * parameters.period, parameters.low, parameters.high, parameters.period
+        )
     columns = read_columns(Path(parameters.reference), ["time", "reference"], at_least=3)
     times, values = columns.values["time"], columns.values["reference"]
     steps = np.diff(times)

@@ -19,8 +19,8 @@ class Adapter:
 
     `update` returns a new adapter; nothing is changed in place, so that an earlier model can be taken up again.
     The density follows a projected normalised gradient on output differences (Tan and Baras, Recursive
-    identification of hysteresis in smart materials, American Control Conference 2004): with x = density * area of each cell and φ the change of
-    its (on - off) part between two measurements,
+    identification of hysteresis in smart materials, American Control Conference 2004). With x = density * area
+    of each cell and φ the change of its (on - off) part between two measurements,
 
         x := max(0, x + step φ (Δoutput - Δpredicted) / (|φ|² + 2 noise² / (uncertainty m)²)),
 

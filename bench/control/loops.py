@@ -8,6 +8,8 @@ from typing import Protocol
 
 from bench.control.tracking import Command, Follower, TargetController, Trace
 
+_SHORTEST_WAIT = 1e-3  # s
+
 
 class Loop(Protocol):
     """A controller at work: asked for a command at its beginning and after each reading, until it is done."""
@@ -100,8 +102,8 @@ class FollowReference:
         self._sample += 1
         end = self._sample * self._period
         self._setpoint = self._follower.update(t, measured_input, output, self._reference(end))
-        # Counted from the beginning, so that what a reading takes does not add up.
-        return Command(self._setpoint, max(0.0, self._start + end - t))
+        # Counted from the beginning, so that what is late once is not late ever after.
+        return Command(self._setpoint, max(_SHORTEST_WAIT, self._start + end - t))
 
     @property
     def trace(self) -> Trace:

@@ -23,6 +23,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.model_file import ModelFile
+from bench.protocol import TRACES
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),
@@ -33,6 +34,7 @@ SIGNALS = (
     Signal("psd_position", "m", "tip deflection", 9),
     Signal("curvature", "1/m", "curvature", 2),
 )
+CONTROL_SIGNALS = SIGNALS + tuple(replace(signal, unit="1/m") for signal in TRACES)
 LAYOUT = DashboardLayout(
     title="Hysteresis loop",
     input="tec_temperature",
@@ -43,6 +45,7 @@ LAYOUT = DashboardLayout(
     levels=20,
 )
 PROPERTIES = {"rig": "vo2", "protocol": "identify", "seed": 7}
+CONTROL_COLOURS = {"output": (255, 122, 72), "error": (255, 206, 84), "disturbance": (64, 208, 206)}
 VULKAN = Path("/usr/share/vulkan/icd.d")
 # Stopping a thread of Rerun takes long only when a viewer hangs.
 PATIENCE = 60.0
@@ -109,7 +112,47 @@ def make_run(steps: int, ticks: int) -> Iterator[Tick | StepRecord | Event]:
     yield Event(t, "INFO", "end", "completed")
 
 
-def keep_journal(folder: Path, entries: list[Tick | StepRecord | Event]) -> Path:
+def make_control_run(targets: int, ticks: int) -> Iterator[Tick | StepRecord | Event]:
+    """Yield what an engine tells of a controller that is given one target after another, 20 ticks a second."""
+    operator, random, nothing = make_model().operator, np.random.default_rng(2), (float("nan"),) * 4
+    memory = MemoryCurve.from_negative_saturation(21.0)
+
+    def row(temperature: float, traces: tuple[float, ...]) -> tuple[float, ...]:
+        nonlocal memory
+        memory = memory.step(temperature)
+        kappa = operator.evaluate([temperature], memory)[-1] + float(random.normal())
+        return (temperature, temperature, 24.0, 1.0, 3.0, kappa * 4.5e-8, kappa, *traces)
+
+    yield Event(0.0, "INFO", "phase", "reset")
+    # What a hold shows on the way to a reading is not settled, and no part of the loop.
+    yield 2.0, 0, row(35.0, nothing)
+    yield StepRecord(0, 0.0, 8.0, "", "reset", True, {"tec": 21.0}, row(21.0, nothing))
+    yield Event(8.0, "INFO", "phase", "closed loop")
+    t, step, temperature = 8.0, 1, 21.0
+    for target in range(targets):
+        goal = 62.0 + 6.0 * float(np.cos(2.4 * target) * np.exp(-target / targets))
+        started, before, prior = t, temperature, target == 0
+        for tick in range(ticks):
+            t = started + 0.05 * (tick + 1)
+            temperature = goal + (before - goal) * float(np.exp(started - t)) + 0.003 * float(random.normal())
+            values = row(temperature, (20.0 * goal, 20.0 * temperature, 30.0 * target, 6e4 if prior else 5.0))
+            if tick == 30:
+                values = (*values[:6], float("nan"), *values[7:])
+            yield t, step, values
+        # A controller ends with a tick and a reading in one instant; then it is read again where it stands.
+        yield StepRecord(step, started, t, "", "reach", True, {"tec": goal}, values)
+        yield t + 0.1, step + 1, row(temperature, nothing)
+        yield StepRecord(step + 1, t, t + 0.2, "", "reading", True, {}, row(temperature, nothing))
+        t, step = t + 0.2, step + 2
+    yield Event(t, "INFO", "end", "completed")
+
+
+def keep_journal(
+    folder: Path,
+    entries: list[Tick | StepRecord | Event],
+    signals: tuple[Signal, ...] = SIGNALS,
+    controls: str = "",
+) -> Path:
     meta = {
         "run": folder.name,
         "rig": "vo2",
@@ -124,10 +167,11 @@ def keep_journal(folder: Path, entries: list[Tick | StepRecord | Event]) -> Path
         "operator": "lab",
         "plan": {"steps": 400, "seconds": 3200.0},
         "git": "0123456789ab",
+        "controls": controls,
         "dashboard": {key: value for key, value in asdict(LAYOUT).items() if key != "title"},
     }
     folder.mkdir()
-    journal = Journal(folder / FILE_NAME, SIGNALS, meta)
+    journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
     journal._db.execute("BEGIN")
     for entry in entries:
@@ -157,10 +201,16 @@ def tell(dashboard: Dashboard, entries: list[Tick | StepRecord | Event]) -> None
 
 
 def make_dashboard(
-    path: Path | None, *, live: bool = False, port: int = 0, layout: DashboardLayout | None = LAYOUT
+    path: Path | None,
+    *,
+    live: bool = False,
+    port: int = 0,
+    layout: DashboardLayout | None = LAYOUT,
+    signals: tuple[Signal, ...] = SIGNALS,
+    controls: str = "",
 ) -> Dashboard:
-    texts = {"run_id": "run", "title": "a run", "card": "# Card"}
-    return Dashboard(SIGNALS, layout, path=path, live=live, properties=PROPERTIES, port=port, **texts)
+    texts = {"run_id": "run", "title": "a run", "card": "# Card", "controls": controls}
+    return Dashboard(signals, layout, path=path, live=live, properties=PROPERTIES, port=port, **texts)
 
 
 def read(path: Path) -> dict[str, dict[str, list[object]]]:
@@ -199,6 +249,21 @@ def rebuilt(run_folder: Path) -> Path:
     with Record(run_folder) as record:
         rebuild(record, run_folder / "rebuilt.rrd")
     return run_folder / "rebuilt.rrd"
+
+
+@pytest.fixture(scope="module")
+def control_entries() -> list[Tick | StepRecord | Event]:
+    return list(make_control_run(12, 100))
+
+
+@pytest.fixture(scope="module")
+def control_folder(
+    tmp_path_factory: pytest.TempPathFactory, control_entries: list[Tick | StepRecord | Event]
+) -> Path:
+    folder = keep_journal(tmp_path_factory.mktemp("runs") / "run", control_entries, CONTROL_SIGNALS, "curvature")
+    with Record(folder) as record:
+        rebuild(record, folder / "rebuilt.rrd")
+    return folder
 
 
 def test_a_rebuilt_recording_holds_what_the_journal_holds(run_folder: Path, rebuilt: Path) -> None:
@@ -253,11 +318,18 @@ def test_the_density_of_a_model_is_drawn(rebuilt: Path) -> None:
     assert ["preisach", "density [(1/m)/°C²]"] in found["/plane/legend/title"]["labels"]
 
 
-def test_live_and_rebuilt_recordings_are_equal(
-    tmp_path: Path, entries: list[Tick | StepRecord | Event], rebuilt: Path
-) -> None:
-    with make_dashboard(tmp_path / "live.rrd") as dashboard:
-        tell(dashboard, entries)
+@pytest.mark.parametrize("controls", ["", "curvature"])
+def test_live_and_rebuilt_recordings_are_equal(tmp_path: Path, request: pytest.FixtureRequest, controls: str) -> None:
+    if controls:
+        entries, signals = request.getfixturevalue("control_entries"), CONTROL_SIGNALS
+        rebuilt = request.getfixturevalue("control_folder") / "rebuilt.rrd"
+    else:
+        entries, signals, rebuilt = request.getfixturevalue("entries"), SIGNALS, request.getfixturevalue("rebuilt")
+    with make_dashboard(tmp_path / "live.rrd", signals=signals, controls=controls) as dashboard:
+        tell(dashboard, entries[:777])
+        # Whatever is handed over at once makes no difference.
+        wait_until(lambda: not dashboard._queue.qsize())
+        tell(dashboard, entries[777:])
         operator = make_model().operator
         dashboard.model(operator.density_matrix(), operator.levels, "preisach")
         dashboard.finish("completed", "")
@@ -273,7 +345,110 @@ def test_live_and_rebuilt_recordings_are_equal(
                 mine, theirs = table(live[path], component), table(again[path], component)
                 np.testing.assert_array_equal(mine[0], theirs[0])
                 np.testing.assert_array_equal(mine[1], theirs[1])
-                assert mine[2] == theirs[2], path
+                if component == "scalars":
+                    # Where nan is nan's equal.
+                    np.testing.assert_array_equal(mine[2], theirs[2], path)
+                else:
+                    assert mine[2] == theirs[2], path
+
+
+def test_a_control_run_shows_reference_error_and_disturbance(control_folder: Path) -> None:
+    found = read(control_folder / "rebuilt.rrd")
+    with Record(control_folder) as record:
+        ticks = record.telemetry()
+    reference, output, sigma = ticks["reference"], ticks["curvature"], ticks["disturbance_uncertainty"]
+    # The first target has nothing to go by: its uncertainty is beyond all that is shown.
+    band = np.where(sigma < 1e3, 2 * sigma, np.nan)
+    zero = 0 * reference
+    expected = {
+        "tracking": [reference - band, reference + band, ticks["predicted"], output, reference],
+        "error": [output - reference, zero - band, zero + band],
+        "disturbance": [ticks["disturbance"] - band, ticks["disturbance"] + band, ticks["disturbance"]],
+    }
+    for name, series in expected.items():
+        t, step, values = table(found[f"/control/{name}"], "scalars")
+        np.testing.assert_allclose(t, ticks["t"], atol=1e-9)
+        np.testing.assert_array_equal(step, ticks["step"])
+        np.testing.assert_allclose(np.array(values), np.column_stack(series), rtol=1e-12)
+        assert [len(names) for names in found[f"/control/{name}"]["names"] if names] == [len(series)]
+    error = np.array(table(found["/control/error"], "scalars")[2])[:, 0]
+    assert np.isnan(error).sum() == 13 + 12  # ticks without a controller, and those without an output
+    curvature = np.array(table(found["/signals/curvature"], "scalars")[2])
+    np.testing.assert_array_equal(curvature, output[:, None])
+
+
+def test_loop_and_memory_curve_follow_the_ticks_under_control(
+    control_entries: list[Tick | StepRecord | Event], control_folder: Path
+) -> None:
+    found = read(control_folder / "rebuilt.rrd")
+    points = [
+        (entry[0], False, entry[2][1], entry[2][6])
+        if isinstance(entry, tuple)
+        else (entry.finished, True, entry.values[1], entry.values[6])
+        for entry in control_entries
+        if isinstance(entry, StepRecord) or (isinstance(entry, tuple) and np.isfinite(entry[2][7]))
+    ]
+    told, is_reading, inputs, outputs = (np.array(column) for column in zip(*points, strict=True))
+    t, _, curves = table(found["/plane/data/memory"], "strips")
+    reset = MemoryCurve.from_negative_saturation(inputs[0])
+    for at, (curve,) in zip(t, curves, strict=True):
+        until = np.searchsorted(told, at + 1e-6)
+        np.testing.assert_allclose(curve, reset.advance(inputs[:until]).corners(30.0, 70.0), rtol=1e-6)
+    # Every reading, and of the ticks what an eye can tell.
+    readings = set(np.round(told[is_reading], 6))
+    assert readings <= set(np.round(t, 6))
+    assert 12 * 20 < len(t) < 12 * 52
+    between = [at for at in t if round(at, 6) not in readings]
+    assert np.diff(between).min() > 0.099
+    latest = np.array(table(found["/loop/data/now"], "positions")[2])[:, 0]
+    shown = np.searchsorted(t, told + 1e-6) - 1
+    waiting = np.isfinite(outputs) & (told - t[shown] > 0.16)
+    assert waiting.any()
+    moved = abs(latest[shown] - np.column_stack([inputs, outputs]))[waiting]
+    assert np.all(moved <= (0.002 * 40.0 * 1.001, 0.002 * 2200.0 * 1.001))
+
+    strips = [np.array(strip) for (strip,) in table(found["/loop/data/path"], "strips")[2]]
+    np.testing.assert_array_equal([strip[-1] for strip in strips], latest)
+    np.testing.assert_array_equal([strip[0] for strip in strips[1:]], latest[:-1])
+    assert max(len(strip) for strip in strips) > 2
+    assert np.isfinite(np.concatenate(strips)).all()
+
+
+def test_a_controller_that_holds_its_target_is_not_drawn_again(tmp_path: Path) -> None:
+    values = (60.0, 60.0, 24.0, 1.0, 3.0, 1e-6, 900.0, 900.0, 900.0, 0.0, 1.0)
+    with make_dashboard(tmp_path / "run.rrd", signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
+        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", True, {}, values))
+        for tick in range(1_000):
+            noise = 0.01 * (-1) ** tick
+            dashboard.telemetry(8.0 + tick, 1, (60.0, 60.0 + noise, *values[2:6], 900.0 + noise, *values[7:]))
+    found = read(tmp_path / "run.rrd")
+    assert len(table(found["/plane/data/memory"], "strips")[0]) == 1
+    assert len(table(found["/control/error"], "scalars")[0]) == 1_000
+
+
+def test_a_step_run_has_nothing_of_control(rebuilt: Path) -> None:
+    assert not [path for path in read(rebuilt) if path.startswith("/control")]
+
+
+def test_a_control_run_of_a_rig_without_a_loop_still_shows_the_control(
+    tmp_path: Path, control_entries: list[Tick | StepRecord | Event]
+) -> None:
+    path = tmp_path / "run.rrd"
+    with make_dashboard(path, layout=None, signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
+        tell(dashboard, control_entries)
+    assert dashboard.dropped == 0
+    assert len(table(read(path)["/control/error"], "scalars")[0]) == sum(
+        isinstance(e, tuple) for e in control_entries
+    )
+
+
+@pytest.mark.parametrize(("signals", "controls"), [(CONTROL_SIGNALS, "x"), (SIGNALS, "curvature")])
+def test_what_is_controlled_must_be_among_the_signals(
+    tmp_path: Path, signals: tuple[Signal, ...], controls: str
+) -> None:
+    with pytest.raises(ConfigurationError, match="controls: there is no signal"):
+        make_dashboard(tmp_path / "run.rrd", signals=signals, controls=controls)
+    assert not (tmp_path / "run.rrd").exists()
 
 
 def test_readings_that_are_not_numbers_leave_a_gap(tmp_path: Path) -> None:
@@ -476,14 +651,27 @@ def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
     assert len(table(read(folder / "run.rrd")["/signals/current"], "scalars")[0]) == 20_000
 
 
+def test_a_long_control_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
+    folder = keep_journal(tmp_path / "long", list(make_control_run(60, 200)), CONTROL_SIGNALS, "curvature")
+    stopwatch = Stopwatch()
+    with Record(folder) as record:
+        rebuild(record, folder / "run.rrd")
+    # About 0.6 s; the rest is room for a busy machine.
+    assert stopwatch.seconds() < 5.0
+    assert len(table(read(folder / "run.rrd")["/control/error"], "scalars")[0]) == 12_061
+
+
 def test_a_picture_needs_a_recording(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no recording"):
         picture(tmp_path / "none.rrd", tmp_path / "none.png")
 
 
-@pytest.mark.skipif(
+NEEDS_VULKAN = pytest.mark.skipif(
     not [*VULKAN.glob("lvp_icd*.json")], reason="needs the packages mesa-vulkan-drivers and libvulkan1"
 )
+
+
+@NEEDS_VULKAN
 def test_the_viewer_draws_it_without_complaint(tmp_path: Path, rebuilt: Path) -> None:
     png = tmp_path / "dashboard.png"
     assert picture(rebuilt, png, at=1700.0, size=(1280, 800)) == []
@@ -494,6 +682,19 @@ def test_the_viewer_draws_it_without_complaint(tmp_path: Path, rebuilt: Path) ->
     right, top = pixels[:, 640:, :3].astype(int), pixels[:400, 640:, :3].astype(int)
     assert ((right[:, :, 0] > 200) & (right[:, :, 1] < 160) & (right[:, :, 2] < 120)).sum() > 200
     assert ((abs(top - (150, 248, 228))).sum(axis=2) < 60).sum() > 200
+
+
+@NEEDS_VULKAN
+def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, control_folder: Path) -> None:
+    png = tmp_path / "dashboard.png"
+    assert picture(control_folder / "rebuilt.rrd", png, size=(1280, 800)) == []
+    left = read_png(png)[:, :500, :3].astype(int)
+    heights = {
+        name: np.argwhere(abs(left - colour).sum(axis=2) < 60)[:, 0] for name, colour in CONTROL_COLOURS.items()
+    }
+    assert all(len(rows) > 100 for rows in heights.values())
+    # Tracking above error above disturbance.
+    assert heights["output"].mean() < heights["error"].mean() < heights["disturbance"].mean()
 
 
 def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> float:

@@ -1,0 +1,58 @@
+"""Characterization by designed sequences: every cell of the Preisach plane in few set-points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.hysteresis import uniform_levels
+from bench.identification import covering_sequence, design
+from bench.protocol import Dwell, Messages, Phase, ProtocolParameters, Step, UntilSteady, parameter, protocol
+
+
+class Parameters(ProtocolParameters):
+    """What can be set."""
+
+    low: float = parameter(21.0, unit="°C", low=-20, high=150, help="lowest temperature, where the memory is reset")
+    high: float = parameter(84.0, unit="°C", low=-20, high=150, help="highest temperature")
+    plane_low: float = parameter(30.0, unit="°C", low=-20, high=150, help="lower end of the Preisach plane")
+    plane_high: float = parameter(70.0, unit="°C", low=-20, high=150, help="upper end of the Preisach plane")
+    levels: int = parameter(20, unit="1", low=2, high=200, help="discretization levels of the plane")
+    per_cell: int = parameter(1, unit="1", low=1, high=20, help="set-points in each cell that is crossed")
+    dwell: float = parameter(8.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
+
+
+@protocol(needs=("tec", "tec_temperature", "curvature"))
+def covering(parameters: Parameters) -> Messages:
+    """Characterize a hysteresis in the fewest set-points that cover every cell.
+
+    Loops that shrink level by level, one set-point a level: each cell of the plane is told apart from all others
+    by the difference of two readings. `bench design` shows what it saves.
+    """
+    yield from _carry_out(parameters, covering_sequence(*_grid(parameters), per_cell=parameters.per_cell))
+
+
+@protocol(needs=("tec", "tec_temperature", "curvature"))
+def first_order_reversals(parameters: Parameters) -> Messages:
+    """Characterize a hysteresis by first-order reversal curves.
+
+    From positive saturation down to each level in turn, and up again level by level (Mayergoyz, *Mathematical
+    Models of Hysteresis and Their Applications*, 2003, chapter 1).
+    """
+    yield from _carry_out(parameters, design.first_order_reversals(*_grid(parameters), per_cell=parameters.per_cell))
+
+
+def _grid(parameters: Parameters) -> tuple[np.ndarray, tuple[float, float]]:
+    grid = uniform_levels(parameters.plane_low, parameters.plane_high, parameters.levels)
+    return grid, (parameters.low, parameters.high)
+
+
+def _carry_out(parameters: Parameters, setpoints: np.ndarray) -> Messages:
+    yield Phase("reset to negative saturation")
+    yield Step(
+        {"tec": parameters.low},
+        UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=parameters.dwell),
+        label="reset",
+    )
+    yield Phase("designed sequence")
+    for target in setpoints.tolist():
+        yield Step({"tec": target}, Dwell(parameters.dwell))
