@@ -414,8 +414,9 @@ def design(
 ) -> None:
     """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
 
-    The damped oscillation of the papers, first-order reversal curves, and the shortest sequence that covers every
-    cell. Each is a protocol: damped-oscillation, first-order-reversals, covering.
+    The damped oscillation of the papers, first-order reversal curves, the shortest sequence that covers every cell,
+    and the same twice as fine with two set-points a level, which averages noise. Each is a protocol:
+    damped-oscillation, first-order-reversals, covering.
     """
     from bench.modelling import assess_designs
 

@@ -178,7 +178,9 @@ def identify_file(
     trials: CrossValidation | None = None
     try:
         if cross_validated:
-            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, skip=skip, **options)
+            others = {name: value for name, value in options.items() if name != "levels"}
+            orders = None if levels is None else [levels]
+            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
             smoothing = trials.best.smoothing
         found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
     except ValueError as error:
@@ -292,7 +294,11 @@ def invert_targets(
             state = model.memory
         low, high = operator.output_range()
         reachable = np.clip(targets, low, high)
-        setpoints = operator.inverse().evaluate(reachable, operator.inverse_state(state))
+        try:
+            inverse = operator.inverse()
+        except ValueError as error:
+            raise DataError(f"model {model.name} has a plateau, so it has no inverse: {error}") from None
+        setpoints = inverse.evaluate(reachable, operator.inverse_state(state))
         passing = np.full(targets.size, np.nan)
         predicted = operator.evaluate(setpoints, state)
         reached = [
@@ -450,7 +456,8 @@ def assess_designs(
         sequences = {
             "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
             "first-order-reversals": first_order_reversals(grid, operating),
-            "covering": covering_sequence(grid, operating),
+            "covering, fewest": covering_sequence(grid, operating),
+            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
         }
         return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
     except ValueError as error:

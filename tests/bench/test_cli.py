@@ -49,7 +49,7 @@ def write_loop(path, rows=400):
     play, outputs = 0.0, []
     for value in inputs:
         play = min(max(play, value - 1.0), value + 1.0)
-        outputs.append(play)
+        outputs.append(play + 0.2 * value)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["voltage [V]", "displacement [µm]"])
@@ -59,7 +59,8 @@ def write_loop(path, rows=400):
 
 class TestHelp:
     @pytest.mark.parametrize(
-        "command", ["", "list", "run", "identify", "predict", "invert", "report", "export", "reproduce"]
+        "command",
+        ["", "list", "run", "identify", "predict", "invert", "compare", "design", "report", "export", "reproduce"],
     )
     def test_every_command_has_help(self, bench, command):
         code, out, _ = bench(*command.split(), "--help")
@@ -282,7 +283,7 @@ class TestIdentifyAndPredict:
         assert fit["levels"] == 20
         assert fit["kkt"] < 1e-10
         assert fit["rms_percent"] < 1.5
-        assert len(list((tmp_path / "figures").iterdir())) == 3
+        assert len(list((tmp_path / "figures").iterdir())) == 4
 
         code, _, _ = bench(
             "predict", tmp_path / "model.json", tmp_path / "loop.csv", "--input", "voltage",
@@ -390,6 +391,92 @@ class TestIdentifyAndPredict:
         code, _, err = bench("predict", path, other, "--input", "voltage", "--out", tmp_path / "o.csv")
         assert code == 3
         assert "mV" in err
+
+
+class TestTheCoreOnTheCommandLine:
+    COLUMNS = ("--input", "voltage", "--output", "displacement")
+
+    def identify(self, bench, tmp_path, name, *options):
+        path, result = tmp_path / f"{name}.json", tmp_path / "result.json"
+        code, out, err = bench(
+            "identify", tmp_path / "loop.csv", *self.COLUMNS, *options, "--out", path, "--json", result
+        )
+        assert code == 0, err
+        return json.loads(result.read_text()), out
+
+    def test_smoothing_is_chosen_by_cross_validation(self, bench, tmp_path):
+        write_loop(tmp_path / "loop.csv")
+        found, out = self.identify(
+            bench, tmp_path, "smooth", "--model", "preisach", "--levels", "10", "--cross-validate"
+        )
+        assert "cross-validation" in out
+        assert out.count("*") == 1
+        assert found["smoothing"] >= 0
+
+    def test_unknown_memory_can_be_estimated(self, bench, tmp_path):
+        write_loop(tmp_path / "loop.csv")
+        header, *rows = (tmp_path / "loop.csv").read_text().splitlines()
+        (tmp_path / "loop.csv").write_text("\n".join([header, *rows[60:]]) + "\n")
+        plain, _ = self.identify(bench, tmp_path, "plain", "--model", "preisach")
+        estimated, _ = self.identify(bench, tmp_path, "estimated", "--model", "preisach", "--initial", "estimate")
+        assert estimated["rms"] < plain["rms"]
+
+    def test_plays_are_found_and_inverted_by_their_own_inverse(self, bench, tmp_path):
+        write_loop(tmp_path / "loop.csv")
+        found, _ = self.identify(bench, tmp_path, "plays", "--model", "prandtl-ishlinskii")
+        assert found["rms_percent"] < 2.0
+        code, _, err = bench(
+            "invert", tmp_path / "plays.json", tmp_path / "loop.csv", "--column", "displacement", "--out",
+            tmp_path / "inverse.csv", "--json", tmp_path / "inverse.json",
+        )  # fmt: skip
+        assert code == 0, err
+        assert json.loads((tmp_path / "inverse.json").read_text())["largest_residual"] < 1e-9
+
+    def test_a_model_with_plateaus_is_not_inverted(self, bench, tmp_path):
+        write_loop(tmp_path / "loop.csv")
+        self.identify(bench, tmp_path, "plays", "--model", "prandtl-ishlinskii")
+        model = json.loads((tmp_path / "plays.json").read_text())
+        model["operator"]["weights"][0] = 0.0
+        (tmp_path / "plays.json").write_text(json.dumps(model))
+        code, _, err = bench(
+            "invert", tmp_path / "plays.json", tmp_path / "loop.csv", "--column", "displacement", "--out",
+            tmp_path / "inverse.csv",
+        )  # fmt: skip
+        assert code == 3
+        assert "no inverse" in err
+
+    def test_models_are_compared_raw_and_rezeroed(self, bench, tmp_path):
+        inputs, outputs = write_loop(tmp_path / "loop.csv")
+        self.identify(bench, tmp_path, "a", "--model", "preisach", "--levels", "20")
+        self.identify(bench, tmp_path, "b", "--model", "polynomial")
+        with (tmp_path / "session.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["voltage [V]", "displacement [µm]"])
+            writer.writerows(zip(inputs, outputs + 0.75, strict=True))
+        code, out, _ = bench(
+            "compare", tmp_path / "a.json", tmp_path / "b.json", "--data", tmp_path / "session.csv",
+            "--json", tmp_path / "compared.json", "--figures", tmp_path / "figures",
+        )  # fmt: skip
+        assert code == 0
+        assert "re-zeroed" in re.sub(r"\s+", " ", out)
+        compared = json.loads((tmp_path / "compared.json").read_text())
+        assert compared["a"]["offset"] == pytest.approx(0.75, abs=0.05)
+        assert compared["a"]["rezeroed"]["rms"] < 0.2 * compared["a"]["raw"]["rms"]
+        assert compared["a"]["rezeroed"]["rms"] < compared["b"]["rezeroed"]["rms"]
+        assert (tmp_path / "figures" / "residuals.png").stat().st_size > 0
+
+    def test_designs_are_compared_by_what_they_cover_and_cost(self, bench, tmp_path):
+        code, out, _ = bench("design", "--levels", "8", "--json", tmp_path / "design.json")
+        assert code == 0
+        assert "covering" in out
+        designs = json.loads((tmp_path / "design.json").read_text())
+        assert set(designs) == {"damped-oscillation", "first-order-reversals", "covering, fewest", "covering, fine"}
+        for design in designs.values():
+            assert design["covered"] == design["cells"] == 36
+        assert designs["covering, fine"]["time"] < 0.5 * designs["damped-oscillation"]["time"]
+        code, _, err = bench("design", "--plane", "30", "90")
+        assert code == 2
+        assert "design" in err
 
 
 def replace_cell(text, row, value):

@@ -1,4 +1,4 @@
-"""Forward evaluation and exact inverse beside what a user would otherwise take. Prints, asserts no time."""
+"""Forward evaluation, exact inverse and adaptation beside what one would otherwise take. Prints, asserts no time."""
 
 import time
 
@@ -6,22 +6,23 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from bench.control.adaptation import Adapter
 from bench.control.inverse import Inverse
-from bench.hysteresis import Preisach, ThermalExpansion, uniform_levels
+from bench.hysteresis import PrandtlIshlinskii, Preisach, ThermalExpansion, uniform_levels
 from bench.identification import damped_oscillation
 
 pytestmark = pytest.mark.benchmark
 
 
-def best_of(function, repeats=3):
-    """Return the least wall time, s, after one call to compile and warm up."""
+def median_of(function, repeats=9):
+    """Return the median wall time, s, after one call to compile and warm up."""
     function()
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
         function()
         times.append(time.perf_counter() - start)
-    return min(times)
+    return float(np.median(times))
 
 
 def film(order):
@@ -63,16 +64,16 @@ def test_forward(capsys):
     rows = []
     for order in (20, 50, 100, 200):
         operator = film(order)
-        ours = best_of(lambda operator=operator: operator.evaluate(many)) / many.size
+        ours = median_of(lambda operator=operator: operator.evaluate(many)) / many.size
         state = operator.initial_state()
 
         def steps(operator=operator, state=state):
             for value in inputs[:1000]:
                 state, _ = operator.step(state, value)
 
-        single = best_of(steps) / 1000
+        single = median_of(steps) / 1000
         exact = operator.evaluate(inputs[:300])
-        relays = best_of(lambda operator=operator: by_relays(operator, inputs[:300], 4), 1) / 300
+        relays = median_of(lambda operator=operator: by_relays(operator, inputs[:300], 4), 1) / 300
         error = np.abs(by_relays(operator, inputs[:300], 4) - exact).max() / np.ptp(exact)
         rows.append((order, ours, single, relays, relays / ours, error))
         np.testing.assert_allclose(by_dense_areas(operator, inputs[:300]), exact, atol=1e-8)
@@ -107,8 +108,8 @@ def test_inverse(capsys):
         middle, reach = 0.5 * (least + greatest), 0.45 * (greatest - least)
         smooth = middle + reach * np.sin(2 * np.pi * t / 1000) * (1 - 0.5 * t / t.size)
         jumps = np.random.default_rng(0).uniform(least, greatest, 20_000)
-        sequence = best_of(lambda inverse=inverse, smooth=smooth: inverse.follow(smooth)) / smooth.size
-        random = best_of(lambda inverse=inverse, jumps=jumps: inverse.follow(jumps)) / jumps.size
+        sequence = median_of(lambda inverse=inverse, smooth=smooth: inverse.follow(smooth)) / smooth.size
+        random = median_of(lambda inverse=inverse, jumps=jumps: inverse.follow(jumps)) / jumps.size
         start = operator.initial_state().advance([60.0, 55.0])
         state, times, worst = start, [], 0.0
         for target in smooth[:2000]:
@@ -132,3 +133,73 @@ def test_inverse(capsys):
                 f"  M={order:3d}  {sequence * 1e9:6.0f} ns  {random * 1e9:6.0f} ns  {single * 1e6:5.1f} µs"
                 f"  {slow * 1e6:6.1f} µs  x{slow / single:4.0f} (x{slow / sequence:6.0f})  {worst:.0e}"
             )
+
+
+def by_whole_model(operator, state, target, value, output):
+    """Adaptation without tables kept up to date: new model and new inverse from the adapted density."""
+    rows = operator.regressor([state.input, value], state).dense()
+    change = rows[1] - rows[0]
+    cells = operator.density.size
+    error = output - operator.value(state) - change @ operator.coefficients
+    coefficients = operator.coefficients.copy()
+    step = 0.5 * error / (change[:cells] @ change[:cells] + 1.0) * change[:cells]
+    coefficients[:cells] = np.maximum(0.0, coefficients[:cells] + step)
+    other = operator.with_coefficients(coefficients, operator.bias)
+    return other, Inverse(other).invert(state.step(value), target)
+
+
+def test_adaptation(capsys):
+    rows = []
+    for order in (20, 50, 100):
+        operator = film(order)
+        inputs = 54.0 + 12.0 * np.sin(np.arange(2000) / 40.0)
+        outputs = 1.02 * operator.evaluate(inputs) + 0.4 * np.random.default_rng(0).normal(size=inputs.size)
+        pairs = list(zip(inputs.tolist(), outputs.tolist(), strict=True))
+        start = Adapter(operator, noise=0.4).update(*pairs[0])
+
+        def updates(adapter=start, pairs=pairs):
+            for value, output in pairs:
+                adapter = adapter.update(value, output)
+
+        def loop(adapter=start, pairs=pairs):
+            for value, output in pairs:
+                adapter = adapter.update(value, output)
+                adapter.inverse.invert(adapter.state, output)
+
+        def whole(operator=operator, pairs=pairs[:200]):
+            model, state = operator, operator.initial_state()
+            for value, output in pairs:
+                model, _ = by_whole_model(model, state, output, value, output)
+                state = state.step(value)
+
+        rows.append((order, median_of(updates) / 2000, median_of(loop) / 2000, median_of(whole, 3) / 200))
+    with capsys.disabled():
+        print("\nadaptation, per sample: update, update and inverse, the same with model and inverse made anew")
+        for order, update, both, slow in rows:
+            line = f"  M={order:3d}  {update * 1e6:5.1f} µs  {both * 1e6:5.1f} µs"
+            print(f"{line}  {slow * 1e6:7.1f} µs  x{slow / both:.0f}")
+
+
+def by_play_loop(operator, inputs):
+    """Plays in numpy, one sample at a time."""
+    plays, outputs = np.zeros(operator.thresholds.size), np.empty(inputs.size)
+    for n, value in enumerate(inputs):
+        plays = np.maximum(value - operator.thresholds, np.minimum(value + operator.thresholds, plays))
+        outputs[n] = operator.weights @ plays
+    return outputs + operator.bias
+
+
+def test_plays(capsys):
+    thresholds = 40.0 * np.arange(15) / 15
+    operator = PrandtlIshlinskii(thresholds, np.exp(-np.arange(15) / 5.0) / 50.0, input_range=(-40.0, 40.0))
+    inputs = 40.0 * np.sin(np.arange(100_000) / 300.0)
+    forward = median_of(lambda: operator.evaluate(inputs)) / inputs.size
+    outputs, inverse = operator.evaluate(inputs), operator.inverse()
+    backward = median_of(lambda: inverse.evaluate(outputs)) / inputs.size
+    worst = np.abs(inverse.evaluate(outputs) - inputs).max()
+    slow = median_of(lambda: by_play_loop(operator, inputs[:5000]), 3) / 5000
+    with capsys.disabled():
+        print(
+            f"\n15 plays, per sample: forward {forward * 1e9:.0f} ns, inverse {backward * 1e9:.0f} ns"
+            f" (error {worst:.0e}), numpy loop {slow * 1e6:.1f} µs x{slow / forward:.0f}"
+        )
