@@ -235,7 +235,8 @@ def identify_(
         typer.Option(min=2, max=1000, help="Discretization levels of the Preisach plane; 20 if not given."),
     ] = None,
     degree: Annotated[
-        int | None, typer.Option(min=1, max=60, help="Degree of a polynomial; 12 if not given.")
+        int | None,
+        typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
     ] = None,
     plane: Annotated[
         tuple[float, float] | None,
@@ -245,7 +246,7 @@ def identify_(
     ] = None,
     reversible: Annotated[
         str | None,
-        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear or quadratic."),
+        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
     ] = None,
     smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
     skip: Annotated[

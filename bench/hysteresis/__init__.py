@@ -6,13 +6,20 @@ from bench.hysteresis.polynomial import Polynomial
 from bench.hysteresis.prandtl_ishlinskii import DeadZones, PrandtlIshlinskii
 from bench.hysteresis.preisach import Preisach, Segment, uniform_levels
 from bench.hysteresis.regressor import Regressor
-from bench.hysteresis.reversible import QuadraticTerm, Reversible, ThermalExpansion, reversible_from_json
+from bench.hysteresis.reversible import (
+    PolynomialTerm,
+    QuadraticTerm,
+    Reversible,
+    ThermalExpansion,
+    reversible_from_json,
+)
 
 __all__ = [
     "DeadZones",
     "MemoryCurve",
     "Operator",
     "Polynomial",
+    "PolynomialTerm",
     "PrandtlIshlinskii",
     "Preisach",
     "QuadraticTerm",

@@ -105,6 +105,97 @@ class QuadraticTerm:
 
 
 @dataclass(frozen=True)
+class PolynomialTerm:
+    """A reversible term that follows a polynomial of the input, quadratic from knot to knot.
+
+    The term is sum over k of series_k T_k(x), with x the input mapped to [-1, 1] and T_k the Chebyshev polynomials,
+    each replaced by its quadratic interpolant on every one of `knots` equal intervals of [low, high]: so the operator
+    stays piecewise quadratic, and its range and its inverse stay exact. Beyond [low, high] the last quadratics go on.
+    The interpolant of T_k is off by at most k²(k²-1)(k²-4)/15 (2/knots)³/(72√3), 5e-5 of T_5 at 128 knots.
+
+    Parameters
+    ----------
+    series : tuple of float
+        Coefficients of T_1, T_2, ..., output units; at least one.
+    low, high : float
+        Range of the mapping, input units, low < high.
+    knots : int
+        Number of intervals, >= 1.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, there is no coefficient, low >= high, or knots < 1.
+    """
+
+    series: tuple[float, ...]
+    low: float
+    high: float
+    knots: int = 128
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "series", tuple(_checks.samples("series", self.series).tolist()))
+        _checks.increasing("low, high", [self.low, self.high])
+        if isinstance(self.knots, bool) or not isinstance(self.knots, int) or self.knots < 1:
+            raise ValueError(f"knots: expected a whole number >= 1, got {self.knots!r}")
+
+    @property
+    def coefficients(self) -> Floats:
+        """The series, shape (n,)."""
+        return np.array(self.series)
+
+    @property
+    def nonnegative(self) -> bool:
+        """The signs are free."""
+        return False
+
+    def with_coefficients(self, coefficients: Sequence[float]) -> PolynomialTerm:
+        """Return the same term with another series of the same degree."""
+        values = _checks.samples("coefficients", coefficients)
+        if values.size != len(self.series):
+            raise ValueError(f"coefficients: expected {len(self.series)} values, got {values.size}")
+        return PolynomialTerm(tuple(values.tolist()), self.low, self.high, self.knots)
+
+    def columns(self, inputs: ArrayLike) -> Floats:
+        """Return the interpolants of T_1, T_2, ... at the inputs, shape (N, n)."""
+        values = np.asarray(inputs, dtype=np.float64)
+        breaks, _ = self._knots()
+        piece = np.searchsorted(breaks, values)
+        powers = np.stack([np.ones_like(values), values, values**2])
+        return np.column_stack(
+            [np.einsum("pn,np->n", powers, self._quadratics(k)[piece]) for k in range(1, len(self.series) + 1)]
+        )
+
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Return the inner knots and the quadratic of each interval."""
+        quadratics = sum(
+            (c * self._quadratics(k) for k, c in enumerate(self.series, start=1)), np.zeros((self.knots, 3))
+        )
+        return self._knots()[0], quadratics
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the term as a JSON object."""
+        series = list(self.series)
+        return {"type": "polynomial", "series": series, "low": self.low, "high": self.high, "knots": self.knots}
+
+    def _knots(self) -> tuple[Floats, Floats]:
+        """Return the inner knots, and all of them."""
+        knots = np.linspace(self.low, self.high, self.knots + 1)
+        return knots[1:-1], knots
+
+    def _quadratics(self, degree: int) -> Floats:
+        """Return c0, c1, c2 of the interpolant of T_degree on each interval, shape (knots, 3)."""
+        _, knots = self._knots()
+        left, right = knots[:-1], knots[1:]
+        middle, half = 0.5 * (left + right), 0.5 * (right - left)
+        x = (2.0 * np.stack([left, middle, right]) - self.low - self.high) / (self.high - self.low)
+        before, at, after = np.cos(degree * np.arccos(np.clip(x, -1.0, 1.0)))
+        slope, bend = (after - before) / (2.0 * half), (after - 2.0 * at + before) / (2.0 * half**2)
+        # From powers of (u - middle) to powers of u.
+        return np.column_stack([at - slope * middle + bend * middle**2, slope - 2.0 * bend * middle, bend])
+
+
+@dataclass(frozen=True)
 class ThermalExpansion:
     """The thermal term of a film whose phase fraction θ is a ramp: -[k0 (1 - θ) + k1 θ] (T - reference).
 
@@ -190,8 +281,9 @@ def reversible_from_json(document: Mapping[str, Any]) -> Reversible:
     """
     kind = _checks.json_field(document, "type", "reversible")
     fields = {key: value for key, value in document.items() if key != "type"}
-    terms: dict[str, type[QuadraticTerm] | type[ThermalExpansion]] = {
+    terms: dict[str, type[QuadraticTerm] | type[PolynomialTerm] | type[ThermalExpansion]] = {
         "quadratic": QuadraticTerm,
+        "polynomial": PolynomialTerm,
         "thermal-expansion": ThermalExpansion,
     }
     if kind not in terms:

@@ -14,10 +14,12 @@ from bench.hysteresis import (
     MemoryCurve,
     Operator,
     Polynomial,
+    PolynomialTerm,
     PrandtlIshlinskii,
     Preisach,
     QuadraticTerm,
     Regressor,
+    Reversible,
     ThermalExpansion,
     _checks,
     uniform_levels,
@@ -37,7 +39,7 @@ from bench.identification.least_squares import (
 )
 from bench.identification.measures import Errors, measure_errors
 
-ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic"]
+ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic", "polynomial"]
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
 
 # Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
@@ -116,7 +118,8 @@ def identify(
 
     ==========================  ==============================================================================
     `preisach`                  nonnegative density; options `levels` (20), `plane` (range of the inputs),
-                                `reversible` ("none", "linear" or "quadratic"), `input_range`
+                                `reversible` ("none", "linear", "quadratic", or "polynomial" of `degree` 5 unless
+                                given), `input_range`
     `preisach-signed`           density of either sign, least norm; options as `preisach`
     `preisach-nonmonotonic`     nonnegative density and thermal term (Zhang et al. 2013, eq. 12); options
                                 `levels` (20), `plane` (30, 70), `reference` (20), `input_range`
@@ -425,6 +428,7 @@ def _preisach(
     levels: int | ArrayLike = 20,
     plane: tuple[float, float] | None = None,
     reversible: ReversibleKind = "none",
+    degree: int | None = None,
     input_range: tuple[float, float] | None = None,
     input_unit: str = "",
     output_unit: str = "",
@@ -433,10 +437,16 @@ def _preisach(
         plane = _input_span(inputs, "plane")
     lattice = _lattice(levels, plane or (0.0, 0.0))
     middle = 0.5 * float(lattice[0] + lattice[-1])
-    terms: dict[str, QuadraticTerm | None] = {
+    span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
+    if degree is not None and reversible != "polynomial":
+        raise ValueError(f"degree: belongs to the reversible part 'polynomial', not to {reversible!r}")
+    if degree is not None and degree < 1:
+        raise ValueError(f"degree: expected at least 1, got {degree}")
+    terms: dict[str, Reversible | None] = {
         "none": None,
         "linear": QuadraticTerm(origin=middle),
         "quadratic": QuadraticTerm(quadratic=0.0, origin=middle),
+        "polynomial": PolynomialTerm((0.0,) * (5 if degree is None else degree), *span),
     }
     if reversible not in terms:
         raise ValueError(f"reversible: expected one of {', '.join(terms)}, got {reversible!r}")
@@ -444,7 +454,7 @@ def _preisach(
         lattice,
         np.zeros(lattice.size * (lattice.size - 1) // 2),
         reversible=terms[reversible],
-        input_range=_operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range),
+        input_range=span,
         input_unit=input_unit,
         output_unit=output_unit,
     )

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.control.inverse import Inverse, Reach
-from bench.hysteresis import MemoryCurve, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
+from bench.hysteresis import MemoryCurve, PolynomialTerm, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
 
 LOW, HIGH = 21.0, 84.0
 
@@ -215,6 +215,7 @@ def test_sequence_equals_single_inversions(seed, kind):
         "plain": lambda: plain(seed=seed),
         "film": lambda: film(seed=seed),
         "term": lambda: plain(seed=seed, term=QuadraticTerm(-0.4, 0.3, 0.5)),
+        "polynomial": lambda: plain(seed=seed, term=PolynomialTerm((0.3, -0.2, 0.4), 0.0, 1.0, 16)),
         "signed": lambda: plain(seed=seed, signed=True),
     }[kind]()
     inverse = Inverse(operator, "paper" if seed % 2 else "nearest")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from bench.hysteresis import (
     MemoryCurve,
+    PolynomialTerm,
     Preisach,
     QuadraticTerm,
     ThermalExpansion,
@@ -25,6 +26,7 @@ TERMS = {
     "none": None,
     "linear": QuadraticTerm(1.5, origin=50.0),
     "quadratic": QuadraticTerm(1.5, -0.2, 40.0),
+    "polynomial": PolynomialTerm((3.0, -1.0, 0.5), 21.0, 84.0, 12),
     "thermal": ThermalExpansion(2.8, 4.3),
 }
 

@@ -112,7 +112,7 @@ def test_given_levels_and_ranges():
         ("preisach", [0.0, math.nan], [0.0, 1.0], {}, "inputs: expected finite"),
         ("preisach", [1.0, 1.0], [0.0, 1.0], {}, "inputs: constant at 1.0; give plane"),
         ("polynomial", [1.0, 1.0], [0.0, 1.0], {}, "inputs: constant"),
-        ("preisach", [0.0, 1.0], [0.0, 1.0], {"degree": 3}, "options of preisach: .*degree"),
+        ("preisach", [0.0, 1.0], [0.0, 1.0], {"degree": 3}, "degree: belongs to"),
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"reversible": "cubic"}, "reversible: expected one of none"),
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"levels": 0}, "intervals"),
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"levels": [1.0, 0.0]}, "levels: expected strictly"),
