@@ -1,0 +1,690 @@
+"""Driver of the Flintec DAD 141.1, the amplifier of a strain-gauge load cell, by Modbus RTU.
+
+Sources: Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3, for the registers; Flintec DAD 141.1
+Technical Manual, Rev 2.5, 10.1 (identity), 10.4 (filters) and 10.5 (taring); MODBUS over Serial Line,
+Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
+
+The instrument is calibrated at its own keys, for a weight in a unit of the user's; the settings turn that into
+newtons. Nothing is saved in its EEPROM: filter and tare are what they were before after a power cycle.
+
+Assumptions: register 0x202C holds the 1410 that the command ID returns, as a number or digit by digit; the first
+byte of the firmware register is the higher one, and holds the minor version; an integer weight has the digits of
+the floating-point one without the decimal point; a tare that the instrument refuses leaves the tare bit as it
+was; characters have 8 bits and one stop bit.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import serial
+from pydantic import Field, field_validator
+from pymodbus.client import ModbusSerialClient
+from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
+from pymodbus.pdu import ModbusPDU
+
+from bench.clock import Clock
+from bench.devices import DriverSettings, Identity, LoadCell
+from bench.errors import DeviceConnectionError, DeviceError
+
+# Everything that pymodbus logs as an error is raised here with the name of the device.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
+"""3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
+
+_INTEGER_GROSS = 0x2020
+_ADC_SAMPLE = 0x202A
+_DEVICE_ID = 0x202C
+_FIRMWARE = 0x202E
+_SERIAL_NUMBER = 0x2034
+_COMMAND = 0x2061
+_FILTER = 0x2106
+_FILTER_MODE = 0x2110
+_COMBINED = 0x3500
+
+_RESET_TARE = 0x04
+_SET_TARE = 0x08
+
+_UNDER_RANGE = 0x0001
+_OVER_RANGE = 0x0002
+_NO_MOTION = 0x0010
+_TARE_SET = 0x0020
+
+_IIR = 0
+_MOST_DECIMALS = 5
+_ORDER_TRIALS = 5  # a load that moves may change between two reads
+_TARE_TIMEOUT = 1.0  # s that the instrument is given to show a change of tare
+_POLL = 0.05
+
+_READ = 3  # function code
+_RESENDS = 1
+_SHORTEST_REPLY = 5  # address, function, one byte, CRC
+_WRITE_REPLY = 8
+_LONGEST_REPLY = 256
+_MOST_STRAY = 4096  # bytes
+_STALE_LOOKS = 10
+_FAST_LINE = 19200  # Bd above which the pause between frames does not get shorter
+_FAST_PAUSE = 1.75e-3  # s
+
+_EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "device failure",
+    5: "acknowledge",
+    6: "device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target does not respond",
+}
+
+
+class DAD141Settings(DriverSettings):
+    """What a rig file says of a DAD 141.1."""
+
+    port: str = Field(
+        min_length=1, description="line, as pyserial opens it: /dev/ttyUSB0, socket://host:port, emulated://load"
+    )
+    address: int = Field(default=1, ge=1, le=247, description="Modbus address (menu 8.3), 1 to 247")
+    baudrate: int = Field(
+        default=115200, ge=9600, le=115200, description="speed of the line (menu 8.1) in Bd, 9600 to 115200"
+    )
+    parity: Literal["N", "E", "O"] = Field(
+        default="N", description="parity (menu 8.7): N for none, E for even, O for odd"
+    )
+    timeout: float = Field(
+        default=0.2,
+        ge=0.02,
+        le=10.0,
+        description="wait for a reply in s, 0.02 to 10; a request is sent twice at most",
+    )
+    pause: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1.0,
+        description="silence between a reply and the next request in s, 0 to 1; unless given, the 3.5 characters "
+        "that Modbus asks for, or 1.75 ms above 19200 Bd",
+    )
+    filter: int = Field(
+        default=3,
+        ge=0,
+        le=7,
+        description="digital low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1 and 0.5 Hz",
+    )
+    samples: int = Field(default=5, ge=1, le=1000, description="readings averaged in one measurement, 1 to 1000")
+    interval: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=60.0,
+        description="time from reading to reading of a measurement in s, 0 to 60; unless given, half a period of "
+        "the filter's cut-off, which makes their noise nearly independent",
+    )
+    newtons_per_unit: float = Field(
+        default=1.0,
+        description="calibration: N for each unit of weight, not 0; 9.80665 for kg, negative to turn the sign",
+    )
+    zero_newtons: float = Field(
+        default=0.0, description="calibration: force in N at which the gross weight reads zero"
+    )
+    force_limits: tuple[float, float] = Field(
+        description="calibrated range in N, low and high; a gross force beyond, whatever the tare, is an error"
+    )
+    keep_tare: bool = Field(
+        default=False, description="whether a tare found on connecting stays; otherwise it is reset"
+    )
+    still_timeout: float = Field(
+        default=10.0, ge=0.0, le=600.0, description="longest wait for a still signal before taring in s, 0 to 600"
+    )
+    stale_after: float = Field(
+        default=30.0,
+        ge=0.0,
+        le=86400.0,
+        description="time in s, to 86400, for which neither weight nor converter may stand still to the last digit; "
+        "0 for ever",
+    )
+    device_ids: tuple[int, ...] = Field(
+        default=(1410, 0x1410), min_length=1, description="values of register 0x202C (device identity) to accept"
+    )
+
+    @field_validator("newtons_per_unit")
+    @classmethod
+    def _check_slope(cls, value: float) -> float:
+        if value == 0:
+            raise ValueError("must be a number other than 0")
+        return value
+
+    @field_validator("force_limits")
+    @classmethod
+    def _check_limits(cls, value: tuple[float, float]) -> tuple[float, float]:
+        low, high = value
+        if not low < high:
+            raise ValueError(f"expected low < high, got {low:g} and {high:g} N")
+        return value
+
+
+class _Client(ModbusSerialClient):
+    """pymodbus's client of a serial line, with a receiver that waits for bytes instead of looking for them.
+
+    pymodbus looks whether bytes have come, sleeps for a millisecond or more, and looks again whether more have:
+    two naps for each reply. The head of a reply says how long it is, so that the port itself can wait for
+    exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
+
+    Parameters
+    ----------
+    settings : DAD141Settings
+        What the rig file says.
+    """
+
+    def __init__(self, settings: DAD141Settings) -> None:
+        # Sending again is up to the caller, who has to let late replies pass first.
+        super().__init__(
+            settings.port,
+            baudrate=settings.baudrate,
+            parity=settings.parity,
+            timeout=settings.timeout,
+            retries=0,
+        )
+        self.socket: Any = None
+        self._received = 0
+
+    def open(self) -> None:
+        """Open the line; raises what the port raises."""
+        parameters = self.comm_params
+        self.socket = serial.serial_for_url(
+            parameters.host,
+            baudrate=parameters.baudrate,
+            bytesize=parameters.bytesize,
+            parity=parameters.parity,
+            stopbits=parameters.stopbits,
+            timeout=parameters.timeout_connect,
+            write_timeout=parameters.timeout_connect,
+            exclusive=True,
+        )
+
+    def connect(self) -> bool:
+        """Return whether the line is open; a line that was lost stays closed."""
+        return self.socket is not None
+
+    def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:  # noqa: ARG002 - pymodbus's form
+        """Send a request, and forget whatever came before it."""
+        with _LineErrors(self):
+            self._forget()
+            self._received = 0
+            sent: int = self.socket.write(request)
+        return sent
+
+    def recv(self, size: int | None) -> bytes:  # noqa: ARG002 - pymodbus's form
+        """Wait for a reply, up to the timeout, and return what has come of it."""
+        if self._received > _LONGEST_REPLY:
+            return b""  # it never becomes a reply
+        with _LineErrors(self):
+            reply: bytes = self.socket.read(_SHORTEST_REPLY)
+            if len(reply) == _SHORTEST_REPLY and (missing := _reply_length(reply) - _SHORTEST_REPLY) > 0:
+                reply += self.socket.read(missing)
+        self._received += len(reply)
+        return reply
+
+    def drain(self) -> None:
+        """Let whatever still arrives pass, until nothing has come for a timeout."""
+        with _LineErrors(self):
+            for _ in range(_MOST_STRAY // _LONGEST_REPLY):
+                if not self.socket.read(_LONGEST_REPLY):
+                    return
+        raise ConnectionException("the line does not fall silent")
+
+    def _forget(self) -> None:
+        # A socket says only that something is waiting, not how much; hence byte by byte at worst.
+        for _ in range(_MOST_STRAY):
+            if not (waiting := self.socket.in_waiting):
+                return
+            self.socket.read(waiting)
+
+
+class _LineErrors:
+    """Turns what a port raises into what pymodbus raises."""
+
+    def __init__(self, client: _Client) -> None:
+        self._client = client
+
+    def __enter__(self) -> None:
+        if self._client.socket is None:
+            raise ConnectionException("the line is closed")
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if isinstance(error, OSError):
+            self._client.close()  # type: ignore[no-untyped-call]
+            raise ConnectionException(str(error)) from error
+
+
+def _reply_length(head: bytes) -> int:
+    """Return the bytes of the reply that begins so; those at hand if it is none."""
+    function = head[1]
+    if function in (3, 4):
+        return _SHORTEST_REPLY + head[2]
+    if function in (6, 16):
+        return _WRITE_REPLY
+    return len(head)
+
+
+class _Line:
+    """The serial line to one instrument: its registers, and sending again.
+
+    Modbus RTU does not say which request a reply belongs to. So after a request without a good reply the line
+    is given time for a late one to pass before anything else is sent.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device, for messages.
+    settings : DAD141Settings
+        What the rig file says.
+    clock : Clock
+        The clock of the run, for the pauses between frames.
+
+    Raises
+    ------
+    DeviceConnectionError
+        If the line cannot be opened.
+    """
+
+    def __init__(self, name: str, settings: DAD141Settings, clock: Clock) -> None:
+        self._name = name
+        self._settings = settings
+        self._clock = clock
+        self._pause = _frame_pause(settings)
+        self._silent_since = clock.now()
+        self._client = _Client(settings)
+        try:
+            self._client.open()
+        except Exception as error:  # pyserial lets errors of the system pass that are no OSError
+            raise DeviceConnectionError(name, f"cannot open {settings.port}: {error}") from None
+
+    def close(self) -> None:
+        """Release the line."""
+        self._client.close()  # type: ignore[no-untyped-call]
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Get `count` registers from `address` on, each 0 to 65535."""
+        unit = self._settings.address
+        response = self._exchange(
+            lambda: self._client.read_holding_registers(address, count=count, device_id=unit),
+            f"reading register 0x{address:04X}",
+        )
+        if response.function_code != _READ or len(response.registers) != count:
+            raise DeviceError(
+                self._name,
+                f"sent {len(response.registers)} registers by function {response.function_code} where {count} by "
+                f"function {_READ} were asked for; check that no other master is on the line",
+            )
+        return list(response.registers)
+
+    def read_integer(self, address: int) -> int:
+        """Get a 32-bit integer."""
+        return _integer(self.read(address, 2))
+
+    def set_integer(self, title: str, address: int, value: int) -> None:
+        """Set a 32-bit integer and read it back; `title` is its name for messages."""
+        words = list(struct.unpack(">2H", struct.pack(">i", value)))
+        unit = self._settings.address
+        self._exchange(
+            lambda: self._client.write_registers(address, words, device_id=unit), f"writing register 0x{address:04X}"
+        )
+        actual = self.read_integer(address)
+        if actual != value:
+            raise DeviceError(
+                self._name,
+                f"{title} reads back {actual} after {value} was written; is another program using the instrument?",
+            )
+
+    def command(self, value: int) -> None:
+        """Give a command of register 0x2061."""
+        unit = self._settings.address
+        self._exchange(lambda: self._client.write_register(_COMMAND, value, device_id=unit), f"command 0x{value:02X}")
+
+    def _exchange(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
+        if not self._client.connect():
+            raise DeviceConnectionError(
+                self._name, f"the line {self._settings.port} is closed; connect again, so that the set-up is checked"
+            )
+        try:
+            for _ in range(_RESENDS):
+                try:
+                    return self._checked(self._once(request), doing)
+                except ModbusIOException:
+                    self._client.drain()
+            return self._checked(self._once(request), doing)
+        except ModbusException as error:
+            raise self._lost(error) from error
+
+    def _once(self, request: Callable[[], ModbusPDU]) -> ModbusPDU:
+        self._clock.sleep_until(self._silent_since + self._pause)
+        response = request()
+        self._silent_since = self._clock.now()
+        return response
+
+    def _checked(self, response: ModbusPDU, doing: str) -> ModbusPDU:
+        if response.isError():
+            code = response.exception_code
+            raise _RefusedError(self._name, code, doing)
+        return response
+
+    def _lost(self, error: Exception) -> DeviceConnectionError:
+        # An instrument that was off has lost its set-up, so the line ends here.
+        settings = self._settings
+        self.close()
+        if isinstance(error, ConnectionException):
+            return DeviceConnectionError(
+                self._name, f"lost the line {settings.port} ({error.string}); check the cable, then connect again"
+            )
+        return DeviceConnectionError(
+            self._name,
+            f"no good reply within {settings.timeout:g} s at {settings.port}, address {settings.address}, after "
+            f"{1 + _RESENDS} requests; check power, cable, address (menu 8.3), speed ({settings.baudrate} Bd, menu "
+            f"8.1), parity ({settings.parity}, menu 8.7) and that the mode is RTU (menu 8.8), then connect again",
+        )
+
+
+class _RefusedError(DeviceError):
+    """The instrument answered with a Modbus exception."""
+
+    def __init__(self, device: str, code: int, doing: str) -> None:
+        super().__init__(device, f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'unknown')}) on {doing}")
+
+
+class _Block(NamedTuple):
+    """What one read of the combined registers gives."""
+
+    gross: float
+    net: float
+    qualifier: int
+
+
+class FlintecDAD141(LoadCell):
+    """A load cell behind a DAD 141.1.
+
+    Every reading is one request for gross weight, net weight and qualifier together, so that they belong to one
+    conversion. The force is the net one while the instrument has a tare, and the gross one otherwise; a tare
+    that was set or lost without the bench is an error, as the force would jump by it. `measure` averages
+    `samples` readings, `glance` takes one.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    clock : Clock
+        The clock of the run.
+    settings : DAD141Settings
+        What the rig file says.
+    line : _Line
+        The open line; `connect` makes it.
+    identity : Identity
+        What the instrument said of itself.
+    tared : bool
+        Whether the instrument has a tare that counts.
+    """
+
+    Settings: ClassVar[type[DAD141Settings]] = DAD141Settings
+
+    def __init__(
+        self, name: str, clock: Clock, settings: DAD141Settings, line: _Line, identity: Identity, tared: bool
+    ) -> None:
+        super().__init__(name, clock)
+        self._settings = settings
+        self._line = line
+        self._identity = identity
+        self._tared = tared
+        self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
+        self._gross = math.nan
+        self._gross_since = 0.0
+        self._adc: int | None = None
+        self._adc_since = self._adc_seen = 0.0
+        self._adc_looks = 0
+
+    @classmethod
+    def connect(cls, name: str, settings: DAD141Settings, clock: Clock) -> FlintecDAD141:
+        """Open the line, check that a DAD 141.1 answers and how it orders words, and set filter and tare.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened, nobody answers, or another device, or with swapped words.
+        DeviceError
+            If the instrument does not take a setting.
+        """
+        line = _Line(name, settings, clock)
+        try:
+            identity = _identify(name, settings, line)
+            line.set_integer("filter mode", _FILTER_MODE, _IIR)
+            line.set_integer("filter", _FILTER, settings.filter)
+            tared = settings.keep_tare and bool(_decode(line.read(_COMBINED, 5)).qualifier & _TARE_SET)
+            cell = cls(name, clock, settings, line, identity, tared)
+            if not tared:
+                cell.clear_tare()
+        except BaseException:
+            line.close()
+            raise
+        return cell
+
+    @property
+    def identity(self) -> Identity:
+        """Get the identity that the instrument gave on connecting."""
+        return self._identity
+
+    @property
+    def tared(self) -> bool:
+        """Whether the force is counted from a tare."""
+        return self._tared
+
+    def measure(self) -> dict[str, float]:
+        """Measure the force in N, as the mean of `samples` readings.
+
+        Raises
+        ------
+        DeviceError
+            If the cell is under or over its range, the force is outside of its calibration, or a reading is
+            stale or no number.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        begin = self._clock.now()
+        forces = []
+        for sample in range(self._settings.samples):
+            self._clock.sleep_until(begin + sample * self._interval)
+            forces.append(self._force())
+        return {f"{self.name}_force": math.fsum(forces) / len(forces)}
+
+    def glance(self) -> dict[str, float]:
+        """Measure the force in N by one reading; raises what `measure` does."""
+        return {f"{self.name}_force": self._force()}
+
+    def tare(self) -> None:
+        """Make the present force read zero from now on, as soon as the instrument finds the signal still.
+
+        Raises
+        ------
+        DeviceError
+            If the signal is out of range or does not become still, or the instrument does not take the tare.
+        """
+        end = self._clock.now() + self._settings.still_timeout
+        while not self._checked_block().qualifier & _NO_MOTION:
+            if self._clock.now() >= end:
+                raise DeviceError(
+                    self.name,
+                    f"the signal was not still within {self._settings.still_timeout:g} s, so there is no tare; bring "
+                    "the load to rest, choose a higher `filter`, or widen the no-motion range (menu 4)",
+                )
+            self._clock.sleep(_POLL)
+        self._line.command(_SET_TARE)
+        self._await_tare(True)
+
+    def clear_tare(self) -> None:
+        """Read gross force again.
+
+        Raises
+        ------
+        DeviceError
+            If the instrument keeps its tare.
+        """
+        self._line.command(_RESET_TARE)
+        self._await_tare(False)
+
+    def safe(self) -> None:
+        """Do nothing: a load cell is safe in any state."""
+
+    def close(self) -> None:
+        """Release the line."""
+        self._line.close()
+
+    def _await_tare(self, wanted: bool) -> None:
+        end = self._clock.now() + _TARE_TIMEOUT
+        while bool(_decode(self._line.read(_COMBINED, 5)).qualifier & _TARE_SET) is not wanted:
+            if self._clock.now() >= end:
+                done, advice = (
+                    ("took no tare", "is the load at rest?") if wanted else ("keeps its tare", "reset it by its keys")
+                )
+                raise DeviceError(self.name, f"the instrument {done}; {advice}")
+            self._clock.sleep(_POLL)
+        self._tared = wanted
+
+    def _force(self) -> float:
+        """Take one reading, in N."""
+        settings = self._settings
+        block = self._checked_block()
+        if bool(block.qualifier & _TARE_SET) is not self._tared:
+            what = (
+                "lost its tare; was it switched off?" if self._tared else "was tared by its keys or another program;"
+            )
+            raise DeviceError(
+                self.name, f"the instrument {what} Set the tare again, or clear it, so that its force can be trusted"
+            )
+        gross = settings.newtons_per_unit * block.gross + settings.zero_newtons
+        low, high = settings.force_limits
+        if not low <= gross <= high:
+            raise DeviceError(
+                self.name,
+                f"force {gross:.6g} N is outside of its calibrated range {low:g} to {high:g} N; "
+                "take load off, or extend the calibration and `force_limits`",
+            )
+        self._check_fresh(block.gross)
+        return settings.newtons_per_unit * block.net if self._tared else gross
+
+    def _checked_block(self) -> _Block:
+        """Read the combined registers; raise what they say is wrong."""
+        block = _decode(self._line.read(_COMBINED, 5))
+        if block.qualifier & (_UNDER_RANGE | _OVER_RANGE):
+            side = "over" if block.qualifier & _OVER_RANGE else "under"
+            raise DeviceError(
+                self.name,
+                f"the load cell is {side} its range (qualifier 0x{block.qualifier:04X}, gross weight "
+                f"{block.gross:.6g}); take load off and check the cell's cable",
+            )
+        if not (math.isfinite(block.gross) and math.isfinite(block.net)):
+            raise DeviceError(
+                self.name, f"sent a weight that is no number (gross {block.gross}, net {block.net}); check its set-up"
+            )
+        return block
+
+    def _check_fresh(self, gross: float) -> None:
+        """Raise if neither the weight nor, after a while, the converter behind it has changed for too long."""
+        limit, now = self._settings.stale_after, self._clock.now()
+        if gross != self._gross:
+            self._gross, self._gross_since, self._adc, self._adc_looks = gross, now, None, 0
+            return
+        if not limit or now - self._gross_since < limit:
+            return
+        # A quiet load shows one weight for hours, but a converter that works does not stand still to its last digit.
+        suspicious = self._adc_looks >= _STALE_LOOKS
+        if not suspicious and self._adc_looks and now - self._adc_seen < limit / _STALE_LOOKS:
+            return
+        adc = self._line.read_integer(_ADC_SAMPLE)
+        if adc != self._adc:
+            self._adc, self._adc_since, self._adc_looks = adc, now, 0
+        self._adc_seen = now
+        self._adc_looks += 1
+        if self._adc_looks >= _STALE_LOOKS and now - self._adc_since >= limit:
+            raise DeviceError(
+                self.name,
+                f"readings are stale: the converter has stood at {adc} for {now - self._adc_since:.3g} s; switch the "
+                "instrument off and on, and connect again",
+            )
+
+
+def _identify(name: str, settings: DAD141Settings, line: _Line) -> Identity:
+    """Check that the instrument is the right one and orders words as this driver does."""
+    where = f"the device at {settings.port}, address {settings.address},"
+    try:
+        words = line.read(_DEVICE_ID, 2)
+        if _integer(words) not in settings.device_ids:
+            raise DeviceConnectionError(name, f"{where} {_found(words, settings)}")
+        high, low = line.read(_FIRMWARE, 2)
+        if high or not low:
+            raise DeviceConnectionError(
+                name,
+                f"{where} gives 0x{high:04X}{low:04X} for its firmware, which no DAD 141.1 does; check the address",
+            )
+        serial_number = line.read_integer(_SERIAL_NUMBER)
+        _check_order(name, where, line)
+    except _RefusedError as error:
+        reason = str(error).removeprefix(f"{name}: ")
+        raise DeviceConnectionError(name, f"{where} is no DAD 141.1: {reason}; check the address") from error
+    minor, major = low >> 8, low & 0xFF
+    return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
+
+
+def _found(words: Sequence[int], settings: DAD141Settings) -> str:
+    """Say what stands in the device identity instead of that of a DAD 141.1."""
+    if _integer(words[::-1]) in settings.device_ids:
+        return "sends the words of a value in swapped order; is there a gateway in between?"
+    if _integer([(word & 0xFF) << 8 | word >> 8 for word in words]) in settings.device_ids:
+        return "sends the bytes of a word in swapped order; is there a gateway in between?"
+    known = " or ".join(str(each) for each in settings.device_ids)
+    return (
+        f"is no DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or add the number to "
+        "`device_ids` if it is one"
+    )
+
+
+def _check_order(name: str, where: str, line: _Line) -> None:
+    """Raise unless the same weight as floating-point number and as integer has the same digits."""
+    for _ in range(_ORDER_TRIALS):
+        block = _decode(line.read(_COMBINED, 5))
+        digits = line.read_integer(_INTEGER_GROSS)
+        # Out of range the weight may be anything; the identity has shown the order already.
+        if block.qualifier & (_UNDER_RANGE | _OVER_RANGE) or _agree(block.gross, digits):
+            return
+    raise DeviceConnectionError(
+        name,
+        f"{where} gives the same weight as {block.gross:g} and, as an integer, {digits}; is there a gateway in "
+        "between that changes the order of words or bytes?",
+    )
+
+
+def _agree(weight: float, digits: int) -> bool:
+    """Return whether an integer has the digits of a weight, give or take some motion."""
+    tolerance = 2.5 + 0.02 * abs(digits)
+    return any(abs(weight * 10.0**decimals - digits) <= tolerance for decimals in range(_MOST_DECIMALS + 1))
+
+
+def _decode(words: Sequence[int]) -> _Block:
+    gross, net, qualifier = struct.unpack(">ffH", struct.pack(">5H", *words))
+    return _Block(gross, net, qualifier)
+
+
+def _integer(words: Sequence[int]) -> int:
+    value: int = struct.unpack(">i", struct.pack(">2H", *words))[0]
+    return value
+
+
+def _frame_pause(settings: DAD141Settings) -> float:
+    """Return the silence between frames in s."""
+    if settings.pause is not None:
+        return settings.pause
+    if settings.baudrate > _FAST_LINE:
+        return _FAST_PAUSE
+    bits = 10 if settings.parity == "N" else 11
+    return 3.5 * bits / settings.baudrate

@@ -1,0 +1,546 @@
+"""An emulated Flintec DAD 141.1, the amplifier of a strain-gauge load cell.
+
+The register map is that of the Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3; what the
+commands do is that of the DAD 141.1 Technical Manual, Rev 2.5: 10.2 (calibration), 10.3 (motion detection),
+10.4 (filters), 10.5 (taring and zeroing).
+
+Assumptions, where these say nothing:
+
+- The digital filter is two equal first-order lags in a row. The manual gives a filter of second order with
+  Gaussian characteristics and its cut-off; two equal lags with that cut-off settle to 0.1 % within 6 % of the
+  times that the manual gives for each setting. Setting 0, the anti-aliasing filter of 17 Hz alone, is emulated
+  in the same way, although it falls by 60 dB a decade. Filter mode 1 (FIR) is stored and changes nothing.
+- The noise of amplifier and cell is white before the filter.
+- Conversions come when somebody asks, not 600 times a second; between two of them the force ran straight.
+- Integer weights are the displayed digits without the decimal point. The ADC value is the filtered signal with
+  24 bits.
+- The range bits say that the gross weight is beyond the largest or the smallest value to be displayed; the
+  converter itself saturates at 1.2 times these.
+- The signal is still when the weight has stayed within the no-motion range around one of its values for the
+  no-motion time. Setting tare or zero while it is not still is refused with Modbus exception 4, as the command
+  language has ERR for it; so is a zero that is more than 2 % of the largest weight away from the calibrated one.
+- An address that is not emulated, or a read of what can only be written, gives exception 2; half a 32-bit value
+  or a value that is not allowed gives exception 3.
+- The device identity reads as 1410 and the device status as the decimal number that the command IS returns.
+- A power cycle brings back what was saved of filter and motion detection, and forgets zero and tare.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from bench.devices import Identity, LoadCell
+from bench.errors import DeviceError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
+from sim_devices.world import World
+
+CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
+"""3 dB cut-off by filter setting 0 to 7 (Technical Manual, 10.4.2, IIR filter)."""
+
+UNDER_RANGE = 0x0001
+OVER_RANGE = 0x0002
+NO_MOTION = 0x0010
+TARE_SET = 0x0020
+
+RESET_ZERO = 0x01
+SET_ZERO = 0x02
+RESET_TARE = 0x04
+SET_TARE = 0x08
+RESET_MAXIMUM = 0x10
+TRIGGER_HOLD = 0x20
+
+DEVICE_ID = 1410
+ADC_BITS = 24
+
+_SATURATION = 1.2
+_ZERO_SHARE = 0.02
+_LAGS_CUTOFF = math.sqrt(math.sqrt(2.0) - 1.0)  # cut-off of two equal lags over that of one
+_MEMORY_LAGS = 16.0  # time constants after which two lags have forgotten, to 2e-6
+_FINE_LAGS = 0.5  # time constants between two looks at the force
+_LEAST_LAGS = 1e-6  # and less than which nothing changes
+_COARSE = 0.05  # s between two looks for the motion detection
+_STILL_POLL = 0.05
+_STILL_TIMEOUT = 10.0
+_COMMANDS = RESET_ZERO | SET_ZERO | RESET_TARE | SET_TARE | RESET_MAXIMUM | TRIGGER_HOLD
+_SAVE_SET_UP = 0x0004
+_SAVES = 0x0001 | 0x0002 | _SAVE_SET_UP | 0x0010
+
+_FORMATS = {"F32": ">f", "I32": ">i", "U16": ">H"}
+
+
+def time_constant(setting: int) -> float:
+    """Return the time constant in s of either lag of a filter setting, 0 to 7."""
+    return _LAGS_CUTOFF / (2 * math.pi * CUTOFF_HZ[setting])
+
+
+def reading_interval(setting: int) -> float:
+    """Return the time in s between two readings whose noise is nearly independent: half a period at cut-off."""
+    return 0.5 / CUTOFF_HZ[setting]
+
+
+@dataclass(frozen=True)
+class _Register:
+    kind: Literal["F32", "I32", "U16"]
+    read: Callable[[], float] | None
+    write: Callable[[int], None] | None
+
+    @property
+    def words(self) -> int:
+        return 1 if self.kind == "U16" else 2
+
+    def encode(self, value: float) -> tuple[int, ...]:
+        raw = struct.pack(_FORMATS[self.kind], value if self.kind == "F32" else int(value))
+        return struct.unpack(f">{self.words}H", raw)
+
+    def decode(self, words: Sequence[int]) -> int:
+        return int(struct.unpack(_FORMATS[self.kind], struct.pack(f">{self.words}H", *words))[0])
+
+
+@dataclass(frozen=True)
+class _SetUp:
+    """What command WP saves; the factory's values (Technical Manual, 10.3 and 10.4)."""
+
+    filter: int = 3
+    filter_mode: int = 0
+    motion_range: int = 1  # d
+    motion_time: int = 1000  # ms
+
+
+class EmulatedDAD141(LoadCell):
+    """A DAD 141.1 with its load cell: the role, called directly, and a bank of Modbus registers for the wire.
+
+    Every access brings the world up to date first and holds its lock. The filter sees the force as often as
+    its cut-off asks for, however seldom it is read; so the instrument is a `Timed` one.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    world : World
+        The laboratory that the instrument stands in.
+    force : callable
+        The force on the cell in N, positive in tension, from the plant.
+    rng : numpy.random.Generator
+        Source of the noise.
+    newtons_per_unit : float
+        How the instrument was calibrated: N for each unit that it displays, not 0; 9.80665 for kg.
+    zero_newtons : float
+        Force in N at which the gross weight reads zero.
+    weight_limits : tuple of float
+        Smallest (command CI, zero or negative) and largest weight (CM, positive) to be displayed, in units.
+    decimals : int
+        Digits after the decimal point of the display (DP), 0 to 5.
+    step : int
+        Step of the last digit (DS): 1, 2, 5, 10, 20, 50, 100, 200 or 500.
+    noise : float
+        Noise in N rms as filter setting 0 lets it through; zero or positive. Less in proportion to the root of
+        the cut-off at other settings: 0.49 times at setting 3.
+    samples : int
+        Readings that `measure` averages, 1 or more.
+    serial_number : int
+        Serial number that the instrument reports.
+    firmware : tuple of int
+        Major and minor version that the instrument reports.
+
+    Attributes
+    ----------
+    frozen : bool
+        A fault: the converter stands still, and with it everything that is read.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not allowed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        world: World,
+        force: Callable[[], float],
+        *,
+        rng: np.random.Generator,
+        newtons_per_unit: float = 1.0,
+        zero_newtons: float = 0.0,
+        weight_limits: tuple[float, float] = (-60.0, 60.0),
+        decimals: int = 3,
+        step: int = 1,
+        noise: float = 5e-4,
+        samples: int = 5,
+        serial_number: int = 1410237,
+        firmware: tuple[int, int] = (1, 10),
+    ) -> None:
+        super().__init__(name, world.clock)
+        if not (math.isfinite(newtons_per_unit) and newtons_per_unit != 0):
+            raise ValueError(f"newtons_per_unit: expected a number other than 0, got {newtons_per_unit}")
+        if not 0 <= decimals <= 5:
+            raise ValueError(f"decimals: allowed are 0 to 5, got {decimals}")
+        if step not in (1, 2, 5, 10, 20, 50, 100, 200, 500):
+            raise ValueError(f"step: allowed are 1, 2 and 5, times 1, 10 and 100, got {step}")
+        low, high = (round(limit * int(10**decimals)) for limit in weight_limits)
+        if not -999_999 <= low <= 0 < high <= 999_999:
+            raise ValueError(f"weight_limits: allowed are -999999 to 0 and 1 to 999999 digits, got {low} and {high}")
+        if not noise >= 0:
+            raise ValueError(f"noise: expected zero or a positive number, got {noise}")
+        if samples < 1:
+            raise ValueError(f"samples: expected 1 or more, got {samples}")
+        self.world = world
+        self.serial_number = serial_number
+        self.firmware = firmware
+        self.frozen = False
+        self._force = force
+        self._rng = rng
+        self._newtons_per_unit = newtons_per_unit
+        self._zero_newtons = zero_newtons
+        self._lowest, self._highest = low, high
+        self._scale = int(10**decimals)
+        self._decimals = decimals
+        self._step = step
+        self._noise = noise / abs(newtons_per_unit)
+        self._samples = samples
+        self._saved = _SetUp()
+        self._zero = self._tare = self._hold = self._peak = 0
+        self._words: dict[int, tuple[int, _Register]] = {}
+        self._build_map()
+        self.power_cycle()
+        world.add(self)
+
+    # What the laboratory around the instrument does to it.
+
+    def power_cycle(self) -> None:
+        """Switch the instrument off and on again."""
+        with self.world.lock:
+            self.world.advance()
+            self._set_up = self._saved
+            self._zero = self._tare = self._hold = 0
+            self._tare_set = False
+            self._settle()
+            self._peak = self._gross
+
+    # The conversion.
+
+    def deadline(self) -> float:
+        """Return when the filter has to look at the force next, in laboratory seconds, if it is asked by now."""
+        if self.frozen:
+            return math.inf
+        now = self.world.clock.now()
+        waiting = now - self._converted
+        tau = time_constant(self._set_up.filter)
+        # The margins of one coarse step keep a clock that runs on from drawing these instants along with it.
+        if waiting > self._memory() + _COARSE:
+            return now - self._memory()
+        if waiting > _MEMORY_LAGS * tau + _COARSE:
+            return self._converted + _COARSE
+        return self._converted + _FINE_LAGS * tau
+
+    def expire(self) -> None:
+        """Look at the force."""
+        self._convert()
+
+    def _memory(self) -> float:
+        """Return how long before a reading the force matters to it, s."""
+        return _MEMORY_LAGS * time_constant(self._set_up.filter) + self._set_up.motion_time / 1000 + 2 * _COARSE
+
+    def _signal(self) -> float:
+        """Return the weight at this instant, in units, as far as the converter goes."""
+        weight = (self._force() - self._zero_newtons) / self._newtons_per_unit
+        limit = _SATURATION * max(self._highest, -self._lowest) / self._scale
+        return min(max(weight, -limit), limit)
+
+    def _settle(self) -> None:
+        """Begin with a filter that has settled, at this instant."""
+        self._converted = self._still_since = self.world.time
+        self._input = self._first = self._second = self._signal()
+        # The noise behind the first lag has twice the variance of that behind the second, and a covariance with
+        # it that equals the latter.
+        spread = self._noise * math.sqrt(time_constant(0) / time_constant(self._set_up.filter))
+        self._noise_second = spread * self._rng.standard_normal()
+        self._noise_first = self._noise_second + spread * self._rng.standard_normal()
+        self._display()
+        self._reference = self._digits
+
+    def _convert(self) -> None:
+        """Bring the filter from the last conversion to this instant."""
+        tau = time_constant(self._set_up.filter)
+        lags = (self.world.time - self._converted) / tau
+        if self.frozen or lags < _LEAST_LAGS:
+            return
+        decay = math.exp(-lags)
+        # Two equal lags with an input that runs straight from the last look to this one.
+        signal = self._signal()
+        trail = (signal - self._input) / lags
+        first = self._first - self._input + trail
+        second = self._second - self._input + 2 * trail
+        self._first = signal - trail + first * decay
+        self._second = signal - 2 * trail + (second + first * lags) * decay
+        self._input = signal
+        self._converted = self.world.time
+        self._wander(lags, decay)
+        self._display()
+        if abs(self._digits - self._reference) > self._set_up.motion_range:
+            self._reference = self._digits
+            self._still_since = self._converted
+
+    def _wander(self, lags: float, decay: float) -> None:
+        """Bring the noise behind both lags to this instant, exactly for white noise before them."""
+        spread = self._noise * math.sqrt(time_constant(0) / time_constant(self._set_up.filter))
+        # The stationary covariance is 2, 1, 1 in units of the output's variance. What the known values still say
+        # of it fades by `known`; the rest is new.
+        known = decay * decay
+        first = -2 * math.expm1(-2 * lags)
+        both = 1 - known * (1 + 2 * lags)
+        second = 1 - known * (1 + 2 * lags + 2 * lags * lags)
+        along = both / math.sqrt(first)
+        across = math.sqrt(max(second - along * along, 0.0))
+        fresh, other = spread * self._rng.standard_normal(), spread * self._rng.standard_normal()
+        self._noise_second = decay * (self._noise_second + lags * self._noise_first) + along * fresh + across * other
+        self._noise_first = decay * self._noise_first + math.sqrt(first) * fresh
+
+    def _display(self) -> None:
+        weight = self._second + self._noise_second
+        span = _SATURATION * max(self._highest, -self._lowest) / self._scale
+        full = 2 ** (ADC_BITS - 1)
+        self._adc = min(max(round(weight / span * full), -full), full - 1)
+        self._digits = round(weight * self._scale / self._step) * self._step
+        self._peak = max(self._peak, self._gross)
+
+    @property
+    def _gross(self) -> int:
+        return self._digits - self._zero
+
+    @property
+    def _net(self) -> int:
+        return self._gross - self._tare
+
+    @property
+    def _still(self) -> bool:
+        return self._converted - self._still_since >= self._set_up.motion_time / 1000
+
+    @property
+    def _qualifier(self) -> int:
+        return (
+            (UNDER_RANGE if self._digits < self._lowest else 0)
+            | (OVER_RANGE if self._digits > self._highest else 0)
+            | (NO_MOTION if self._still else 0)
+            | (TARE_SET if self._tare_set else 0)
+        )
+
+    @property
+    def _status(self) -> int:
+        return (1 if self._still else 0) | (2 if self._zero else 0) | (4 if self._tare_set else 0)
+
+    # The registers.
+
+    @contextmanager
+    def _request(self) -> Iterator[None]:
+        with self.world.lock:
+            self.world.advance()
+            self._convert()
+            yield
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        """Return `count` registers from `address` on, all of one conversion; reading half a value is allowed.
+
+        Raises
+        ------
+        RegisterError
+            If one of them does not exist or cannot be read.
+        """
+        with self._request():
+            words = []
+            for each in range(address, address + count):
+                start, register = self._at(each)
+                if register.read is None:
+                    raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{each:04X} can only be written")
+                words.append(register.encode(register.read())[each - start])
+            return words
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        """Write registers from `address` on, in whole values.
+
+        Raises
+        ------
+        RegisterError
+            If one of them does not exist or cannot be written, or if a value is not allowed; the values before
+            it have been written then.
+        """
+        with self._request():
+            position = 0
+            while position < len(values):
+                start, register = self._at(address + position)
+                words = values[position : position + register.words]
+                if register.write is None:
+                    raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{start:04X} can only be read")
+                if start != address + position or len(words) < register.words:
+                    raise RegisterError(ILLEGAL_VALUE, f"register 0x{start:04X} is to be written as a whole")
+                register.write(register.decode(words))
+                position += register.words
+
+    def _at(self, address: int) -> tuple[int, _Register]:
+        try:
+            return self._words[address]
+        except KeyError:
+            raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{address:04X} is not emulated") from None
+
+    def _add(
+        self,
+        address: int,
+        kind: Literal["F32", "I32", "U16"],
+        read: Callable[[], float] | None,
+        write: Callable[[int], None] | None = None,
+    ) -> None:
+        register = _Register(kind, read, write)
+        for word in range(register.words):
+            self._words[address + word] = (address, register)
+
+    def _build_map(self) -> None:
+        major, minor = self.firmware
+        weights: dict[str, Callable[[], int]] = {
+            "gross": lambda: self._gross,
+            "net": lambda: self._net,
+            "peak": lambda: self._peak,
+            "hold": lambda: self._hold,
+        }
+        for address, weight in ((0x2000, "gross"), (0x2002, "net"), (0x2080, "peak"), (0x2084, "hold")):
+            self._add(address, "F32", partial(self._in_units, weights[weight]))
+        for address, weight in ((0x2020, "gross"), (0x2022, "net"), (0x2082, "peak"), (0x2086, "hold")):
+            self._add(address, "I32", weights[weight])
+        self._add(0x202A, "I32", lambda: self._adc)
+        self._add(0x202C, "I32", lambda: DEVICE_ID)
+        self._add(0x202E, "I32", lambda: minor << 8 | major)
+        self._add(0x2030, "I32", lambda: 1000 * self._status)
+        self._add(0x2034, "I32", lambda: self.serial_number)
+        self._add(0x2060, "U16", lambda: self._qualifier)
+        self._add(0x2061, "U16", None, self._command)
+        self._add(0x2066, "U16", None, self._save)
+        self._add_set_up(0x2106, "filter", 0, len(CUTOFF_HZ) - 1)
+        self._add_set_up(0x2110, "filter_mode", 0, 1)
+        self._add_set_up(0x2112, "motion_range", 1, 65535)
+        self._add_set_up(0x2114, "motion_time", 1, 65535)
+        self._add(0x2118, "I32", lambda: self._tare)
+        self._add(0x220C, "I32", lambda: self._highest)
+        self._add(0x220E, "I32", lambda: self._lowest)
+        self._add(0x2214, "I32", lambda: self._decimals)
+        self._add(0x2216, "I32", lambda: self._step)
+        self._add(0x3300, "I32", weights["gross"])
+        self._add(0x3302, "I32", weights["net"])
+        self._add(0x3304, "U16", lambda: self._qualifier)
+        self._add(0x3500, "F32", partial(self._in_units, weights["gross"]))
+        self._add(0x3502, "F32", partial(self._in_units, weights["net"]))
+        self._add(0x3504, "U16", lambda: self._qualifier)
+
+    def _add_set_up(self, address: int, field: str, low: int, high: int) -> None:
+        def write(value: int) -> None:
+            if not low <= value <= high:
+                raise RegisterError(ILLEGAL_VALUE, f"register 0x{address:04X}: allowed are {low} to {high}")
+            changed = replace(self._set_up, **{field: value})
+            if changed != self._set_up:
+                self._set_up = changed
+                self._settle()
+
+        self._add(address, "I32", lambda: getattr(self._set_up, field), write)
+
+    def _in_units(self, digits: Callable[[], int]) -> float:
+        return digits() / self._scale
+
+    # The commands.
+
+    def _command(self, value: int) -> None:
+        if not value or value & ~_COMMANDS:
+            raise RegisterError(ILLEGAL_VALUE, f"command 0x{value:04X} does not exist")
+        if value & RESET_ZERO:
+            self._zero = 0
+        if value & SET_ZERO:
+            self._check_still("set zero")
+            if abs(self._digits) > _ZERO_SHARE * self._highest:
+                raise RegisterError(DEVICE_FAILURE, "set zero: too far from the calibrated zero")
+            self._zero = self._digits
+        if value & RESET_TARE:
+            self._tare, self._tare_set = 0, False
+        if value & SET_TARE:
+            self._check_still("set tare")
+            self._tare, self._tare_set = self._gross, True
+        if value & RESET_MAXIMUM:
+            self._peak = self._gross
+        if value & TRIGGER_HOLD:
+            self._hold = self._gross
+
+    def _check_still(self, command: str) -> None:
+        if not self._still:
+            raise RegisterError(DEVICE_FAILURE, f"{command}: the signal is not still")
+
+    def _save(self, value: int) -> None:
+        if not value or value & ~_SAVES:
+            raise RegisterError(ILLEGAL_VALUE, f"saving 0x{value:04X} is not emulated")
+        if value & _SAVE_SET_UP:
+            self._saved = self._set_up
+
+    # The role.
+
+    @property
+    def identity(self) -> Identity:
+        """Identity of the instrument."""
+        major, minor = self.firmware
+        return Identity("Flintec", "DAD 141.1", str(self.serial_number), f"{major}.{minor:02d}")
+
+    def measure(self) -> dict[str, float]:
+        """Measure the force in N, as a mean of readings that are half a period of the cut-off apart."""
+        begin = self.world.clock.now()
+        interval = reading_interval(self._set_up.filter)
+        forces = []
+        for sample in range(self._samples):
+            self.world.clock.sleep_until(begin + sample * interval)
+            forces.append(self._reading())
+        return {f"{self.name}_force": math.fsum(forces) / len(forces)}
+
+    def glance(self) -> dict[str, float]:
+        """Measure the force in N by one reading."""
+        return {f"{self.name}_force": self._reading()}
+
+    def tare(self) -> None:
+        """Set the tare, as soon as the signal is still; waits 10 s for it at most.
+
+        Raises
+        ------
+        DeviceError
+            If the signal does not become still.
+        """
+        clock = self.world.clock
+        end = clock.now() + _STILL_TIMEOUT
+        while True:
+            try:
+                self.write_registers(0x2061, [SET_TARE])
+            except RegisterError as refusal:
+                if clock.now() >= end:
+                    raise DeviceError(self.name, f"the tare was refused: {refusal}") from refusal
+                clock.sleep(_STILL_POLL)
+            else:
+                return
+
+    def clear_tare(self) -> None:
+        """Reset the tare."""
+        self.write_registers(0x2061, [RESET_TARE])
+
+    def safe(self) -> None:
+        """Do nothing: a load cell is safe in any state."""
+
+    def close(self) -> None:
+        """Do nothing: there is no line."""
+
+    def _reading(self) -> float:
+        with self._request():
+            if self._qualifier & (UNDER_RANGE | OVER_RANGE):
+                side = "over" if self._qualifier & OVER_RANGE else "under"
+                raise DeviceError(
+                    self.name, f"is {side} its range: the weight is {self._in_units(lambda: self._gross)}"
+                )
+            zero = 0.0 if self._tare_set else self._zero_newtons
+            return self._newtons_per_unit * self._net / self._scale + zero

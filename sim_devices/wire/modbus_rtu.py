@@ -1,0 +1,138 @@
+"""Modbus RTU on a serial line, for any emulated instrument that is a bank of registers.
+
+On a real line a pause of 3.5 characters ends a frame. A stream of bytes has no pauses, so frames are found by
+what is in them: the function code says how long a request is, the CRC whether it is one. Whatever does not
+become a request that way is passed over, and a whole request to this instrument is found behind it at once,
+not only after as many bytes as the garbage seemed to announce.
+
+Functions 3, 4, 6 and 16 are carried out. The other functions of the specification are refused with exception
+1; to a function code that it does not define there is no answer, as the length of such a request is unknown.
+
+Sources: MODBUS over Serial Line, Specification and Implementation Guide V1.02, sections 2.2 (addresses,
+broadcast), 2.5.1 (RTU framing) and 6.2.2 (CRC); MODBUS Application Protocol Specification V1.1b3, section 6
+(lengths of requests).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sim_devices.wire.modbus import RegisterBank, answer
+
+BROADCAST = 0
+LONGEST_FRAME = 256
+"""Bytes of the longest frame, Serial Line 2.5.1."""
+
+_SHORTEST_FRAME = 4
+_FIXED: Mapping[int, int] = {
+    **dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8),
+    **dict.fromkeys((7, 11, 12, 17), 4),
+    22: 10,
+    24: 6,
+    43: 7,
+}
+"""Bytes of a request by function code, from the address to the CRC."""
+
+_COUNTED: Mapping[int, tuple[int, int]] = {15: (9, 6), 16: (9, 6), 20: (5, 2), 21: (5, 2), 23: (13, 10)}
+"""Bytes of a request without its data, and where the number of bytes of its data stands."""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+        table.append(value)
+    return tuple(table)
+
+
+_TABLE = _crc_table()
+
+
+def crc16(data: bytes | bytearray | memoryview) -> bytes:
+    """Return the CRC of a frame as it follows on the wire, least significant byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
+    return crc.to_bytes(2, "little")
+
+
+class ModbusRtuServer:
+    """The serial side of an emulated instrument.
+
+    Requests to other addresses have no answer. What is broadcast to address 0 is carried out and not answered.
+
+    Parameters
+    ----------
+    bank : RegisterBank
+        The instrument.
+    address : int
+        Address of the instrument on its line, 1 to 247.
+
+    Raises
+    ------
+    ValueError
+        If the address is not allowed.
+    """
+
+    def __init__(self, bank: RegisterBank, address: int = 1) -> None:
+        if not 1 <= address <= 247:
+            raise ValueError(f"address: allowed are 1 to 247, got {address}")
+        self._bank = bank
+        self._address = address
+        self._received = bytearray()
+
+    @property
+    def address(self) -> int:
+        """Address of the instrument on its line."""
+        return self._address
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the line, in whatever pieces they come; return the replies to whole requests."""
+        self._received += data
+        replies = bytearray()
+        received = memoryview(bytes(self._received))
+        begin = 0
+        while (found := self._find(received[begin:])) is not None:
+            start, end = found
+            replies += self._serve(bytes(received[begin + start : begin + end]))
+            begin += end
+        del self._received[:begin]
+        # What a frame can still become the beginning of is shorter than the longest frame.
+        del self._received[: max(len(self._received) - LONGEST_FRAME + 1, 0)]
+        return bytes(replies)
+
+    def _find(self, received: memoryview) -> tuple[int, int] | None:
+        """Return where the first whole request begins and ends."""
+        for start in range(len(received) - _SHORTEST_FRAME + 1):
+            # Behind bytes that are none of a request, only one to this instrument is trusted to be one.
+            if start and received[start] not in (self._address, BROADCAST):
+                continue
+            length = _length(received[start:])
+            if length is None or start + length > len(received):
+                continue
+            body = received[start : start + length - 2]
+            if received[start + length - 2 : start + length] == crc16(body):
+                return start, start + length
+        return None
+
+    def _serve(self, frame: bytes) -> bytes:
+        address = frame[0]
+        if address not in (self._address, BROADCAST):
+            return b""
+        reply = bytes([address]) + answer(self._bank, frame[1:-2])
+        return b"" if address == BROADCAST else reply + crc16(reply)
+
+
+def _length(received: memoryview) -> int | None:
+    """Return the length of the request that begins here; None if it is none, or too little has come."""
+    function = received[1]
+    if function in _FIXED:
+        return _FIXED[function]
+    if function not in _COUNTED:
+        return None
+    rest, position = _COUNTED[function]
+    if len(received) <= position:
+        return None
+    length = rest + received[position]
+    return length if length <= LONGEST_FRAME else None

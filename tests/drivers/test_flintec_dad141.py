@@ -1,0 +1,733 @@
+"""The DAD 141.1 driver: its settings, its bytes, and what it makes of wrong devices and bad lines."""
+
+import logging
+import math
+import os
+import select
+import socket
+import struct
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bench.clock import VirtualClock, WallClock
+from bench.errors import DeviceConnectionError, DeviceError
+from drivers.flintec_dad141 import FlintecDAD141
+from sim_devices import protocol_emulated
+from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
+from sim_devices.wire import WireServer
+from sim_devices.wire.modbus import RegisterError
+from sim_devices.wire.modbus_rtu import ModbusRtuServer, crc16
+from sim_devices.world import World
+
+Settings = FlintecDAD141.Settings
+WIDE = (-100.0, 100.0)
+
+
+def sealed(text: str) -> bytes:
+    frame = bytes.fromhex(text)
+    return frame + crc16(frame)
+
+
+class Still:
+    def advance(self, dt: float) -> None:
+        pass
+
+
+class Tap:
+    """A line that keeps the bytes, and may alter what comes back."""
+
+    def __init__(self, server: ModbusRtuServer) -> None:
+        self.server = server
+        self.sent: list[bytes] = []
+        self.alter: Callable[[bytes], bytes] = lambda reply: reply
+
+    def receive(self, data: bytes) -> bytes:
+        self.sent.append(data)
+        return self.alter(self.server.receive(data))
+
+
+class Bank:
+    """A DAD 141.1 of which some registers read differently."""
+
+    def __init__(self, instrument: EmulatedDAD141) -> None:
+        self._instrument = instrument
+        self.alter: Callable[[int, list[int]], list[int]] = lambda _, words: words
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        return self.alter(address, self._instrument.read_registers(address, count))
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        self._instrument.write_registers(address, values)
+
+
+class Bench:
+    """An instrument on an emulated line, with the force in `force`."""
+
+    def __init__(self, **options) -> None:
+        self.force = 0.0
+        self.clock = VirtualClock()
+        self.world = World(Still(), self.clock)
+        self.instrument = EmulatedDAD141(
+            "load",
+            self.world,
+            lambda: self.force,
+            rng=np.random.default_rng(3),
+            **{"noise": 0.0, **options},
+        )
+        self.bank = Bank(self.instrument)
+        self.tap = Tap(ModbusRtuServer(self.bank))
+        self.port = protocol_emulated.register("load", self.tap, self.clock)
+        self.cells: list[FlintecDAD141] = []
+
+    def cell(self, **settings) -> FlintecDAD141:
+        made = FlintecDAD141.connect(
+            "load", Settings(port=self.port, **{"force_limits": WIDE, **settings}), self.clock
+        )
+        self.cells.append(made)
+        return made
+
+    def put(self, force: float) -> None:
+        self.force = force
+        self.clock.sleep(5.0)
+
+    def word(self, address: int) -> int:
+        return self.instrument.read_registers(address, 2)[1]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    for cell in bench.cells:
+        cell.close()
+    protocol_emulated.unregister("load")
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"port": ""},
+        {"address": 0},
+        {"address": 248},
+        {"baudrate": 1200},
+        {"baudrate": 230400},
+        {"parity": "M"},
+        {"timeout": 0.0},
+        {"timeout": math.nan},
+        {"pause": -1.0},
+        {"filter": -1},
+        {"filter": 8},
+        {"samples": 0},
+        {"interval": -0.1},
+        {"newtons_per_unit": 0.0},
+        {"newtons_per_unit": math.inf},
+        {"zero_newtons": math.nan},
+        {"force_limits": (1.0, 1.0)},
+        {"force_limits": (1.0, math.nan)},
+        {"stale_after": -1.0},
+        {"still_timeout": 1e9},
+        {"device_ids": ()},
+        {"colour": "red"},
+    ],
+)
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        Settings(**{"port": "/dev/ttyUSB0", "force_limits": WIDE} | wrong)
+
+
+def test_the_calibrated_range_has_to_be_given():
+    with pytest.raises(ValidationError, match="force_limits"):
+        Settings(port="/dev/ttyUSB0")
+
+
+def test_every_setting_is_described():
+    assert all(field.description for field in Settings.model_fields.values())
+
+
+# Bytes
+
+
+READ = bytes.fromhex("01 03 35 00 00 05 8A 05")
+
+
+def test_byte_vectors(bench):
+    cell = bench.cell()
+    bench.put(0.5)
+    bench.tap.sent.clear()
+    cell.tare()
+    assert bench.tap.sent == [READ, bytes.fromhex("01 06 20 61 00 08 D2 12"), READ]
+    bench.put(12.0)
+    bench.tap.sent.clear()
+    replies = []
+    bench.tap.alter = lambda reply: replies.append(reply) or reply
+    assert cell.glance() == {"load_force": 11.5}
+    assert bench.tap.sent == [READ]
+    assert replies == [bytes.fromhex("01 03 0A 41 40 00 00 41 38 00 00 00 30 E8 A4")]
+
+
+def test_connecting_sets_filter_and_tare_and_saves_nothing(bench):
+    bench.put(1.0)
+    bench.instrument.tare()
+    bench.instrument.write_registers(0x2110, [0, 1])
+    cell = bench.cell(filter=5)
+    assert (bench.word(0x2106), bench.word(0x2110)) == (5, 0)
+    assert not bench.instrument.read_registers(0x2060, 1)[0] & 0x20
+    assert not cell.tared
+    assert not any(frame[1:4] == bytes.fromhex("06 20 66") for frame in bench.tap.sent)
+
+
+def test_a_tare_may_be_kept(bench):
+    bench.put(4.0)
+    bench.instrument.tare()
+    cell = bench.cell(keep_tare=True)
+    assert cell.tared
+    bench.put(5.0)
+    assert cell.measure()["load_force"] == pytest.approx(1.0)
+    cell.clear_tare()
+    assert not bench.cell(keep_tare=True).tared
+
+
+def test_one_request_a_reading(bench):
+    cell = bench.cell(samples=7)
+    bench.tap.sent.clear()
+    cell.measure()
+    assert bench.tap.sent == [READ] * 7
+
+
+@pytest.mark.parametrize(
+    ("settings", "pause"),
+    [
+        ({}, 1.75e-3),
+        ({"baudrate": 38400}, 1.75e-3),
+        ({"baudrate": 19200}, 35 / 19200),
+        ({"baudrate": 9600, "parity": "E"}, 38.5 / 9600),
+        ({"pause": 0.0}, 0.0),
+        ({"pause": 0.02}, 0.02),
+    ],
+)
+def test_the_pause_between_frames(bench, settings, pause):
+    cell = bench.cell(**settings)
+    cell.glance()
+    begin = bench.clock.now()
+    cell.glance()
+    wire = 23 * 10 / settings.get("baudrate", 115200)
+    assert bench.clock.now() - begin == pytest.approx(pause + wire)
+
+
+@pytest.mark.parametrize(
+    ("settings", "interval"),
+    [({}, 0.125), ({"filter": 7}, 1.0), ({"filter": 0}, 0.5 / 17), ({"interval": 0.05}, 0.05)],
+)
+def test_the_interval_of_a_measurement(bench, settings, interval):
+    cell = bench.cell(samples=4, **settings)
+    begin = bench.clock.now()
+    cell.measure()
+    assert bench.clock.now() - begin == pytest.approx(3 * interval, abs=0.01)
+
+
+def test_no_interval_is_as_fast_as_the_line(bench):
+    cell = bench.cell(samples=4, interval=0.0)
+    begin = bench.clock.now()
+    cell.measure()
+    assert bench.clock.now() - begin < 0.02
+
+
+# Other lines
+
+
+@contextmanager
+def pseudo_terminal(server: WireServer) -> Iterator[str]:
+    """Serve an instrument at the path that this gives; afterwards it is gone."""
+    import tty
+
+    master, slave = os.openpty()
+    wake, waker = os.pipe()
+    tty.setraw(master)
+    tty.setraw(slave)
+
+    def serve() -> None:
+        while wake not in select.select([master, wake], [], [])[0]:
+            # In two pieces, as a line may deliver them.
+            reply = server.receive(os.read(master, 4096))
+            os.write(master, reply[:4])
+            os.write(master, reply[4:])
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.write(waker, b"x")
+        thread.join()
+        for end in (master, slave, wake, waker):
+            os.close(end)
+
+
+needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+
+
+@needs_pty
+def test_over_a_pseudo_terminal(bench):
+    bench.put(12.0)
+    with pseudo_terminal(bench.tap) as path:
+        settings = Settings(port=path, timeout=5.0, force_limits=WIDE, samples=3, interval=0.01)
+        cell = FlintecDAD141.connect("load", settings, WallClock())
+        assert cell.measure() == {"load_force": 12.0}
+        cell.tare()
+        assert cell.glance() == {"load_force": 0.0}
+        cell.close()
+
+
+@needs_pty
+def test_a_line_that_is_pulled_out(bench):
+    with pseudo_terminal(bench.tap) as path:
+        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=5.0, force_limits=WIDE), WallClock())
+    with pytest.raises(DeviceConnectionError, match=r"^load: lost the line .*check the cable"):
+        cell.glance()
+    with pytest.raises(DeviceConnectionError, match="closed"):
+        cell.glance()
+
+
+def test_over_tcp(bench):
+    bench.put(-3.5)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        clients = []
+
+        def serve() -> None:
+            client, _ = listener.accept()
+            with client:
+                while data := client.recv(4096):
+                    reply = bench.tap.server.receive(data)
+                    clients.append(reply)
+                    client.sendall(reply[:3])
+                    client.sendall(reply[3:])
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        url = f"socket://127.0.0.1:{listener.getsockname()[1]}"
+        cell = FlintecDAD141.connect("load", Settings(port=url, timeout=5.0, force_limits=WIDE), WallClock())
+        assert cell.glance() == {"load_force": -3.5}
+        cell.close()
+        thread.join()
+    assert len(clients) > 5
+
+
+# Wrong devices
+
+
+def bytes_swapped(words: list[int]) -> list[int]:
+    return [(word & 0xFF) << 8 | word >> 8 for word in words]
+
+
+def only(register: int, words: list[int]) -> Callable[[int, list[int]], list[int]]:
+    return lambda address, actual: words if address == register else actual
+
+
+@pytest.mark.parametrize(
+    ("alter", "message"),
+    [
+        (lambda _, words: words[::-1], "words of a value in swapped order"),
+        (lambda _, words: bytes_swapped(words), "bytes of a word in swapped order"),
+        (only(0x202C, [0, 7210]), "is no DAD 141.1: its identity is 7210, not 1410 or 5136; .*device_ids"),
+        (only(0x202E, [0x0A01, 0]), "0x0A010000 for its firmware"),
+        (only(0x202E, [0, 0]), "0x00000000 for its firmware"),
+        (only(0x2020, [12000, 0]), "same weight as 12 and, as an integer, 786432000"),
+        (only(0x2020, [0, 13000]), "same weight as 12 and, as an integer, 13000"),
+        (only(0x3500, [0, 0x4140, 0, 0x4140, 0x10]), "same weight as .*e-41 and, as an integer, 12000"),
+        (only(0x3500, [0x7FC0, 0, 0x7FC0, 0, 0x10]), "same weight as nan"),
+    ],
+)
+def test_a_wrong_device_is_refused(bench, alter, message):
+    bench.put(12.0)
+    bench.bank.alter = alter
+    with pytest.raises(DeviceConnectionError, match=rf"^load: the device at emulated://load, address 1, .*{message}"):
+        bench.cell()
+
+
+def test_a_device_without_these_registers_is_refused(bench):
+    def refuse(address: int, words: list[int]) -> list[int]:
+        raise RegisterError(2, "not here")
+
+    bench.bank.alter = refuse
+    with pytest.raises(DeviceConnectionError, match=r"is no DAD 141\.1: Modbus exception 2 \(illegal data address\)"):
+        bench.cell()
+
+
+@pytest.mark.parametrize("number", [1410, 0x1410, 1411])
+def test_identities_that_are_accepted(bench, number):
+    bench.bank.alter = only(0x202C, [0, number])
+    known = {} if number != 1411 else {"device_ids": (1411,)}
+    bench.cell(**known).glance()
+
+
+@pytest.mark.parametrize("decimals", range(6))
+@pytest.mark.parametrize("force", [-7.5, 0.0, 0.02, 8.25])
+def test_any_decimal_point_agrees(decimals, force):
+    bench = Bench(decimals=decimals, weight_limits=(-9.0, 9.0))
+    try:
+        bench.put(force)
+        cell = bench.cell()
+        assert cell.glance()["load_force"] == pytest.approx(force, abs=0.51 * 10**-decimals)
+    finally:
+        cell.close()
+        protocol_emulated.unregister("load")
+
+
+def test_a_load_that_moves_does_not_make_a_wrong_device(bench):
+    bench.put(10.0)
+    bench.instrument._force = lambda: 10.0 + 0.2 * math.sin(30 * bench.world.time)
+    bench.clock.sleep(1.0)
+    bench.cell()
+
+
+def test_connecting_to_an_overloaded_cell(bench):
+    bench.put(1e6)
+    cell = bench.cell()
+    with pytest.raises(DeviceError, match="over its range"):
+        cell.measure()
+
+
+def test_a_setting_that_is_not_taken_is_noticed(bench):
+    bench.bank.alter = only(0x2106, [0, 3])
+    with pytest.raises(DeviceError, match="filter reads back 3 after 6"):
+        bench.cell(filter=6)
+
+
+def test_another_address_is_silent(bench):
+    begin = bench.clock.now()
+    with pytest.raises(
+        DeviceConnectionError, match=r"no good reply within 0\.2 s at emulated://load, address 2, after 2"
+    ):
+        bench.cell(address=2)
+    assert bench.clock.now() - begin == pytest.approx(0.6, abs=0.01)  # two requests, and a pause for late replies
+
+
+# Bad lines
+
+
+def test_a_port_that_does_not_exist(caplog, capfd):
+    settings = Settings(port="/dev/does-not-exist", force_limits=WIDE)
+    with (
+        caplog.at_level(logging.DEBUG),
+        pytest.raises(DeviceConnectionError, match=r"^load: cannot open /dev/does-not-exist: "),
+    ):
+        FlintecDAD141.connect("load", settings, VirtualClock())
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_scheme_that_does_not_exist():
+    with pytest.raises(DeviceConnectionError, match="cannot open nowhere://load"):
+        FlintecDAD141.connect("load", Settings(port="nowhere://load", force_limits=WIDE), VirtualClock())
+
+
+def test_an_instrument_that_falls_silent(bench, caplog, capfd):
+    cell = bench.cell()
+    with caplog.at_level(logging.INFO):
+        bench.tap.alter = lambda _: b""
+        with pytest.raises(DeviceConnectionError, match=r"no good reply.*check power, cable"):
+            cell.measure()
+        bench.tap.alter = lambda reply: reply
+        # It may have been switched off and lost its filter: what it says now is not to be trusted.
+        for take in (cell.measure, cell.glance, cell.tare, cell.clear_tare):
+            with pytest.raises(DeviceConnectionError, match="closed; connect again"):
+                take()
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")
+    assert bench.cell().glance() == {"load_force": 0.0}
+
+
+def test_an_emulated_line_that_is_unplugged(bench):
+    cell = bench.cell()
+    protocol_emulated.unregister("load")
+    with pytest.raises(DeviceConnectionError, match=r"lost the line emulated://load \(.*unplugged\)"):
+        cell.glance()
+
+
+def test_closed_is_closed(bench):
+    cell = bench.cell()
+    cell.close()
+    cell.close()
+    cell.safe()
+    with pytest.raises(DeviceConnectionError, match="closed"):
+        cell.measure()
+
+
+class Once:
+    """Alters one reply, and lets the others pass."""
+
+    def __init__(self, alter: Callable[[bytes], bytes]) -> None:
+        self._alter = alter
+        self.done = False
+
+    def __call__(self, reply: bytes) -> bytes:
+        if self.done:
+            return reply
+        self.done = True
+        return self._alter(reply)
+
+
+OTHERS = sealed("05 03 0A 00 00 00 00 00 00 00 00 00 00")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda _: b"",
+        lambda reply: reply[:4],
+        lambda reply: reply[:-1],
+        lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]),
+        lambda reply: reply[:2] + b"\xff" + reply[3:],
+        lambda reply: b"\x99" * 5 + reply,
+        lambda reply: b"\x00" + reply,
+        lambda _: OTHERS,
+        lambda _: b"\xa5" * 40,
+    ],
+    ids=["none", "head", "cut", "crc", "length", "garbage", "byte", "other", "noise"],
+)
+def test_a_damaged_reply_is_asked_for_again(bench, damage):
+    cell = bench.cell()
+    bench.put(7.0)
+    bench.tap.alter = Once(damage)
+    assert cell.glance() == {"load_force": 7.0}
+    assert bench.tap.alter.done
+    bench.put(8.0)
+    assert cell.glance() == {"load_force": 8.0}
+
+
+@needs_pty
+def test_a_late_reply_is_not_taken_for_the_next(bench):
+    class Late:
+        slow = False
+
+        def receive(self, data: bytes) -> bytes:
+            reply = bench.tap.server.receive(data)
+            if self.slow:
+                self.slow = False
+                threading.Event().wait(0.3)
+                bench.put(9.0)
+            return reply
+
+    late = Late()
+    bench.put(1.0)
+    with pseudo_terminal(late) as path:
+        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=0.2, force_limits=WIDE), WallClock())
+        late.slow = True
+        assert cell.glance() == {"load_force": 9.0}
+        assert cell.glance() == {"load_force": 9.0}
+        cell.close()
+
+
+def test_stray_bytes_before_a_request_are_forgotten(bench):
+    cell = bench.cell()
+    bench.put(2.0)
+    stray = sealed("01 03 0A 00 00 00 00 00 00 00 00 00 10")
+    cell._line._client.socket._received += stray
+    assert cell.glance() == {"load_force": 2.0}
+
+
+def test_a_line_that_does_not_fall_silent(bench):
+    cell = bench.cell()
+    port = cell._line._client.socket
+    port.read = lambda size: b"\xa5" * size
+    with pytest.raises(DeviceConnectionError, match="does not fall silent"):
+        cell.glance()
+
+
+def test_too_few_registers_are_noticed(bench):
+    cell = bench.cell()
+    bench.tap.alter = lambda _: sealed("01 03 04 00 00 00 00")
+    with pytest.raises(DeviceError, match="2 registers by function 3 where 5"):
+        cell.glance()
+
+
+def test_a_failure_in_the_instrument_is_passed_on(bench):
+    cell = bench.cell()
+
+    def fail(address: int, words: list[int]) -> list[int]:
+        raise RegisterError(4, "no")
+
+    bench.bank.alter = fail
+    with pytest.raises(DeviceError, match=r"^load: Modbus exception 4 \(device failure\) on reading register 0x3500"):
+        cell.measure()
+    bench.bank.alter = lambda _, words: words
+    assert cell.measure() == {"load_force": 0.0}
+
+
+# Bad readings
+
+
+@pytest.mark.parametrize(("bits", "side"), [(0x0001, "under"), (0x0002, "over"), (0x0033, "over")])
+def test_range_bits(bench, bits, side):
+    cell = bench.cell()
+    bench.bank.alter = only(0x3500, [0x4140, 0, 0x4140, 0, bits])
+    for take in (cell.measure, cell.glance, cell.tare):
+        with pytest.raises(
+            DeviceError, match=rf"{side} its range \(qualifier 0x{bits:04X}, gross weight 12\); take load"
+        ):
+            take()
+
+
+@pytest.mark.parametrize("position", [0, 2])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_weight_that_is_no_number(bench, position, value):
+    cell = bench.cell()
+    words = [0, 0, 0, 0, 0x10]
+    words[position : position + 2] = struct.unpack(">2H", struct.pack(">f", value))
+    bench.bank.alter = only(0x3500, words)
+    for take in (cell.measure, cell.glance, cell.tare):
+        with pytest.raises(DeviceError, match="no number"):
+            take()
+
+
+def test_outside_of_the_calibration(bench):
+    cell = bench.cell(force_limits=(-5.0, 50.0))
+    bench.put(50.1)
+    with pytest.raises(DeviceError, match=r"force 50\.1 N is outside of its calibrated range -5 to 50 N"):
+        cell.measure()
+    bench.put(40.0)
+    cell.tare()
+    bench.put(45.0)
+    assert cell.measure()["load_force"] == pytest.approx(5.0)
+    bench.put(51.0)
+    with pytest.raises(DeviceError, match="force 51 N"):
+        cell.glance()
+
+
+def test_one_bad_reading_spoils_a_mean(bench):
+    cell = bench.cell()
+    readings = iter([0x10] * 3 + [0x12] + [0x10] * 5)
+    bench.bank.alter = lambda address, words: [*words[:4], next(readings)] if address == 0x3500 else words
+    with pytest.raises(DeviceError, match="over its range"):
+        cell.measure()
+
+
+def test_a_tare_that_is_lost_is_noticed(bench):
+    cell = bench.cell()
+    bench.put(5.0)
+    cell.tare()
+    bench.instrument.power_cycle()
+    for take in (cell.measure, cell.glance):
+        with pytest.raises(DeviceError, match="lost its tare; was it switched off"):
+            take()
+    cell.clear_tare()
+    assert cell.glance()["load_force"] == pytest.approx(5.0)
+
+
+def test_a_tare_of_somebody_else_is_noticed(bench):
+    cell = bench.cell()
+    bench.put(5.0)
+    bench.instrument.tare()
+    with pytest.raises(DeviceError, match="was tared by its keys"):
+        cell.measure()
+    cell.tare()
+    assert cell.glance()["load_force"] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("action", "message"), [("tare", "took no tare"), ("clear_tare", "keeps its tare")])
+def test_a_command_without_effect_is_noticed(bench, action, message):
+    cell = bench.cell()
+    bench.put(5.0)
+    if action == "clear_tare":
+        cell.tare()
+    bench.bank.write_registers = lambda *_: None
+    with pytest.raises(DeviceError, match=message):
+        getattr(cell, action)()
+
+
+def test_taring_does_not_wait_for_ever(bench):
+    cell = bench.cell(still_timeout=0.5)
+    bench.instrument._force = lambda: math.sin(10 * bench.world.time)
+    begin = bench.clock.now()
+    with pytest.raises(DeviceError, match=r"not still within 0\.5 s"):
+        cell.tare()
+    assert bench.clock.now() - begin == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_converter_that_stands_still(bench):
+    bench.instrument._noise = 2e-4
+    cell = bench.cell(stale_after=10.0, samples=1)
+    bench.instrument.frozen = True
+    begin = bench.clock.now()
+
+    def watch() -> None:
+        for _ in range(100):
+            bench.clock.sleep(1.0)
+            cell.glance()
+
+    stale = r"readings are stale: the converter has stood at -?\d+ for 1\d"
+    with pytest.raises(DeviceError, match=stale):
+        watch()
+    assert 20.0 <= bench.clock.now() - begin <= 23.0
+    with pytest.raises(DeviceError, match=stale):
+        cell.glance()
+    bench.instrument.frozen = False
+    bench.clock.sleep(1.0)
+    cell.glance()
+
+
+def test_a_quiet_load_is_not_stale(bench):
+    bench.instrument._noise = 2e-5  # far below a digit, though not below a step of the converter
+    cell = bench.cell(stale_after=1.0)
+    bench.put(5.0)
+    readings = []
+    for _ in range(200):
+        bench.clock.sleep(1.0)
+        readings.append(cell.glance()["load_force"])
+    assert set(readings) == {5.0}
+
+
+def test_watching_for_stale_readings_can_be_left_out(bench):
+    cell = bench.cell(stale_after=0.0)
+    bench.instrument.frozen = True
+    for _ in range(5):
+        bench.clock.sleep(1e5)
+        cell.glance()
+
+
+# Anything at all
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    reply=st.binary(max_size=40),
+    whole=st.booleans(),
+    head=st.sampled_from([b"", b"\x01", b"\x01\x03", b"\x01\x03\x0a"]),
+)
+def test_any_reply_is_a_reading_or_an_error(bench, reply, whole, head):
+    cell = bench.cell()
+    frame = head + reply
+    bench.tap.alter = lambda _: frame + crc16(frame) if whole else frame
+    try:
+        force = cell.glance()["load_force"]
+    except DeviceError:
+        force = 0.0
+    finally:
+        bench.tap.alter = lambda reply: reply
+        bench.cells.remove(cell)
+        cell.close()
+    assert math.isfinite(force)
+
+
+@pytest.mark.parametrize("function", [*range(32), 43, 0x80, 0x83, 0x84, 0x90, 0xAB, 0xFF])
+def test_a_reply_of_another_form_is_an_error(bench, function):
+    for length in (0, 1, 2, 3, 4, 5, 9, 10, 12):
+        cell = bench.cell()
+        frame = sealed(f"01 {function:02X} {length:02X}" + length * " 01")
+        bench.tap.alter = lambda _, frame=frame: frame
+        if (function, length) != (3, 10):
+            with pytest.raises(DeviceError):
+                cell.glance()
+        bench.tap.alter = lambda reply: reply
+        cell.close()

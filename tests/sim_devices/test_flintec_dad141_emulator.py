@@ -1,0 +1,636 @@
+"""The emulated DAD 141.1: its registers, its filter and motion detection, its wire, and independent clients."""
+
+import math
+import os
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.clock import VirtualClock, WallClock
+from sim_devices.instruments.flintec_dad141 import (
+    CUTOFF_HZ,
+    EmulatedDAD141,
+    reading_interval,
+    time_constant,
+)
+from sim_devices.wire.modbus import RegisterError
+from sim_devices.wire.modbus_rtu import LONGEST_FRAME, ModbusRtuServer, crc16
+from sim_devices.world import World
+
+
+class Load:
+    """A plant whose force the test sets, and which counts how often it is split."""
+
+    def __init__(self, force: float = 0.0) -> None:
+        self.force = force
+        self.time = 0.0
+        self.splits = 0
+
+    def advance(self, dt: float) -> None:
+        self.time += dt
+        self.splits += 1
+
+
+class Cell(EmulatedDAD141):
+    """An instrument with its plant at hand."""
+
+    def __init__(self, force: float = 0.0, *, noise: float = 0.0, seed: int = 5, clock=None, **options) -> None:
+        self.load = Load(force)
+        self.clock = clock or VirtualClock()
+        world = World(self.load, self.clock)
+        super().__init__(
+            "load", world, lambda: self.load.force, rng=np.random.default_rng(seed), noise=noise, **options
+        )
+
+    def floats(self, address: int, count: int = 1) -> list[float]:
+        words = self.read_registers(address, 2 * count)
+        return list(struct.unpack(f">{count}f", struct.pack(f">{2 * count}H", *words)))
+
+    def integer(self, address: int) -> int:
+        return struct.unpack(">i", struct.pack(">2H", *self.read_registers(address, 2)))[0]
+
+    def qualifier(self) -> int:
+        return self.read_registers(0x2060, 1)[0]
+
+    def rest(self, force: float) -> None:
+        self.load.force = force
+        self.clock.sleep(10.0)
+
+
+def refused(code: int, call) -> None:
+    with pytest.raises(RegisterError) as refusal:
+        call()
+    assert refusal.value.code == code
+
+
+# The register map
+
+
+def test_what_registers_read():
+    cell = Cell()
+    cell.rest(12.0)
+    cell.write_registers(0x2061, [0x08])
+    cell.rest(23.5)
+    assert cell.floats(0x2000, 2) == [23.5, 11.5]
+    assert (cell.integer(0x2020), cell.integer(0x2022)) == (23500, 11500)
+    assert cell.integer(0x202A) == round(23.5 / 72.0 * 2**23)
+    assert cell.integer(0x202C) == 1410
+    assert cell.read_registers(0x202E, 2) == [0, 0x0A01]
+    assert cell.integer(0x2030) == 5000  # still, tare
+    assert cell.integer(0x2034) == 1410237
+    assert cell.qualifier() == 0x0030
+    assert cell.integer(0x2106) == 3
+    assert cell.integer(0x2118) == 12000
+    assert [cell.integer(each) for each in (0x220C, 0x220E, 0x2214, 0x2216)] == [60000, -60000, 3, 1]
+    assert cell.read_registers(0x3500, 5) == [0x41BC, 0x0000, 0x4138, 0x0000, 0x0030]
+    assert cell.read_registers(0x3300, 5) == [0, 23500, 0, 11500, 0x0030]
+
+
+def test_a_read_may_begin_in_the_middle_of_a_value():
+    cell = Cell(23.5)
+    assert cell.read_registers(0x3501, 3) == cell.read_registers(0x3500, 5)[1:4]
+
+
+@pytest.mark.parametrize("address", [0x0000, 0x1FFF, 0x2004, 0x2032, 0x3505, 0xFFFF])
+def test_what_is_not_emulated_is_an_illegal_address(address):
+    cell = Cell()
+    refused(2, lambda: cell.read_registers(address, 1))
+    refused(2, lambda: cell.write_registers(address, [0]))
+
+
+def test_read_only_write_only_and_half_values():
+    cell = Cell()
+    refused(2, lambda: cell.write_registers(0x2000, [0, 0]))
+    refused(2, lambda: cell.read_registers(0x2061, 1))
+    refused(2, lambda: cell.read_registers(0x2066, 1))
+    refused(3, lambda: cell.write_registers(0x2106, [0]))
+    refused(3, lambda: cell.write_registers(0x2107, [0]))
+
+
+@pytest.mark.parametrize(
+    ("address", "values"),
+    [(0x2106, [0, 8]), (0x2106, [0xFFFF, 0xFFFF]), (0x2110, [0, 2]), (0x2112, [0, 0]), (0x2114, [1, 0])]
+    + [(0x2061, [each]) for each in (0x00, 0x40, 0x100)]
+    + [(0x2066, [each]) for each in (0x00, 0x8000)],
+)
+def test_values_that_are_not_allowed(address, values):
+    refused(3, lambda: Cell().write_registers(address, values))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"newtons_per_unit": 0.0},
+        {"newtons_per_unit": math.nan},
+        {"decimals": 6},
+        {"step": 3},
+        {"weight_limits": (-1000.0, 1000.0)},
+        {"weight_limits": (1.0, 2.0)},
+        {"noise": -1.0},
+        {"noise": math.nan},
+        {"samples": 0},
+    ],
+)
+def test_wrong_parameters_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Cell(**wrong)
+
+
+@pytest.mark.parametrize(("decimals", "step", "shown"), [(3, 1, 12.346), (3, 5, 12.345), (1, 2, 12.4), (0, 10, 10.0)])
+def test_resolution(decimals, step, shown):
+    cell = Cell(12.3456, decimals=decimals, step=step)
+    assert cell.floats(0x2000) == [pytest.approx(shown, rel=1e-7)]
+    assert cell.integer(0x2020) == round(shown * 10**decimals)
+
+
+@pytest.mark.parametrize(
+    ("newtons", "bits"), [(60.0, 0), (60.001, 2), (1e9, 2), (math.inf, 2), (-60.0, 0), (-60.001, 1), (-1e9, 1)]
+)
+def test_range_bits(newtons, bits):
+    cell = Cell(newtons)
+    assert cell.qualifier() == bits
+    assert abs(cell.floats(0x2000)[0]) <= 72.0
+    assert abs(cell.integer(0x202A)) <= 2**23
+
+
+# Commands
+
+
+def test_tare_and_reset_tare():
+    cell = Cell()
+    cell.rest(5.0)
+    cell.write_registers(0x2061, [0x08])
+    assert cell.floats(0x2000, 2) == [5.0, 0.0]
+    assert cell.qualifier() == 0x0030
+    cell.write_registers(0x2061, [0x04])
+    assert cell.floats(0x2000, 2) == [5.0, 5.0]
+    assert cell.qualifier() == 0x0010
+
+
+def test_set_and_reset_zero():
+    cell = Cell()
+    cell.rest(1.0)
+    cell.write_registers(0x2061, [0x02])
+    assert cell.floats(0x2000, 2) == [0.0, 0.0]
+    assert cell.integer(0x2030) == 3000
+    cell.write_registers(0x2061, [0x01])
+    assert cell.floats(0x2000) == [1.0]
+    cell.rest(1.3)  # more than 2 % of 60
+    refused(4, lambda: cell.write_registers(0x2061, [0x02]))
+
+
+def test_peak_and_hold():
+    cell = Cell()
+    for force in (3.0, 7.0, 5.0):
+        cell.rest(force)
+        cell.qualifier()
+    assert cell.floats(0x2080) == [7.0]
+    cell.write_registers(0x2061, [0x30])
+    cell.rest(2.0)
+    assert (cell.floats(0x2080), cell.floats(0x2084)) == ([5.0], [5.0])
+    assert (cell.integer(0x2082), cell.integer(0x2086)) == (5000, 5000)
+
+
+@pytest.mark.parametrize("command", [0x02, 0x08])
+def test_no_tare_and_no_zero_while_moving(command):
+    cell = Cell()
+    refused(4, lambda: cell.write_registers(0x2061, [command]))  # just switched on
+    cell.clock.sleep(1.01)
+    cell.write_registers(0x2061, [command])
+
+
+def test_a_power_cycle_forgets_what_was_not_saved():
+    cell = Cell()
+    cell.rest(5.0)
+    cell.write_registers(0x2106, [0, 5])
+    cell.rest(5.0)
+    cell.write_registers(0x2061, [0x08])
+    cell.power_cycle()
+    assert cell.integer(0x2106) == 3
+    assert cell.floats(0x2000, 2) == [5.0, 5.0]
+    assert cell.qualifier() == 0
+    cell.write_registers(0x2106, [0, 6])
+    cell.write_registers(0x2066, [0x04])
+    cell.power_cycle()
+    assert cell.integer(0x2106) == 6
+
+
+def test_a_frozen_converter_stands_still():
+    cell = Cell(5.0, noise=1e-3)
+    cell.clock.sleep(1.0)
+    before = cell.read_registers(0x2000, 4), cell.integer(0x202A)
+    cell.frozen = True
+    cell.rest(9.0)
+    assert (cell.read_registers(0x2000, 4), cell.integer(0x202A)) == before
+    cell.frozen = False
+    cell.clock.sleep(10.0)
+    assert cell.floats(0x2000)[0] == pytest.approx(9.0, abs=5e-3)
+
+
+# The filter
+
+SETTLING_MS = {1: 55, 2: 122, 3: 242, 4: 322, 5: 482, 6: 963, 7: 1923}
+"""To 0.1 %, by setting (Technical Manual, 10.4.2, IIR filter)."""
+
+
+def filtered(setting: int, **options) -> Cell:
+    cell = Cell(decimals=5, weight_limits=(-9.0, 9.0), **options)
+    cell.write_registers(0x2106, [0, setting])
+    return cell
+
+
+@pytest.mark.parametrize("setting", SETTLING_MS)
+@pytest.mark.parametrize("watch", [0.001, 0.004, 0.02])
+def test_settles_in_the_time_of_the_manual(setting, watch):
+    cell = filtered(setting)
+    cell.clock.sleep(1.0)
+    cell.qualifier()
+    cell.load.force = 1.0
+    start = cell.clock.now()
+    while abs(cell.floats(0x2000)[0] - 1.0) > 1e-3:
+        cell.clock.sleep(watch)
+    assert 1000 * (cell.clock.now() - start) == pytest.approx(SETTLING_MS[setting], rel=0.06, abs=1000 * watch)
+
+
+@pytest.mark.parametrize("setting", range(8))
+def test_cut_off(setting):
+    """The response to a sine wave at the cut-off, by the plant's own clock."""
+    cell = filtered(setting)
+    omega = 2 * math.pi * CUTOFF_HZ[setting]
+    cell._force = lambda: 5.0 * math.sin(omega * cell.world.time)
+    peak = 0.0
+    for step in range(400):
+        cell.clock.sleep_until((step + 1) / 40 / CUTOFF_HZ[setting])
+        if step >= 200:
+            peak = max(peak, abs(cell.floats(0x2000)[0]))
+    assert peak == pytest.approx(5.0 / math.sqrt(2), rel=0.015)
+
+
+def test_how_often_it_is_asked_does_not_matter():
+    def response(instants) -> float:
+        cell = filtered(4)
+        cell._force = lambda: math.sin(3 * cell.world.time)
+        for instant in instants:
+            cell.clock.sleep_until(instant)
+            cell.qualifier()
+        return cell.floats(0x2000)[0]
+
+    often = response(np.linspace(0, 5, 5001)[1:])
+    assert response([5.0]) == pytest.approx(often, abs=5e-4)
+    assert response([4.99, 5.0]) == pytest.approx(often, abs=5e-4)
+    assert response([0.3, 1.7, 5.0]) == pytest.approx(often, abs=5e-4)
+
+
+@pytest.mark.parametrize("setting", range(8))
+def test_a_long_silence_costs_no_more_than_a_short_one(setting):
+    cell = filtered(setting)
+    cell.load.splits = 0
+    cell.clock.sleep(1e6)
+    cell.qualifier()
+    assert cell.load.splits < 80
+
+
+def test_on_the_clock_of_the_room_it_costs_no_more():
+    cell = Cell(clock=WallClock())
+    for _ in range(20):
+        cell.clock.sleep(0.01)
+        cell.qualifier()
+    assert cell.load.splits < 100
+
+
+@pytest.mark.parametrize("setting", [0, 3, 7])
+def test_noise_is_that_of_the_setting(setting):
+    cell = filtered(setting, noise=0.01, seed=11)
+    readings = []
+    for _ in range(2000):
+        cell.clock.sleep(4 * reading_interval(setting))
+        readings.append(cell.floats(0x2000)[0])
+    assert np.std(readings) == pytest.approx(0.01 * math.sqrt(CUTOFF_HZ[setting] / 17), rel=0.07)
+    assert abs(np.mean(readings)) < 4 * np.std(readings) / math.sqrt(2000)
+
+
+@pytest.mark.parametrize("lags", [0.1, 0.5, 2.0])
+def test_noise_is_correlated_as_two_lags_make_it(lags):
+    cell = filtered(3, noise=0.01, seed=12)
+    readings = []
+    for _ in range(20_000):
+        cell.clock.sleep(lags * time_constant(3))
+        readings.append(cell.floats(0x2000)[0])
+    x = np.asarray(readings)
+    assert np.std(x) == pytest.approx(0.01 * math.sqrt(4 / 17), rel=0.1)
+    assert np.corrcoef(x[1:], x[:-1])[0, 1] == pytest.approx((1 + lags) * math.exp(-lags), abs=0.03)
+
+
+def test_the_same_instant_gives_the_same_reading():
+    cell = Cell(3.0, noise=0.1)
+    cell.clock.sleep(1.0)
+    assert len({tuple(cell.read_registers(0x3500, 5)) for _ in range(10)}) == 1
+
+
+# Motion detection
+
+
+def test_still_after_the_no_motion_time():
+    cell = Cell()
+    cell.rest(5.0)
+    assert cell.qualifier() == 0x0010
+    cell.load.force = 5.0025
+    cell.clock.sleep(0.3)
+    assert cell.qualifier() == 0x0000
+    cell.clock.sleep(0.5)
+    assert cell.qualifier() == 0x0000
+    cell.clock.sleep(0.4)
+    assert cell.qualifier() == 0x0010
+
+
+def test_a_movement_that_nobody_watched_is_noticed():
+    cell = Cell()
+    cell.rest(5.0)
+    cell.qualifier()
+    cell._force = lambda: 5.0 + 0.01 * math.sin(20 * cell.world.time)
+    cell.clock.sleep(100.0)
+    assert cell.qualifier() == 0x0000
+
+
+def test_a_wider_range_and_a_shorter_time():
+    cell = Cell()
+    cell._force = lambda: 0.004 * math.sin(20 * cell.world.time)
+    cell.clock.sleep(5.0)
+    assert cell.qualifier() == 0x0000
+    cell.write_registers(0x2112, [0, 10])
+    cell.write_registers(0x2114, [0, 200])
+    assert cell.qualifier() == 0x0000
+    cell.clock.sleep(0.25)
+    assert cell.qualifier() == 0x0010
+
+
+# The wire
+
+READ = bytes.fromhex("01 03 35 00 00 05 8A 05")
+READ_REPLY = bytes.fromhex("01 03 0A 41 40 00 00 41 38 00 00 00 30 E8 A4")
+TARE = bytes.fromhex("01 06 20 61 00 08 D2 12")
+
+
+def sealed(text: str) -> bytes:
+    frame = bytes.fromhex(text)
+    return frame + crc16(frame)
+
+
+def vector_cell() -> Cell:
+    """12.0 gross, 11.5 net, still, tare set."""
+    cell = Cell()
+    cell.rest(0.5)
+    cell.write_registers(0x2061, [0x08])
+    cell.rest(12.0)
+    return cell
+
+
+def test_byte_vectors():
+    assert ModbusRtuServer(vector_cell()).receive(READ) == READ_REPLY
+    cell = Cell()
+    cell.rest(4.0)
+    server = ModbusRtuServer(cell)
+    assert server.receive(TARE) == TARE
+    assert cell.floats(0x2000, 2) == [4.0, 0.0]
+
+
+EXCHANGES = [
+    (READ, READ_REPLY),
+    (sealed("01 04 35 00 00 05"), sealed("01 04 0A 41 40 00 00 41 38 00 00 00 30")),
+    (sealed("01 06 20 61 00 04"), sealed("01 06 20 61 00 04")),  # reset tare
+    (sealed("01 03 20 60 00 01"), sealed("01 03 02 00 10")),
+    (sealed("01 10 21 06 00 02 04 00 00 00 05"), sealed("01 10 21 06 00 02")),  # filter 5
+    (sealed("01 03 21 06 00 02"), sealed("01 03 04 00 00 00 05")),
+    (sealed("01 06 20 61 00 08"), sealed("01 86 04")),  # not still, as the filter has just begun anew
+    (sealed("01 03 20 04 00 01"), sealed("01 83 02")),
+    (sealed("01 03 20 00 00 7E"), sealed("01 83 03")),
+    (sealed("01 10 21 06 00 02 04 00 00 00 09"), sealed("01 90 03")),
+    (sealed("01 10 21 06 00 02 02 00 00"), sealed("01 90 03")),
+    (sealed("01 01 00 00 00 01"), sealed("01 81 01")),
+    (sealed("01 2B 0E 01 00"), sealed("01 AB 01")),
+    (sealed("01 11"), sealed("01 91 01")),
+    (sealed("02 03 35 00 00 05"), b""),  # another device's
+    (sealed("02 10 21 06 00 02 04 00 00 00 01"), b""),
+    (sealed("00 03 35 00 00 05"), b""),  # nobody answers a broadcast
+    (sealed("00 10 21 06 00 02 04 00 00 00 02"), b""),
+    (sealed("01 03 21 06 00 02"), sealed("01 03 04 00 00 00 02")),  # but it was carried out
+]
+
+
+def test_exchanges():
+    server = ModbusRtuServer(vector_cell())
+    for sent, reply in EXCHANGES:
+        assert server.receive(sent).hex(" ") == reply.hex(" "), sent.hex(" ")
+
+
+@pytest.mark.parametrize("address", [1, 17, 247])
+def test_answers_to_its_address_only(address):
+    server = ModbusRtuServer(Cell(), address)
+    assert server.address == address
+    for other in range(256):
+        frame = bytes([other]) + bytes.fromhex("03 20 60 00 01")
+        reply = server.receive(frame + crc16(frame))
+        assert bool(reply) is (other == address)
+        assert not reply or reply[0] == address
+
+
+@pytest.mark.parametrize("address", [0, 248, -1])
+def test_no_other_addresses(address):
+    with pytest.raises(ValueError, match="1 to 247"):
+        ModbusRtuServer(Cell(), address)
+
+
+@given(cuts=st.lists(st.integers(0, 250), max_size=25))
+def test_requests_may_come_in_any_pieces(cuts):
+    server = ModbusRtuServer(vector_cell())
+    data = b"".join(sent for sent, _ in EXCHANGES)
+    edges = sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})
+    replies = b"".join(server.receive(data[a:b]) for a, b in pairwise(edges))
+    assert replies == b"".join(reply for _, reply in EXCHANGES)
+
+
+def test_byte_by_byte():
+    server = ModbusRtuServer(vector_cell())
+    assert [server.receive(bytes([byte])) for byte in READ] == [b""] * 7 + [READ_REPLY]
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"\x00",
+        b"\xff" * 1000,
+        READ[:-1],  # a request without its end
+        READ[:3],
+        READ[:-2] + b"\x00\x00",  # with a wrong CRC
+        READ_REPLY[:-1] + b"\x00",
+        sealed("05 03 0A 41 40 00 00 41 38 00 00 00 30"),  # another device's reply
+        bytes.fromhex("01 10 21 06 00 7B F6"),  # announces 246 bytes
+        bytes.fromhex("01 10 21 06 00 7B FF"),
+        bytes.fromhex("01 17 21 06 00 01 21 06 00 01 F0"),
+        b"\x01",
+        b"\x01\x03",
+        b"\x01\x99" * 300,
+    ],
+    ids=lambda garbage: f"{garbage[:8].hex()}_{len(garbage)}",
+)
+def test_the_request_behind_garbage_is_answered(garbage):
+    server = ModbusRtuServer(vector_cell())
+    assert server.receive(garbage) == b""
+    assert server.receive(READ) == READ_REPLY
+    assert server.receive(READ) == READ_REPLY
+    assert server.receive(garbage + READ + READ) == 2 * READ_REPLY
+
+
+@given(garbage=st.binary(max_size=600), pieces=st.lists(st.integers(1, 50), max_size=20))
+def test_any_garbage_is_passed_over(garbage, pieces):
+    server = ModbusRtuServer(vector_cell())
+    position = 0
+    for piece in pieces:
+        server.receive(garbage[position : position + piece])
+        position += piece
+    server.receive(garbage[position:])
+    assert server.receive(READ)[-15:-12] == READ_REPLY[:3]
+    assert len(server._received) < LONGEST_FRAME
+
+
+@given(st.lists(st.binary(max_size=300), max_size=10))
+def test_the_buffer_is_bounded(pieces):
+    server = ModbusRtuServer(Cell())
+    for piece in pieces:
+        server.receive(piece)
+        assert len(server._received) < LONGEST_FRAME
+
+
+@given(body=st.binary(min_size=1, max_size=252))
+def test_whatever_is_sealed_gets_one_reply_at_most(body):
+    frame = b"\x01" + body
+    reply = ModbusRtuServer(Cell()).receive(frame + crc16(frame))
+    if reply:
+        assert reply[0] == 1
+        assert crc16(reply[:-2]) == reply[-2:]
+        assert reply[1] & 0x7F == body[0]
+
+
+@given(st.binary(max_size=20), st.integers(0, 159))
+def test_a_crc_notices_every_flipped_bit(data, bit):
+    frame = bytearray(data + crc16(data))
+    bit %= 8 * len(frame)
+    frame[bit // 8] ^= 1 << bit % 8
+    assert crc16(frame[:-2]) != frame[-2:]
+
+
+def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
+    cell = Cell()
+
+    def broken() -> float:
+        raise ZeroDivisionError
+
+    cell._force = broken
+    cell.clock.sleep(1.0)
+    assert ModbusRtuServer(cell).receive(READ) == sealed("01 83 04")
+    assert "the emulated instrument failed" in caplog.text
+
+
+# Independent clients, over a pseudo-terminal
+
+
+@contextmanager
+def pseudo_terminal(server: ModbusRtuServer) -> Iterator[str]:
+    """Serve an instrument at the path that this gives."""
+    import tty
+
+    master, slave = os.openpty()
+    wake, waker = os.pipe()
+    # Raw at both ends before anybody opens it; and this slave stays open, as otherwise a client that closes its
+    # own makes reads from the master fail.
+    tty.setraw(master)
+    tty.setraw(slave)
+
+    def serve() -> None:
+        while wake not in select.select([master, wake], [], [])[0]:
+            os.write(master, server.receive(os.read(master, 4096)))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.write(waker, b"x")
+        thread.join()
+        for end in (master, slave, wake, waker):
+            os.close(end)
+
+
+needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")
+
+
+@needs_pty
+def test_minimalmodbus():
+    minimalmodbus = pytest.importorskip("minimalmodbus", reason="needs the package minimalmodbus")
+    cell = vector_cell()
+    with pseudo_terminal(ModbusRtuServer(cell, 42)) as path:
+        client = minimalmodbus.Instrument(path, 42)
+        try:
+            client.serial.baudrate = 115200
+            client.serial.timeout = 0.3  # waited out at each exception, as its reply is shorter
+            assert client.read_registers(0x3500, 5) == [0x4140, 0, 0x4138, 0, 0x0030]
+            assert client.read_float(0x2000, functioncode=4) == 12.0
+            assert client.read_float(0x2002) == 11.5
+            assert client.read_long(0x2020, signed=True) == 12000
+            assert client.read_register(0x2060) == 0x0030
+            client.write_register(0x2061, 0x08, functioncode=6)
+            assert client.read_float(0x2002) == 0.0
+            client.write_long(0x2106, 5)
+            assert cell.integer(0x2106) == 5
+            with pytest.raises(minimalmodbus.IllegalRequestError):
+                client.read_register(0x2004)
+            with pytest.raises(minimalmodbus.SlaveReportedException):
+                client.write_register(0x2061, 0x08, functioncode=6)  # not still
+        finally:
+            client.serial.close()
+
+
+def mbpoll(path: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = ["mbpoll", "-m", "rtu", "-b", "115200", "-P", "none", "-a", "7", "-0", "-1", "-q", "-o", "5"]
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30, check=False)
+
+
+def values(result: subprocess.CompletedProcess[str]) -> list[str]:
+    assert result.returncode == 0, result.stderr
+    return [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")]
+
+
+@needs_pty
+@needs_mbpoll
+def test_mbpoll():
+    cell = vector_cell()
+    with pseudo_terminal(ModbusRtuServer(cell, 7)) as path:
+        both = mbpoll(path, "-t", "4:float", "-B", "-r", str(0x2000), "-c", "2", path)
+        assert [float(each) for each in values(both)] == [12.0, 11.5]
+        assert values(mbpoll(path, "-t", "3:hex", "-r", str(0x3500), "-c", "5", path)) == [
+            "0x4140",
+            "0x0000",
+            "0x4138",
+            "0x0000",
+            "0x0030",
+        ]
+        assert values(mbpoll(path, "-t", "4:int", "-B", "-r", str(0x2020), path)) == ["12000"]
+        assert mbpoll(path, "-t", "4", "-r", str(0x2061), path, "8").returncode == 0
+        assert cell.floats(0x2002) == [0.0]
+        assert mbpoll(path, "-t", "4:int", "-B", "-r", str(0x2106), path, "6").returncode == 0
+        assert cell.integer(0x2106) == 6
+        refusal = mbpoll(path, "-t", "4", "-r", str(0x2004), path)
+        assert refusal.returncode != 0
+        assert "illegal data address" in refusal.stderr.lower()
