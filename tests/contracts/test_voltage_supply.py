@@ -1,0 +1,501 @@
+"""What the role of a voltage supply promises, of the emulated device itself and of the driver over the wire."""
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from bench.clock import VirtualClock
+from bench.devices import VoltageSupply, role_of
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from drivers.roboteq import RoboteqSupply
+from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
+from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire.canopen_slcan import CanopenSlcanServer
+from sim_devices.world import World
+
+WATCHDOG = 1.0
+RESISTANCE = 5.0
+
+
+class Resistor:
+    """A load that notes when which voltage was applied to it."""
+
+    def __init__(self):
+        self.world = None
+        self.voltage = 0.0
+        self.applied = []
+
+    def apply(self, voltage):
+        self.voltage = voltage
+        self.applied.append((self.world.time, voltage))
+
+    @property
+    def current(self):
+        return self.voltage / RESISTANCE
+
+    def advance(self, dt):
+        pass
+
+
+class RecordingServer:
+    def __init__(self, server, requests):
+        self.server = server
+        self.requests = requests
+        self.lose_next = b""
+
+    def receive(self, data):
+        self.requests.append(data)
+        if self.lose_next and data.startswith(self.lose_next):
+            self.lose_next = b""
+            return b"z\r"
+        return self.server.receive(data)
+
+
+@dataclass
+class Bench:
+    """One device under test and what is behind it."""
+
+    clock: VirtualClock
+    device: VoltageSupply
+    instrument: EmulatedRoboteq
+    load: Resistor
+    connect: Callable[[], VoltageSupply] | None = None
+    recover: Callable[[], VoltageSupply] | None = None
+    requests: list = field(default_factory=list)
+    server: RecordingServer | None = None
+
+    def tick(self, seconds, step=0.5):
+        for _ in range(round(seconds / step)):
+            self.clock.sleep(step)
+            self.device.glance()
+
+
+names = (f"contract-supply-{number}" for number in itertools.count())
+
+
+@pytest.fixture(params=["emulated", "driver"])
+def implementation(request):
+    return request.param
+
+
+@pytest.fixture(params=["average", "rms"])
+def output(request):
+    return request.param
+
+
+@pytest.fixture
+def bench(implementation, output):
+    clock, load = VirtualClock(), Resistor()
+    world = load.world = World(load, clock)
+    instrument = EmulatedRoboteq("supply", world, load, output=output, voltage_limits=(0.0, 12.0), watchdog=WATCHDOG)
+    if implementation == "emulated":
+        yield Bench(clock, instrument, instrument, load)
+        return
+    requests = []
+    name = next(names)
+    server = RecordingServer(CanopenSlcanServer(instrument), requests)
+    settings = RoboteqSupply.Settings(
+        port=register(name, server, clock),
+        output=output,
+        voltage_limits=(0.0, 12.0),
+        watchdog=WATCHDOG,
+    )
+
+    def connect():
+        return RoboteqSupply.connect("supply", settings, clock)
+
+    def recover():
+        return RoboteqSupply.recover("supply", settings, clock)
+
+    device = connect()
+    yield Bench(clock, device, instrument, load, connect, recover, requests, server)
+    device.close()
+    unregister(name)
+
+
+over_the_wire = pytest.mark.parametrize("implementation", ["driver"], indirect=True)
+
+
+def resolution(volts, output):
+    """Return half a step of the command, and half a digit of the battery voltage, at a voltage."""
+    slope = 24e-3 if output == "average" else 24e-3 * 24.0 / (2.0 * volts)
+    return 0.5 * slope + 0.003 * volts
+
+
+def test_role_and_identity(bench, output):
+    assert role_of(type(bench.device)) == "voltage supply"
+    assert str(bench.device.identity) == "Roboteq SDC2160, serial number unknown, firmware v2.0 11/20/2019"
+    assert bench.device.name == "supply"
+    assert bench.device.parent is None
+    assert bench.device.output == output
+    assert output in bench.device.signals[0].description
+    assert output in bench.device.setpoint_signal.description
+
+
+def test_nothing_is_driven_before_the_first_set_point(bench):
+    bench.tick(3.0)
+    assert math.isnan(bench.device.setpoint)
+    assert bench.load.applied == []
+    assert bench.device.measure() == {"supply_voltage": 0.0, "supply_current": 0.0}
+
+
+def test_signals_readings_and_units_agree(bench):
+    device = bench.device
+    assert [(signal.name, signal.unit) for signal in device.signals] == [
+        ("supply_voltage", "V"),
+        ("supply_current", "A"),
+    ]
+    names = [signal.name for signal in device.signals]
+    assert list(device.measure()) == list(device.glance()) == names
+    readings, keys = device.read(), device.describe()
+    assert list(readings) == list(keys) == names
+    for signal in device.signals:
+        assert keys[signal.name]["units"] == signal.unit
+        assert keys[signal.name]["source"] == f"SDC2160:unknown:{signal.name}"
+        assert readings[signal.name]["timestamp"] == pytest.approx(bench.clock.timestamp(), abs=0.1)
+    assert (device.setpoint_signal.name, device.setpoint_signal.unit) == ("supply_setpoint", "V")
+    assert device.limits.unit == "V"
+
+
+@pytest.mark.parametrize("volts", [1.0, 3.7, 6.0, 11.99, 12.0])
+def test_voltage_is_applied_and_measured(bench, output, volts):
+    status = bench.device.set(volts)
+    status.wait()
+    assert status.success
+    assert bench.device.setpoint == volts
+    assert bench.load.voltage == pytest.approx(volts, abs=resolution(volts, output))
+    values = bench.device.measure()
+    assert values["supply_voltage"] == pytest.approx(bench.load.voltage, abs=1e-9)
+    assert values["supply_current"] == pytest.approx(bench.load.current, abs=0.0501)
+    assert values["supply_current"] == round(values["supply_current"], 1)
+
+
+def test_held_for_long_by_looking_at_it(bench, output):
+    bench.device.set(6.0)
+    applied = len(bench.load.applied)
+    bench.tick(600.0)
+    assert bench.load.applied[applied:] == []
+    assert bench.device.measure()["supply_voltage"] == pytest.approx(6.0, abs=resolution(6.0, output))
+
+
+@pytest.mark.parametrize("battery", [15.0, 30.0])
+def test_voltage_follows_a_supply_that_changes(bench, output, battery):
+    bench.device.set(6.0)
+    before = bench.load.voltage
+    bench.instrument.battery_voltage = battery
+    assert bench.load.voltage == pytest.approx(before * battery / 24.0, abs=1e-9)
+    bench.device.glance()
+    assert bench.load.voltage == pytest.approx(6.0, abs=0.05)
+    assert bench.device.glance()["supply_voltage"] == pytest.approx(bench.load.voltage, abs=1e-9)
+    assert bench.device.setpoint == 6.0
+
+
+def test_last_digit_of_the_supply_is_not_followed(bench):
+    bench.device.set(6.0)
+    power = bench.instrument.power
+    for battery in (24.1, 23.9, 24.1, 24.0):
+        bench.instrument.battery_voltage = battery
+        bench.device.glance()
+        assert bench.instrument.power == power
+
+
+def test_supply_that_is_too_low(bench):
+    bench.instrument.battery_voltage = 10.0
+    with pytest.raises(DeviceError, match=r"supply: the .*supply of 10\.0 V is too low for 12 V"):
+        bench.device.set(12.0)
+    assert bench.load.applied == []
+    bench.device.set(10.0).wait()
+    assert bench.instrument.power == 1000
+
+
+@pytest.mark.parametrize("value", [-0.01, 12.01, math.nan, math.inf, -math.inf])
+def test_beyond_the_limits_nothing_is_sent(bench, value):
+    applied, requests = len(bench.load.applied), len(bench.requests)
+    with pytest.raises(LimitError, match=r"supply: set-point .* is outside of 0 to 12 V"):
+        bench.device.set(value)
+    with pytest.raises(LimitError):
+        bench.device.check(value)
+    assert (len(bench.load.applied), len(bench.requests)) == (applied, requests)
+    assert math.isnan(bench.device.setpoint)
+
+
+def test_limits_themselves_are_allowed(bench):
+    for value in (bench.device.limits.low, bench.device.limits.high):
+        bench.device.check(value)
+        bench.device.set(value).wait()
+
+
+def test_stop_keeps_the_voltage(bench):
+    bench.device.set(6.0)
+    voltage = bench.load.voltage
+    bench.device.stop()
+    bench.device.stop(success=False)
+    assert bench.load.voltage == voltage
+
+
+def test_safe_goes_to_zero_and_again_changes_nothing(bench):
+    bench.device.set(6.0)
+    bench.device.safe()
+    assert bench.load.voltage == 0.0
+    assert bench.device.setpoint == 0.0
+    applied = len(bench.load.applied)
+    bench.device.safe()
+    bench.tick(3.0)
+    assert len(bench.load.applied) == applied
+    assert bench.device.measure() == {"supply_voltage": 0.0, "supply_current": 0.0}
+    bench.device.set(5.0).wait()
+    assert bench.load.voltage > 4.9
+
+
+def test_safe_before_anything_was_set(bench):
+    bench.device.safe()
+    assert bench.load.applied == []
+
+
+@pytest.mark.parametrize("fault", [*Fault, ChannelFlag.AMPS_LIMIT])
+def test_safe_from_a_fault(bench, fault):
+    bench.device.set(6.0)
+    bench.instrument.trip(fault)
+    bench.device.safe()
+    bench.device.safe()
+    assert bench.load.voltage == 0.0
+
+
+def test_safe_after_the_watchdog_has_expired(bench):
+    bench.device.set(6.0)
+    bench.clock.sleep(10.0)
+    applied = len(bench.load.applied)
+    bench.device.safe()
+    assert [volts for _, volts in bench.load.applied[applied:]] in ([], [0.0])
+    assert bench.load.voltage == 0.0
+
+
+def test_safe_of_a_device_that_does_not_answer_raises(bench):
+    bench.device.set(6.0)
+    bench.instrument.unplug()
+    with pytest.raises(DeviceError, match="supply: "):
+        bench.device.safe()
+
+
+@pytest.mark.parametrize("fault", [*Fault, *ChannelFlag])
+def test_every_call_tells_of_a_fault(bench, fault):
+    text = fault.name.replace("_", ".")
+    bench.device.set(6.0)
+    bench.instrument.trip(fault)
+    for call in (bench.device.measure, bench.device.glance, bench.device.read, lambda: bench.device.set(5.0)):
+        with pytest.raises(DeviceError, match=f"(?i)supply: .*{text}"):
+            call()
+    if isinstance(fault, Fault):
+        assert bench.load.voltage == 0.0
+
+
+def test_protections_of_the_device_come_through(bench):
+    bench.device.set(6.0)
+    bench.instrument.battery_voltage = 4.0
+    with pytest.raises(DeviceError, match=r"under.voltage"):
+        bench.device.measure()
+    assert bench.load.voltage == 0.0
+
+
+def test_silence_of_the_host_drops_the_output_at_that_instant(bench):
+    bench.device.set(6.0)
+    bench.device.glance()
+    last_command = bench.clock.now()
+    bench.clock.sleep(3600.0)
+    bench.instrument.world.advance()
+    instant, volts = bench.load.applied[-1]
+    assert volts == 0.0
+    # The answer to the last command took a few milliseconds of the wire.
+    assert instant == pytest.approx(last_command + WATCHDOG, abs=0.005)
+
+
+@pytest.mark.parametrize("pause", [1.001, 3.0, 3600.0])
+def test_reading_after_too_long_a_silence_raises_and_resumes_nothing(bench, pause):
+    bench.device.set(6.0)
+    bench.clock.sleep(pause)
+    applied = len(bench.load.applied)
+    with pytest.raises(DeviceError, match=r"supply: .*watchdog"):
+        bench.device.measure()
+    assert all(volts == 0.0 for _, volts in bench.load.applied[applied:])
+    assert bench.device.setpoint == 0.0
+    bench.tick(3.0)
+    assert bench.load.voltage == 0.0
+    assert bench.device.measure()["supply_voltage"] == 0.0
+
+
+@pytest.mark.parametrize("pause", [1.001, 3.0, 3600.0])
+def test_set_point_after_a_silence_does_not_resume_the_voltage_of_before(bench, output, pause):
+    bench.device.set(12.0)
+    bench.clock.sleep(pause)
+    bench.instrument.world.advance()
+    applied = len(bench.load.applied)
+    bench.device.set(3.0)
+    assert max(volts for _, volts in bench.load.applied[applied:]) == pytest.approx(3.0, abs=resolution(3.0, output))
+    assert bench.load.voltage == pytest.approx(3.0, abs=resolution(3.0, output))
+
+
+def test_device_that_stops_answering(bench):
+    bench.device.set(6.0)
+    bench.instrument.unplug()
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(5.0)):
+        with pytest.raises(DeviceConnectionError, match="supply: "):
+            call()
+
+
+def test_device_that_comes_back_resumes_nothing(bench):
+    bench.device.set(6.0)
+    bench.instrument.unplug()
+    bench.clock.sleep(5.0)
+    bench.instrument.world.advance()
+    bench.instrument.plug_in()
+    applied = len(bench.load.applied)
+    with pytest.raises(DeviceError):
+        bench.device.measure()
+    assert all(volts == 0.0 for _, volts in bench.load.applied[applied:])
+    bench.device.set(5.0).wait()
+    assert bench.load.voltage > 4.9
+
+
+def test_bluesky_finds_its_protocols(bench):
+    protocols = pytest.importorskip("bluesky.protocols")
+    assert isinstance(bench.device, protocols.Readable)
+    assert isinstance(bench.device, protocols.Movable)
+    assert isinstance(bench.device, protocols.Stoppable)
+
+
+# What only a wire can do.
+
+
+@over_the_wire
+@pytest.mark.parametrize("fault", ["damage_next_answer", "drop_next_answer"])
+def test_spoilt_answer_is_asked_for_again(bench, output, fault):
+    def set_and_wait():
+        bench.device.set(5.0).wait()
+
+    bench.device.set(6.0)
+    for call in (bench.device.measure, set_and_wait, bench.device.safe):
+        getattr(bench.instrument, fault)()
+        call()
+    assert bench.load.voltage == 0.0
+
+
+@over_the_wire
+def test_command_that_was_lost_until_the_watchdog_expired_does_not_resume(bench, output):
+    bench.device.set(12.0)
+    bench.clock.sleep(0.95)
+    bench.server.lose_next = b"t601823002001"
+    bench.device.set(3.0)
+    assert bench.server.lose_next == b""
+    assert bench.load.voltage == pytest.approx(3.0, abs=resolution(3.0, output))
+
+
+@over_the_wire
+def test_output_is_zero_after_connecting_to_a_device_that_drives(bench):
+    bench.device.set(6.0)
+    bench.device.close()
+    device = bench.connect()
+    assert bench.load.voltage == 0.0
+    assert math.isnan(device.setpoint)
+    device.close()
+
+
+@over_the_wire
+def test_connecting_after_a_silence_resumes_nothing(bench):
+    bench.device.set(6.0)
+    bench.device.close()
+    bench.clock.sleep(10.0)
+    bench.instrument.world.advance()
+    applied = len(bench.load.applied)
+    bench.connect().close()
+    assert len(bench.load.applied) == applied
+
+
+@over_the_wire
+def test_closing_while_the_output_is_on_leaves_it_to_the_watchdog(bench):
+    bench.device.set(6.0)
+    bench.device.close()
+    bench.clock.sleep(WATCHDOG - 0.1)
+    assert bench.instrument.power > 0
+    bench.clock.sleep(0.2)
+    assert bench.instrument.power == 0
+
+
+@over_the_wire
+def test_emergency_stop_stays_until_it_is_released(bench):
+    bench.device.set(6.0)
+    bench.device.emergency_stop()
+    assert bench.load.voltage == 0.0
+    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+        bench.device.set(5.0)
+    with pytest.raises(DeviceError, match="emergency stop"):
+        bench.device.measure()
+    applied = len(bench.load.applied)
+    bench.device.release()
+    assert len(bench.load.applied) == applied
+    bench.device.set(5.0).wait()
+
+
+@over_the_wire
+def test_emergency_stop_of_before_is_refused_and_recovered(bench):
+    bench.device.set(6.0)
+    bench.instrument.write_object(0x200C, 1)
+    bench.device.close()
+    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+        bench.connect()
+    applied = len(bench.load.applied)
+    device = bench.recover()
+    assert len(bench.load.applied) == applied
+    device.set(5.0).wait()
+    device.close()
+
+
+@over_the_wire
+def test_heartbeat_that_stays_away_is_told(bench):
+    bench.device.set(6.0)
+    bench.tick(2.0)
+    bench.instrument.write_object(0x1017, 0)
+    bench.clock.sleep(0.2)
+    bench.device.measure()
+    bench.clock.sleep(0.4)
+    with pytest.raises(
+        DeviceConnectionError, match=r"supply: no heartbeat of node 1 for 0\.\d+ s, 0\.5 s are allowed"
+    ):
+        bench.device.measure()
+    bench.device.safe()
+    assert bench.load.voltage == 0.0
+    assert bench.instrument.read_object(0x2112) == 0
+
+
+@over_the_wire
+def test_restart_of_the_device_is_told_once(bench):
+    bench.device.set(6.0)
+    bench.instrument.power_cycle()
+    with pytest.raises(DeviceError, match="supply: the device has restarted"):
+        bench.device.measure()
+    assert bench.device.setpoint == 0.0
+    assert bench.device.measure()["supply_voltage"] == 0.0
+    bench.device.set(5.0).wait()
+
+
+@over_the_wire
+def test_status_of_a_command_that_was_replaced(bench):
+    first = bench.device.set(6.0)
+    second = bench.device.set(5.0)
+    with pytest.raises(DeviceError, match="another command"):
+        first.wait()
+    second.wait()
+    third = bench.device.set(4.0)
+    bench.device.safe()
+    with pytest.raises(DeviceError, match="another command"):
+        third.wait()
+
+
+@over_the_wire
+def test_power_limit_of_the_device_keeps_the_status_from_completing(bench):
+    bench.instrument._power_limit = 10
+    status = bench.device.set(12.0)
+    with pytest.raises(DeviceError, match="did not arrive within 5 s"):
+        status.wait()

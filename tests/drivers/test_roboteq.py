@@ -1,0 +1,925 @@
+"""The driver of the Roboteq controllers, against a scripted adapter and node at the other end of its line."""
+
+import gc
+import logging
+import math
+import threading
+
+import pytest
+from can import Message
+from can.interfaces.slcan import slcanBus
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bench.clock import VirtualClock
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from drivers import roboteq
+from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
+from sim_devices.protocol_emulated import register, unregister
+
+PORT = "emulated://scripted-supply"
+QUERIES = 0x40
+
+
+def line(identifier, data):
+    return b"t%03X%d%s\r" % (identifier, len(data), bytes(data).hex().upper().encode())
+
+
+class Script:
+    """An adapter and a node of a few lines: objects, what was received, and answers put into its mouth.
+
+    `objects` holds (value, size) by index and subindex; `instead`, request by request, lines to send in place
+    of the right one (None for the right one); `aborts` abort codes by index and subindex.
+    """
+
+    def __init__(self):
+        self.objects = {
+            (0x1000, 0): (0x000F0191, 4),
+            (0x1018, 1): (0x2A, 4),
+            (0x1017, 0): (100, 2),
+            (0x2100, 1): (12, 2),
+            (0x2102, 1): (0, 2),
+            (0x210D, 2): (240, 2),
+            (0x2112, 0): (0, 1),
+            (0x2122, 1): (0, 4),
+        }
+        self.texts = {0x1008: b"Roboteq", 0x1009: b"A", 0x100A: b"v2.0"}
+        self.received = []
+        self.adapter = []
+        self.instead = []
+        self.before = b""
+        self.aborts = {}
+        self.silent = False
+        self.follow = True
+        self.rest = b""
+        self.node = 1
+
+    def receive(self, data):
+        *lines, self.rest = (self.rest + data).split(b"\r")
+        return b"".join(self.obey(line) for line in lines)
+
+    def obey(self, text):
+        if not text.startswith(b"t"):
+            self.adapter.append(text)
+            return b"\r"
+        assert len(text) == 21
+        assert text[4:5] == b"8"
+        identifier, data = int(text[1:4], 16), bytes.fromhex(text[5:].decode())
+        self.received.append((identifier, data))
+        if self.silent or identifier != 0x600 + self.node:
+            return b"z\r"
+        right = line(0x580 + self.node, self.answer(data))
+        sent, self.before = self.before, b""
+        if self.instead:
+            other = self.instead.pop(0)
+            if other is not None:
+                return sent + (other(right) if callable(other) else other)
+        return sent + b"z\r" + right
+
+    def answer(self, data):
+        command, key = data[0], (int.from_bytes(data[1:3], "little"), data[3])
+        if command >> 5 == 3:
+            part, self.text = self.text[:7], self.text[7:]
+            head = (command & 0x10) | (7 - len(part)) << 1 | (not self.text)
+            return bytes((head,)) + part.ljust(7, b"\0")
+        if key in self.aborts:
+            return b"\x80" + data[1:4] + self.aborts[key].to_bytes(4, "little")
+        if command == QUERIES:
+            if key[0] in self.texts and key[1] == 0:
+                self.text = self.texts[key[0]]
+                return b"\x41" + data[1:4] + len(self.text).to_bytes(4, "little")
+            if key not in self.objects:
+                return b"\x80" + data[1:4] + (0x06020000).to_bytes(4, "little")
+            value, size = self.objects[key]
+            raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+            return bytes((0x43 | (4 - size) << 2,)) + data[1:4] + raw.ljust(4, b"\0")
+        if key[0] == 0x2000 and self.follow:
+            self.objects[0x2102, key[1]] = (int.from_bytes(data[4:], "little", signed=True), 2)
+        if key[0] == 0x1017:
+            self.objects[key] = (int.from_bytes(data[4:6], "little"), 2)
+        return b"\x60" + data[1:4] + bytes(4)
+
+    def orders(self):
+        """Return all that was written: index, subindex and value."""
+        return [
+            (int.from_bytes(data[1:3], "little"), data[3], int.from_bytes(data[4:], "little", signed=True))
+            for _, data in self.received
+            if data[0] >> 5 == 1
+        ]
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def script(clock):
+    script = Script()
+    register("scripted-supply", script, clock)
+    yield script
+    unregister("scripted-supply")
+
+
+def make_settings(**changes):
+    keys = {"port": PORT, "output": "average", "voltage_limits": (0, 12), "heartbeat": 60}
+    return RoboteqSupply.Settings(**keys | changes)
+
+
+@pytest.fixture
+def connect(clock):
+    devices = []
+
+    def connect(how=RoboteqSupply.connect, **changes):
+        device = how("supply", make_settings(**changes), clock)
+        devices.append(device)
+        return device
+
+    yield connect
+    for device in devices:
+        device.close()
+
+
+@pytest.fixture
+def supply(script, connect):
+    supply = connect()
+    script.received.clear()
+    script.adapter.clear()
+    return supply
+
+
+def test_bytes_of_opening_and_closing(script, connect):
+    supply = connect()
+    assert [text for text in script.adapter if text] == [b"C", b"S4", b"O", b"O"]
+    supply.close()
+    assert script.adapter[-1] == b"C"
+    connect(bitrate=500_000)
+    assert b"S6" in script.adapter
+
+
+def test_bytes_of_connecting(script, connect):
+    connect()
+    sent = [data.hex(" ").upper() for _, data in script.received]
+    assert {identifier for identifier, _ in script.received} == {0x601}
+    assert sent[0] == "40 00 10 00 00 00 00 00"
+    assert sent[1:3] == ["40 08 10 00 00 00 00 00", "60 00 00 00 00 00 00 00"]
+    assert "23 00 20 01 00 00 00 00" in sent
+    assert script.orders() == [(0x2000, 1, 0)]
+
+
+def test_bytes_of_a_set_point_and_a_measurement(script, supply):
+    supply.set(6.0)
+    assert script.received[-1] == (0x601, bytes.fromhex("23002001FA000000"))
+    assert script.orders() == [(0x2000, 1, 250)]
+    script.received.clear()
+    assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
+    assert [data.hex(" ").upper() for _, data in script.received] == [
+        "40 02 21 01 00 00 00 00",
+        "40 0D 21 02 00 00 00 00",
+        "40 00 21 01 00 00 00 00",
+        "40 12 21 00 00 00 00 00",
+        "40 22 21 01 00 00 00 00",
+        "23 00 20 01 FA 00 00 00",
+    ]
+
+
+def test_bytes_of_the_emergency_stop_and_its_release(script, supply):
+    supply.emergency_stop()
+    assert script.received == [(0x601, bytes.fromhex("2F0C200001000000"))]
+    script.received.clear()
+    supply.release()
+    assert script.orders() == [(0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
+
+
+def test_node_and_channel(script, connect):
+    script.node = 77
+    script.objects |= {(index, 2): script.objects[index, 1] for index in (0x2100, 0x2102, 0x2122)}
+    supply = connect(node=77, channel=2)
+    supply.set(6.0)
+    supply.safe()
+    assert {identifier for identifier, _ in script.received} == {0x64D}
+    assert script.orders()[-3:] == [(0x2000, 2, 250), (0x2000, 2, 0), (0x200E, 0, 2)]
+
+
+def test_channel_that_is_not_there(script, connect):
+    with pytest.raises(ConfigurationError, match=r"supply: channel: the controller does not have channel 3"):
+        connect(channel=3)
+    assert script.orders() == []
+
+
+def test_identity(script, supply):
+    assert str(supply.identity) == "Roboteq motor controller, serial number unknown, firmware v2.0"
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        (b"Roboteq SDC2160", "SDC2160"),
+        (b"SDC2160 by ROBOTEQ", "SDC2160 by"),
+        (b"roboteq", "motor controller"),
+        (b"Roboteq\0\0\0", "motor controller"),
+        (b"A Roboteq whose name has twenty-eight", "A  whose name has twenty-eight"),
+    ],
+)
+def test_names_in_segments(script, connect, name, model):
+    script.texts[0x1008] = name
+    assert connect().identity.model == model
+
+
+def test_name_without_end(script, connect):
+    script.texts[0x1008] = b"x" * 5000
+    with pytest.raises(DeviceConnectionError, match=r"found 'x{50}"):
+        connect()
+
+
+def test_name_in_an_expedited_answer(script, connect):
+    script.texts[0x1008] = b"xx"
+    original = script.answer
+
+    def answer(data):
+        if data[:3] == b"\x40\x08\x10":
+            return b"\x43" + data[1:4] + b"ABB2"
+        return original(data)
+
+    script.answer = answer
+    with pytest.raises(DeviceConnectionError, match=r"found 'ABB2' \(device type 0x000F0191, vendor 0x0000002A\)"):
+        connect()
+    assert script.orders() == []
+
+
+def test_controller_without_a_name_is_known_by_its_type(script, connect):
+    script.aborts |= {(index, 0): 0x06020000 for index in (0x1008, 0x1009, 0x100A)}
+    assert str(connect().identity) == "Roboteq motor controller, serial number unknown, firmware unknown"
+    script.objects[0x1000, 0] = (0x00020192, 4)
+    script.aborts[0x1018, 1] = 0x06020000
+    with pytest.raises(DeviceConnectionError, match=r"found '' \(device type 0x00020192\); check port and node"):
+        connect()
+
+
+def test_lost_segment_is_asked_for_again_with_the_whole_text(script, connect):
+    script.instead = [None, None, b"z\r"]
+    assert connect().identity.model == "motor controller"
+    assert [data[0] for _, data in script.received[:5]] == [0x40, 0x40, 0x60, 0x40, 0x60]
+
+
+def test_wrong_toggle_bit(script, connect):
+    script.instead = [None, None, line(0x581, bytes.fromhex("11526F0000000000"))]
+    with pytest.raises(DeviceError, match="answered 11 52"):
+        connect()
+
+
+@pytest.mark.parametrize(("milliseconds", "written"), [(100, None), (0, 166), (5000, 166), (166, None)])
+def test_heartbeat_of_the_device_is_made_frequent_enough(script, connect, milliseconds, written):
+    script.objects[0x1017, 0] = (milliseconds, 2)
+    script.before = b"t701105\r"
+    connect(heartbeat=0.5)
+    assert [value for index, _, value in script.orders() if index == 0x1017] == ([] if written is None else [written])
+
+
+@pytest.mark.parametrize(
+    ("output", "battery", "volts", "command"),
+    [
+        ("average", 240, 0.0, 0),
+        ("average", 240, 12.0, 500),
+        ("average", 240, 0.03, 1),
+        ("average", 240, -6.0, -250),
+        ("average", 119, 11.9, 1000),
+        ("average", 119, 11.95, 1000),
+        ("average", 237, 12.0, 506),
+        ("average", 235, 12.0, 510),  # 510.64, but 511 would be 12.0085 V, beyond the limit
+        ("rms", 240, 12.0, 250),
+        ("rms", 240, 6.0, 62),
+        ("rms", 240, 0.76, 1),
+        ("rms", 240, 0.5, 0),
+        ("rms", 120, 12.0, 1000),
+    ],
+)
+def test_conversion(script, connect, output, battery, volts, command):
+    script.objects[0x210D, 2] = (battery, 2)
+    limits = (-12, 12) if volts < 0 else (0, 12)
+    supply = connect(output=output, voltage_limits=limits)
+    supply.set(volts)
+    assert script.orders()[-1] == (0x2000, 1, command)
+    values = supply.measure()
+    duty = command / 1000
+    expected = battery / 10 * (duty if output == "average" else math.sqrt(duty))
+    assert values["supply_voltage"] == pytest.approx(expected, abs=1e-12)
+
+
+def test_voltage_that_the_supply_does_not_give(script, supply):
+    script.objects[0x210D, 2] = (100, 2)
+    with pytest.raises(DeviceError, match=r"power supply of 10\.0 V is too low for 12 V; check"):
+        supply.set(12.0)
+    assert script.orders() == []
+    supply.set(10.0)
+    script.objects[0x210D, 2] = (80, 2)
+    with pytest.raises(DeviceError, match=r"power supply of 8\.0 V is too low for 10 V"):
+        supply.measure()
+
+
+def test_supply_that_moves_is_followed_and_its_last_digit_is_not(script, supply):
+    supply.set(6.0)
+    script.received.clear()
+    for battery in (241, 239, 240, 242, 241, 243, 200):
+        script.objects[0x210D, 2] = (battery, 2)
+        supply.glance()
+    assert [value for _, _, value in script.orders()] == [250, 250, 250, 248, 248, 248, 300]
+
+
+def test_no_set_point_beyond_the_limits_is_sent(script, supply):
+    for value in (-0.1, 12.1, math.nan, math.inf):
+        with pytest.raises(LimitError, match="0 to 12 V"):
+            supply.set(value)
+    assert script.received == []
+    assert math.isnan(supply.setpoint)
+
+
+def test_nothing_is_kept_while_the_set_point_is_zero(script, supply, clock):
+    supply.set(0.0)
+    script.received.clear()
+    clock.sleep(50.0)
+    supply.measure()
+    assert script.orders() == []
+
+
+@pytest.mark.parametrize(("watchdog", "pause", "zero"), [(1.0, 0.9, False), (1.0, 1.0, True), (0.0, 50.0, False)])
+def test_zero_comes_first_after_a_gap(script, connect, clock, watchdog, pause, zero):
+    supply = connect(watchdog=watchdog)
+    supply.set(6.0)
+    script.received.clear()
+    clock.sleep(pause)
+    supply.set(3.0)
+    assert [value for _, _, value in script.orders()] == ([0, 125] if zero else [125])
+
+
+def test_reading_after_a_gap_sends_zero_and_raises(script, supply, clock):
+    supply.set(6.0)
+    clock.sleep(1.5)
+    script.received.clear()
+    with pytest.raises(DeviceError, match=r"output was dropped: the last command is 1\.5\d* s old .*\^RWD"):
+        supply.glance()
+    assert script.orders() == [(0x2000, 1, 0)]
+    assert supply.setpoint == 0.0
+
+
+def test_watchdog_that_is_shorter_than_the_settings_say_is_noticed(script, connect, clock):
+    supply = connect(watchdog=60)
+    supply.set(6.0)
+    supply.measure()
+    clock.sleep(6.0)
+    script.objects[0x2102, 1] = (0, 2)
+    script.received.clear()
+    with pytest.raises(DeviceError, match="output was dropped"):
+        supply.measure()
+    assert script.orders() == [(0x2000, 1, 0)]
+
+
+def test_ramp_of_the_device(script, supply, clock):
+    script.follow = False
+    status = supply.set(6.0)
+    assert not status.update()
+    script.objects[0x2102, 1] = (248, 2)
+    assert not status.update()
+    assert supply.measure()["supply_voltage"] == pytest.approx(5.952)
+    script.objects[0x2102, 1] = (249, 2)
+    assert status.update()
+    assert status.success
+
+
+def test_ramp_through_zero_is_no_drop(script, connect):
+    supply = connect(voltage_limits=(-12, 12))
+    supply.set(6.0).wait()
+    script.follow = False
+    supply.set(-6.0)
+    for power in (100, 0, -100, -250):
+        script.objects[0x2102, 1] = (power, 2)
+        supply.measure()
+    script.objects[0x2102, 1] = (0, 2)
+    with pytest.raises(DeviceError, match="output was dropped"):
+        supply.measure()
+
+
+def test_waiting_for_a_ramp_feeds_the_watchdog(script, connect, clock):
+    supply = connect(watchdog=0.2)
+    script.follow = False
+    status = supply.set(6.0)
+    script.received.clear()
+    with pytest.raises(DeviceError, match="did not arrive within 5 s"):
+        status.wait()
+    assert {value for _, _, value in script.orders()} == {250}
+    assert len(script.orders()) > 25
+
+
+@pytest.mark.parametrize("bit", list(FAULT_FLAGS))
+def test_every_fault_is_told_with_advice(script, supply, bit):
+    script.objects[0x2112, 0] = (bit, 2)
+    text, advice = FAULT_FLAGS[bit]
+    for call in (supply.measure, lambda: supply.set(6.0)):
+        with pytest.raises(DeviceError) as caught:
+            call()
+        assert str(caught.value) == f"supply: fault: {text}; {advice}"
+    assert script.orders() == []
+
+
+@pytest.mark.parametrize("bit", list(CHANNEL_FLAGS))
+def test_every_flag_of_the_channel_is_told_with_advice(script, supply, bit):
+    script.objects[0x2122, 1] = (bit, 2)
+    text, advice = CHANNEL_FLAGS[bit]
+    with pytest.raises(DeviceError) as caught:
+        supply.measure()
+    assert str(caught.value) == f"supply: channel 1: {text}; {advice}"
+
+
+def test_several_faults_and_unknown_ones(script, supply):
+    script.objects |= {(0x2112, 0): (0x8105, 2), (0x2122, 1): (0x80000001, 4)}
+    with pytest.raises(DeviceError) as caught:
+        supply.measure()
+    for part in ("overheat", "under-voltage", "amps limit", "fault flags 0x8100, unknown"):
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("code", [*ABORT_CODES, 0x12345678])
+def test_every_abort_code_is_told(script, supply, code):
+    text = ABORT_CODES.get(code, "abort code 0x12345678")
+    script.aborts[0x210D, 2] = code
+    with pytest.raises(DeviceError) as caught:
+        supply.measure()
+    assert str(caught.value) == f"supply: refused to tell its battery voltage (object 0x210D:2): {text}"
+    script.aborts = {(0x2000, 1): code}
+    with pytest.raises(DeviceError) as caught:
+        supply.set(6.0)
+    assert str(caught.value) == f"supply: refused 250 as its motor command (object 0x2000:1): {text}"
+
+
+GOOD = bytes.fromhex("4B0D2102F0000000")
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        b"",
+        b"z\r",
+        b"\a",
+        b"z\r\a\r\r",
+        b"z\rt58184B0D21\r",
+        b"z\rt58184B0D2102F000000\r",
+        b"t581\r",
+        b"t\r",
+        b"t5819" + b"00" * 9 + b"\r",
+        b"t5x1" + b"00" * 9 + b"\r",
+        b"T00000581\r",
+        b"\xff\xfe\r",
+        b"t58184B\xff\r",
+        b"x" * 300 + b"\r",
+        b"x" * 300,
+        b"t58184B0D2102F0000000",
+        line(0x582, GOOD),
+        line(0x581, GOOD[:7]),
+        line(0x581, b"\x4b\x0d\x21\x01" + GOOD[4:]),
+        line(0x581, b"\x80\x0d\x21\x01" + bytes(4)),
+        b"T000005818" + GOOD.hex().encode() + b"\r",
+        b"r5818\r",
+        line(0x705, b"\x05"),
+        line(0x701, b"\x05") * 50,
+    ],
+)
+def test_a_spoilt_answer_costs_a_resend(script, supply, spoilt):
+    script.received.clear()
+    script.instead = [None, spoilt, spoilt]
+    values = supply.measure()
+    assert values["supply_voltage"] == 0.0
+    assert script.received[1] == script.received[2] == script.received[3]
+    assert len(script.received) == 5 + 2
+
+
+def test_late_answers_are_passed_over(script, supply):
+    late = line(0x581, bytes.fromhex("4B022101E8030000"))
+    script.instead = [None, lambda right: late + b"z\r" + right]
+    assert supply.measure()["supply_voltage"] == 0.0
+    script.instead = [lambda right: b"z\r" + right + late, None]
+    assert supply.measure()["supply_voltage"] == 0.0
+
+
+def test_answer_that_came_too_late_for_an_earlier_reading_is_not_taken_for_the_next(script, supply):
+    supply._line._adapter.serialPortOrig._received += line(0x581, bytes.fromhex("4B022101E8030000"))
+    assert supply.measure()["supply_voltage"] == 0.0
+
+
+def test_simplified_answers_of_the_manual_are_understood(script, supply):
+    simplified = line(0x581, bytes.fromhex("480D210290010000"))
+    script.instead = [None, simplified]
+    script.objects[0x2102, 1] = (1000, 2)
+    assert supply.measure()["supply_voltage"] == 40.0
+    script.instead = [line(0x581, bytes.fromhex("40022101F4010000"))]
+    assert supply.measure()["supply_voltage"] == 12.0
+
+
+def test_negative_readings(script, supply):
+    script.objects |= {(0x2100, 1): (-15, 2), (0x2102, 1): (-500, 2)}
+    assert supply.measure() == {"supply_voltage": -12.0, "supply_current": -1.5}
+
+
+@pytest.mark.parametrize("answer", ["410D210204000000", "600D210200000000"])
+def test_answers_that_are_no_number(script, supply, answer):
+    script.instead = [None, line(0x581, bytes.fromhex(answer))]
+    with pytest.raises(DeviceError, match=r"answered .* for its battery voltage \(object 0x210D:2\)"):
+        supply.measure()
+
+
+def test_write_that_is_answered_like_a_query(script, supply):
+    script.instead = [None, None, None, line(0x581, bytes.fromhex("4300200100000000"))]
+    with pytest.raises(DeviceError, match=r"answered 43 00 20 01 .* for its motor command"):
+        supply.set(6.0)
+
+
+@given(st.lists(st.one_of(st.binary(max_size=60), st.just(line(0x701, b"\x05"))), min_size=3, max_size=3))
+def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
+    script, clock = Script(), VirtualClock()
+    register("fuzzed-supply", script, clock)
+    try:
+        access = roboteq._Line("supply", make_settings(port="emulated://fuzzed-supply"), clock)
+        script.instead = list(replies)
+        with pytest.raises(DeviceConnectionError):
+            access.read(roboteq._VOLTS, 2)
+        assert access.read(roboteq._VOLTS, 2) == 240
+        access.close()
+    finally:
+        unregister("fuzzed-supply")
+
+
+def test_silence_names_port_and_node_and_takes_its_time(script, supply, clock):
+    script.silent = True
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError) as caught:
+        supply.measure()
+    assert str(caught.value) == (
+        "supply: no answer within 0.1 s at emulated://scripted-supply, node 1, after 3 requests; check power, "
+        "cable, node and speed (125000 bit/s)"
+    )
+    assert len(script.received) == 3
+    assert clock.now() - before == pytest.approx(0.3, abs=0.02)
+
+
+def test_silence_among_heartbeats_ends_as_well(script, supply, clock):
+    script.instead = [line(0x701, b"\x05") * 100] * 3
+    with pytest.raises(DeviceConnectionError, match="no answer within"):
+        supply.measure()
+
+
+def test_heartbeats_that_never_end_do_not_prolong_the_timeout(script, supply, clock, monkeypatch):
+    def frame():
+        clock.sleep(0.04)
+        return Message(arbitration_id=0x701, is_extended_id=False, data=b"\x05")
+
+    monkeypatch.setattr(supply._line._adapter, "frame", frame)
+    monkeypatch.setattr(supply._line._adapter, "waiting_frames", list)
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError, match="no answer within"):
+        supply.measure()
+    assert clock.now() - before == pytest.approx(0.36, abs=0.02)
+
+
+def test_nonsense_without_an_end_does_not_pile_up(script, supply):
+    script.instead = [b"x" * 5000] * 3
+    with pytest.raises(DeviceConnectionError, match="no answer within"):
+        supply.measure()
+    assert len(supply._line._adapter._buffer) <= 64
+    supply.measure()
+
+
+def test_wrong_node_names_those_that_are_heard(script, connect):
+    original = script.obey
+    script.obey = lambda text: (
+        original(text) + (line(0x705, b"\x05") + line(0x709, b"\x7f") if text[:1] == b"t" else b"")
+    )
+    with pytest.raises(DeviceConnectionError, match=r"node 7, after 3 requests; heard of node 5, 9 instead; check"):
+        connect(node=7)
+
+
+def test_error_of_the_adapter_is_named(script, supply):
+    script.instead = [b"\a"] * 3
+    with pytest.raises(DeviceConnectionError, match="the adapter reports an error"):
+        supply.measure()
+
+
+def test_heartbeat_that_becomes_stale(script, connect, clock):
+    script.before = line(0x701, b"\x05")
+    supply = connect(heartbeat=0.5)
+    for _ in range(20):
+        clock.sleep(0.3)
+        script.before = line(0x701, b"\x05") * 3
+        supply.measure()
+    clock.sleep(0.51)
+    with pytest.raises(DeviceConnectionError, match=r"no heartbeat of node 1 for 0\.\d+ s, 0\.5 s are allowed"):
+        supply.measure()
+    with pytest.raises(DeviceConnectionError, match="no heartbeat"):
+        supply.set(6.0)
+    assert script.orders()[-1] == (0x2000, 1, 0)
+    script.before = line(0x702, b"\x05") + line(0x701, b"\x05\x05") + line(0x700, b"\x05")
+    with pytest.raises(DeviceConnectionError, match="no heartbeat"):
+        supply.measure()
+    script.before = line(0x701, b"\x7f")
+    supply.measure()
+
+
+def test_heartbeats_that_wait_in_the_line_count_when_they_are_read(script, supply, connect, clock):
+    supply = connect(heartbeat=1)
+    port = supply._line._adapter.serialPortOrig
+    clock.sleep(100.0)
+    port._received += line(0x701, b"\x05") * 400 + b"t7011"
+    supply.measure()
+
+
+def test_start_before_connecting_is_no_restart(script, connect):
+    script.before = line(0x701, b"\x00")
+    connect().measure()
+
+
+def test_restart_is_told_once_and_zero_is_sent(script, supply):
+    supply.set(6.0)
+    script.received.clear()
+    script.before = line(0x701, b"\x00")
+    with pytest.raises(DeviceError, match="has restarted and its output dropped"):
+        supply.measure()
+    assert script.orders() == [(0x2000, 1, 0)]
+    supply.measure()
+
+
+@pytest.mark.parametrize("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+def test_port_that_cannot_be_opened(script, connect, port):
+    with pytest.raises(DeviceConnectionError, match=f"supply: cannot open {port}"):
+        connect(port=port)
+
+
+def test_line_that_is_pulled_out(script, supply):
+    unregister("scripted-supply")
+    with pytest.raises(DeviceConnectionError, match="lost the line emulated://scripted-supply"):
+        supply.measure()
+    with pytest.raises(DeviceError, match="does not confirm that its output is off"):
+        supply.safe()
+    supply.close()
+
+
+def test_adapter_that_fails_while_it_is_opened_is_closed(script, connect, caplog):
+    def receive(data):
+        raise OSError("gone")
+
+    script.receive = receive
+    with caplog.at_level(logging.WARNING), pytest.raises(DeviceConnectionError, match=r"cannot open .*: gone"):
+        connect()
+    gc.collect()
+    assert caplog.records == []
+
+
+def test_closing_twice_and_using_afterwards(script, supply, caplog):
+    supply.set(6.0)
+    before = len(script.received)
+    with caplog.at_level(logging.WARNING):
+        supply.close()
+        supply.close()
+    assert len(script.received) == before
+    assert caplog.records == []
+    with pytest.raises(DeviceConnectionError):
+        supply.measure()
+
+
+def test_safe_sends_zero_and_stop(script, supply):
+    supply.set(6.0)
+    script.received.clear()
+    supply.safe()
+    assert script.orders() == [(0x2000, 1, 0), (0x200E, 0, 1)]
+    assert supply.setpoint == 0.0
+
+
+def test_safe_waits_for_the_ramp(script, supply, clock):
+    supply.set(6.0)
+    script.follow = False
+    original, left = script.answer, [200, 100, 0]
+
+    def answer(data):
+        if data[1:3] == b"\x02\x21":
+            script.objects[0x2102, 1] = (left.pop(0) if left else 0, 2)
+        return original(data)
+
+    script.answer = answer
+    supply.safe()
+    assert all(index != 0x200C for index, _, _ in script.orders())
+
+
+@pytest.mark.parametrize("refused", [(0x2000, 1), (0x200E, 0)])
+def test_safe_goes_on_to_the_emergency_stop(script, supply, refused):
+    supply.set(6.0)
+    script.received.clear()
+    script.aborts[refused] = 0x08000022
+    script.objects[0x2102, 1] = (0, 2)
+    supply.safe()
+    assert script.orders() == [(0x2000, 1, 0), (0x200E, 0, 1), (0x200C, 0, 1)]
+
+
+def test_safe_that_is_not_confirmed_raises_after_everything_was_tried(script, supply, clock):
+    supply.set(6.0)
+    script.follow = False
+    script.received.clear()
+    with pytest.raises(DeviceError, match=r"does not confirm that its output is off; disconnect its power"):
+        supply.safe()
+    assert script.orders() == [(0x2000, 1, 0), (0x200E, 0, 1), (0x200C, 0, 1)]
+    script.aborts = dict.fromkeys([(0x2000, 1), (0x200E, 0), (0x200C, 0)], 0x08000000)
+    with pytest.raises(DeviceError, match=r"does not confirm .*refused 0 as its motor command.*general error"):
+        supply.safe()
+
+
+def test_safe_of_a_silent_device_tries_everything(script, supply):
+    script.silent = True
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        supply.safe()
+    assert {data[1:3].hex() for _, data in script.received} == {"0020", "0e20", "0c20", "0221"}
+
+
+def test_safe_with_a_stale_heartbeat_or_a_fault_needs_no_emergency_stop(script, connect, clock):
+    supply = connect(heartbeat=0.5)
+    supply.set(6.0)
+    clock.sleep(10.0)
+    script.objects[0x2112, 0] = (1, 2)
+    supply.safe()
+    assert all(index != 0x200C for index, _, _ in script.orders())
+
+
+def test_emergency_stop_of_before_is_refused_and_recovered(script, connect):
+    script.objects[0x2112, 0] = (0x10, 2)
+    with pytest.raises(DeviceError, match=r"emergency stop; .*RoboteqSupply\.recover"):
+        connect()
+    original = script.answer
+
+    def answer(data):
+        if data[1:3] == b"\x0d\x20":
+            script.objects[0x2112, 0] = (0, 2)
+        return original(data)
+
+    script.answer = answer
+    script.received.clear()
+    supply = connect(RoboteqSupply.recover)
+    assert script.orders() == [(0x2000, 1, 0), (0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
+    assert math.isnan(supply.setpoint)
+
+
+def test_several_threads_wait_for_each_other(script, supply):
+    supply.set(6.0)
+    failures = []
+
+    def look():
+        try:
+            for _ in range(50):
+                assert supply.measure()["supply_voltage"] == 6.0
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=look) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+
+
+def test_python_can_still_reads_where_the_driver_does():
+    """The driver replaces this method of python-can; were it renamed, the wire would be polled."""
+    assert callable(vars(slcanBus).get("_read"))
+    assert isinstance(Message(arbitration_id=1, data=b"").data, bytearray)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": ""},
+        {"port": "/dev/ttyUSB0@9600"},
+        {"node": 0},
+        {"node": 127},
+        {"bitrate": 250_000},
+        {"baudrate": 300},
+        {"channel": 0},
+        {"channel": 4},
+        {"output": "peak"},
+        {"voltage_limits": (12, 0)},
+        {"voltage_limits": (0, 0)},
+        {"voltage_limits": (1, 12)},
+        {"voltage_limits": (0, 61)},
+        {"voltage_limits": (0, math.inf)},
+        {"output": "rms", "voltage_limits": (-12, 12)},
+        {"watchdog": -1},
+        {"watchdog": 66},
+        {"heartbeat": 0.01},
+        {"timeout": 0},
+        {"address": 1},
+    ],
+)
+def test_settings_that_make_no_sense(changes):
+    with pytest.raises(ValidationError):
+        make_settings(**changes)
+
+
+@pytest.mark.parametrize("missing", ["port", "output", "voltage_limits"])
+def test_settings_without_a_default(missing):
+    keys = {"port": PORT, "output": "rms", "voltage_limits": (0, 12)}
+    del keys[missing]
+    with pytest.raises(ValidationError):
+        RoboteqSupply.Settings(**keys)
+
+
+def test_settings_say_what_they_are():
+    for name, field in RoboteqSupply.Settings.model_fields.items():
+        assert field.description, name
+    settings = make_settings()
+    assert (settings.node, settings.bitrate, settings.channel, settings.watchdog) == (1, 125_000, 1, 1.0)
+
+
+class LocalNode:
+    """A node of the package canopen behind slcan lines; no emulator of ours takes part."""
+
+    def __init__(self, canopen):
+        types = canopen.objectdictionary.datatypes
+        objects = canopen.ObjectDictionary()
+        for index, sub, kind, access, value in (
+            (0x1000, 0, types.UNSIGNED32, "ro", 0x000F0191),
+            (0x1008, 0, types.VISIBLE_STRING, "const", "Roboteq SDC3260"),
+            (0x1009, 0, types.VISIBLE_STRING, "const", "1"),
+            (0x100A, 0, types.VISIBLE_STRING, "const", "v2.1 beta"),
+            (0x1017, 0, types.UNSIGNED16, "rw", 0),
+            (0x2000, 1, types.INTEGER32, "wo", 0),
+            (0x200C, 0, types.UNSIGNED8, "wo", 0),
+            (0x200D, 0, types.UNSIGNED8, "wo", 0),
+            (0x200E, 0, types.UNSIGNED8, "wo", 0),
+            (0x2100, 1, types.INTEGER16, "ro", 23),
+            (0x2102, 1, types.INTEGER16, "ro", 0),
+            (0x210D, 2, types.UNSIGNED16, "ro", 240),
+            (0x2112, 0, types.UNSIGNED8, "ro", 0),
+            (0x2122, 1, types.UNSIGNED32, "ro", 0),
+        ):
+            variable = canopen.objectdictionary.ODVariable(f"{index:04X}sub{sub}", index, sub)
+            variable.data_type, variable.access_type, variable.default = kind, access, value
+            if sub:
+                record = canopen.objectdictionary.ODRecord(f"{index:04X}", index)
+                record.add_member(variable)
+                objects.add_object(record)
+            else:
+                objects.add_object(variable)
+        self.sent = b""
+
+        class Network(canopen.Network):
+            def send_message(_, can_id, data, **_options):
+                self.sent += line(can_id, data)
+
+        self.node = canopen.LocalNode(9, objects)
+        Network().add_node(self.node)
+        self.network = self.node.network
+        self.written = []
+        self.node.add_write_callback(self.write)
+
+    def write(self, *, index, subindex, data, **_):
+        self.written.append((index, subindex, bytes(data)))
+        if index == 0x2000:
+            power = int.from_bytes(data, "little", signed=True)
+            self.node.data_store[0x2102] = {1: power.to_bytes(2, "little", signed=True)}
+
+    def receive(self, data):
+        for text in data.split(b"\r"):
+            if text.startswith(b"t"):
+                self.network.notify(int(text[1:4], 16), bytearray.fromhex(text[5:].decode()), 0.0)
+        # Its heartbeat would come from a timer of the room.
+        sent, self.sent = line(0x709, b"\x05") + self.sent, b""
+        return sent
+
+
+@pytest.fixture
+def local_node(clock):
+    canopen = pytest.importorskip("canopen")
+    local = LocalNode(canopen)
+    register("local-node", local, clock)
+    yield local
+    unregister("local-node")
+
+
+def test_against_a_node_of_the_package_canopen(local_node, connect):
+    local_node.node.object_dictionary[0x1017].default = 100
+    supply = connect(port="emulated://local-node", node=9)
+    assert str(supply.identity) == "Roboteq SDC3260, serial number unknown, firmware v2.1 beta"
+    supply.set(6.0).wait()
+    assert local_node.written[-1] == (0x2000, 1, bytes.fromhex("FA000000"))
+    assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 2.3}
+    supply.safe()
+    assert [row[:2] for row in local_node.written[-2:]] == [(0x2000, 1), (0x200E, 0)]
+    supply.emergency_stop()
+    assert local_node.written[-1] == (0x200C, 0, b"\x01")
+    supply.release()
+
+
+def test_channel_that_a_node_of_the_package_canopen_lacks(local_node, connect):
+    with pytest.raises(ConfigurationError, match=r"does not have channel 2 \(the subindex does not exist"):
+        connect(port="emulated://local-node", node=9, channel=2)
+
+
+def test_other_device_of_the_package_canopen_is_refused(local_node, connect):
+    local_node.node.object_dictionary[0x1008].default = "Some drive"
+    with pytest.raises(DeviceConnectionError, match="found 'Some drive'"):
+        connect(port="emulated://local-node", node=9)
+    assert local_node.written == []

@@ -1,0 +1,668 @@
+"""The emulated Roboteq controller: its objects, its watchdog, and the bytes of its slcan adapter."""
+
+import math
+import os
+import queue
+import select
+import struct
+import threading
+import tty
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from bench.clock import VirtualClock, WallClock
+from bench.errors import DeviceConnectionError, DeviceError
+from drivers.roboteq import RoboteqSupply
+from sim_devices.instruments.roboteq import (
+    DICTIONARY,
+    AbortCode,
+    ChannelFlag,
+    EmulatedRoboteq,
+    Fault,
+    NodeState,
+    TransferAbortedError,
+)
+from sim_devices.wire.canopen_slcan import BITRATES, LONGEST_LINE, CanopenSlcanServer
+from sim_devices.world import World
+
+COMMAND, EMERGENCY_STOP, RELEASE, STOP = 0x2000, 0x200C, 0x200D, 0x200E
+NUMBERS = sorted(key for key, row in DICTIONARY.items() if row.kind != "text")
+
+
+class Resistor:
+    def __init__(self, ohms=5.0):
+        self.ohms = ohms
+        self.voltage = 0.0
+        self.world = None
+        self.applied = []
+
+    def apply(self, voltage):
+        self.voltage = voltage
+        self.applied.append((self.world.time, voltage))
+
+    @property
+    def current(self):
+        return self.voltage / self.ohms
+
+    def advance(self, dt):
+        pass
+
+
+def make_device(clock=None, load=None, **keys):
+    load = load or Resistor()
+    load.world = World(load, clock or VirtualClock())
+    return EmulatedRoboteq("supply", load.world, load, **keys), load
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def load():
+    return Resistor()
+
+
+@pytest.fixture
+def device(clock, load):
+    return make_device(clock, load)[0]
+
+
+@pytest.fixture
+def server(device):
+    server = CanopenSlcanServer(device)
+    assert server.receive(b"S4\rO\r") == b"\r\r"
+    return server
+
+
+class TestInstrument:
+    def test_every_object_can_be_read_or_written(self, device):
+        for (index, sub), row in DICTIONARY.items():
+            if row.readable:
+                value = device.read_object(index, sub)
+                assert isinstance(value, str if row.kind == "text" else int)
+            else:
+                with pytest.raises(TransferAbortedError, match="WRITE_ONLY"):
+                    device.read_object(index, sub)
+            if not row.writable:
+                with pytest.raises(TransferAbortedError, match="READ_ONLY"):
+                    device.write_object(index, 0, sub)
+
+    @pytest.mark.parametrize(
+        ("index", "sub", "code"),
+        [(0x2100, 3, AbortCode.NO_SUBINDEX), (0x210D, 0, AbortCode.NO_SUBINDEX), (0x3000, 0, AbortCode.NO_OBJECT)],
+    )
+    def test_object_that_is_not_there(self, device, index, sub, code):
+        for call in (lambda: device.read_object(index, sub), lambda: device.write_object(index, 0, sub)):
+            with pytest.raises(TransferAbortedError) as caught:
+                call()
+            assert caught.value.code == code
+
+    @pytest.mark.parametrize("value", [-1001, 1001, 2**31 - 1])
+    def test_command_beyond_its_range(self, device, load, value):
+        with pytest.raises(TransferAbortedError, match="VALUE"):
+            device.write_object(COMMAND, value, 1)
+        assert load.applied == []
+
+    @pytest.mark.parametrize(("output", "volts"), [("average", 6.0), ("rms", 12.0)])
+    def test_quarter_of_the_duty_cycle(self, clock, output, volts):
+        device, load = make_device(clock, output=output)
+        device.write_object(COMMAND, 250, 1)
+        assert load.voltage == pytest.approx(volts)
+        assert device.voltage == load.voltage
+        assert device.read_object(0x2101, 1) == device.read_object(0x2102, 1) == 250
+        assert device.read_object(0x2100, 1) == round(2.0 * volts)
+        assert device.read_object(0x210C, 1) == round(0.5 * volts)
+        device.write_object(COMMAND, -250, 1)
+        assert load.voltage == pytest.approx(-volts)
+
+    def test_other_channel_is_connected_to_nothing(self, device, load):
+        device.write_object(COMMAND, 500, 2)
+        assert load.applied == []
+        assert device.read_object(0x2101, 2) == 500
+        assert device.read_object(0x2100, 2) == device.read_object(0x2102, 2) == device.read_object(0x2122, 2) == 0
+
+    def test_readings_have_their_resolution(self, clock):
+        device, _ = make_device(clock, battery_voltage=23.96)
+        assert device.read_object(0x210D, 2) == 240
+        device.write_object(COMMAND, 333, 1)
+        assert device.read_object(0x2100, 1) == 16  # 1.596 A
+
+    def test_noise_is_small_and_seeded(self, clock):
+        def readings(seed):
+            device, _ = make_device(clock, rng=np.random.default_rng(seed))
+            device.write_object(COMMAND, 500, 1)
+            return [(device.read_object(0x210D, 2), device.read_object(0x2100, 1)) for _ in range(300)]
+
+        assert readings(1) == readings(1) != readings(2)
+        volts, amps = np.array(readings(3)).T
+        assert set(volts) <= {239, 240, 241}
+        assert (volts == 240).mean() > 0.95
+        assert amps.mean() == pytest.approx(24.0, abs=0.1)
+        assert 0.2 < amps.std() < 0.6
+
+    def test_stop_ends_the_channel_that_it_names(self, device, load):
+        for channel in (1, 2):
+            device.write_object(COMMAND, 500, channel)
+        device.write_object(STOP, 2)
+        assert (device.read_object(0x2101, 1), device.read_object(0x2101, 2)) == (500, 0)
+        device.write_object(STOP, 7)
+        device.write_object(STOP, 1)
+        assert load.voltage == 0.0
+
+    def test_emergency_stop_and_its_release(self, device, load):
+        device.write_object(COMMAND, 500, 1)
+        device.write_object(EMERGENCY_STOP, 1)
+        assert load.voltage == 0.0
+        assert device.read_object(0x2112) == Fault.EMERGENCY_STOP
+        assert device.read_object(0x2111) & 0x08
+        assert device.read_object(0x1001) == 1
+        device.write_object(RELEASE, 1)
+        assert load.voltage == 12.0
+        assert device.read_object(0x2112) == device.read_object(0x1001) == 0
+
+    @pytest.mark.parametrize("fault", list(Fault))
+    def test_fault_drops_the_output(self, device, load, fault):
+        device.write_object(COMMAND, 500, 1)
+        device.trip(fault)
+        assert load.voltage == 0.0
+        assert device.read_object(0x2112) == fault
+        device.clear()
+        assert load.voltage == 12.0
+
+    def test_flags_of_the_channel(self, device, load):
+        device.write_object(COMMAND, 500, 1)
+        device.trip(ChannelFlag.STALL)
+        device.trip(ChannelFlag.AMPS_TRIGGER)
+        assert device.read_object(0x2122, 1) == 0x42
+        assert load.voltage == 12.0
+
+    @pytest.mark.parametrize(("volts", "fault"), [(4.9, Fault.UNDER_VOLTAGE), (60.1, Fault.OVER_VOLTAGE)])
+    def test_supply_beyond_its_range(self, device, load, volts, fault):
+        device.write_object(COMMAND, 500, 1)
+        device.battery_voltage = volts
+        assert device.battery_voltage == volts
+        assert (device.read_object(0x2112), load.voltage) == (fault, 0.0)
+        device.battery_voltage = 20.0
+        assert (device.read_object(0x2112), load.voltage) == (0, 10.0)
+
+    @pytest.mark.parametrize("output", ["average", "rms"])
+    def test_current_is_limited(self, clock, output):
+        device, load = make_device(clock, Resistor(1.0), amps_limit=6.0, output=output)
+        device.write_object(COMMAND, 1000, 1)
+        assert 5.9 < load.current <= 6.0
+        assert device.read_object(0x2122, 1) == ChannelFlag.AMPS_LIMIT
+        assert device.read_object(0x2101, 1) == 1000
+        device.write_object(COMMAND, 10, 1)
+        assert device.read_object(0x2122, 1) == 0
+
+    def test_power_is_limited(self, clock):
+        device, load = make_device(clock, power_limit=400)
+        device.write_object(COMMAND, 1000, 1)
+        assert load.voltage == pytest.approx(9.6)
+
+    @pytest.mark.parametrize("watchdog", [0.1, 1.0, 65.0])
+    def test_watchdog_expires_at_its_own_instant(self, clock, watchdog):
+        device, load = make_device(clock, watchdog=watchdog)
+        clock.sleep(0.3)
+        device.write_object(COMMAND, 500, 1)
+        clock.sleep(watchdog * 0.999)
+        assert device.power == 500
+        clock.sleep(3600.0)
+        assert device.power == 0
+        assert load.applied == [(0.3, 12.0), (0.3 + watchdog, 0.0)]
+        assert device.read_object(0x2101, 1) == 0
+        assert device.read_object(0x2111) == 0
+
+    def test_watchdog_is_fed_by_commands_and_not_by_queries(self, device, clock):
+        device.write_object(COMMAND, 500, 1)
+        for _ in range(10):
+            clock.sleep(0.9)
+            device.write_object(COMMAND, 0, 2)
+        assert device.power == 500
+        for _ in range(10):
+            clock.sleep(0.2)
+            device.read_object(0x2102, 1)
+            device.write_object(0x1017, 100)
+        assert device.power == 0
+
+    def test_watchdog_can_be_switched_off(self, clock):
+        device, _ = make_device(clock, watchdog=0.0)
+        device.write_object(COMMAND, 500, 1)
+        clock.sleep(1e5)
+        assert device.power == 500
+        assert device.deadline() == math.inf
+
+    def test_first_command_after_an_expiry_resumes_the_power_of_before(self, device, clock):
+        device.write_object(COMMAND, 500, 1)
+        clock.sleep(2.0)
+        device.write_object(COMMAND, 100, 1)
+        assert device.power == 500
+        device.write_object(COMMAND, 100, 1)
+        assert device.power == 100
+
+    @pytest.mark.parametrize(("index", "value", "sub"), [(COMMAND, 0, 2), (STOP, 2, 0), (RELEASE, 1, 0)])
+    def test_any_command_resumes(self, device, clock, index, value, sub):
+        device.write_object(COMMAND, 500, 1)
+        clock.sleep(2.0)
+        device.write_object(index, value, sub)
+        assert device.power == 500
+
+    def test_command_of_zero_resumes_nothing(self, device, load, clock):
+        device.write_object(COMMAND, 500, 1)
+        clock.sleep(2.0)
+        device.write_object(COMMAND, 0, 1)
+        device.write_object(COMMAND, 100, 1)
+        assert [volts for _, volts in load.applied] == [12.0, 0.0, pytest.approx(2.4)]
+
+    def test_splitting_the_time_does_not_matter(self):
+        def expiry(pieces):
+            clock = VirtualClock()
+            device, load = make_device(clock)
+            device.write_object(COMMAND, 500, 1)
+            for _ in range(pieces):
+                clock.sleep(8.0 / pieces)
+                device.read_object(0x2112)
+            return load.applied
+
+        assert expiry(1) == expiry(8) == expiry(64)
+
+    def test_heartbeats_of_a_silence_are_few(self, device, clock):
+        assert device.heartbeats() == []
+        clock.sleep(0.1)
+        assert device.heartbeats() == [NodeState.OPERATIONAL]
+        assert device.heartbeats() == []
+        clock.sleep(0.25)
+        assert len(device.heartbeats()) == 2
+        clock.sleep(0.05)
+        assert len(device.heartbeats()) == 1
+        clock.sleep(1e6)
+        assert len(device.heartbeats()) == 4
+        device.write_object(0x1017, 0)
+        clock.sleep(10.0)
+        assert device.heartbeats() == []
+        device.unplug()
+        device.write_object(0x1017, 50)
+        clock.sleep(10.0)
+        assert device.heartbeats() == []
+        clock.sleep(10.0)
+        device.plug_in()
+        assert device.heartbeats() == []
+        clock.sleep(0.05)
+        assert device.heartbeats() == [NodeState.OPERATIONAL]
+
+    def test_restart_forgets_the_command(self, device, load):
+        device.write_object(COMMAND, 500, 1)
+        device.write_object(EMERGENCY_STOP, 1)
+        device.power_cycle()
+        assert device.read_object(0x2112) == 0
+        assert load.voltage == 0.0
+        assert device.heartbeats() == [NodeState.BOOT_UP]
+
+    def test_reset_of_the_communication_keeps_the_output(self, device, load):
+        device.write_object(COMMAND, 500, 1)
+        device.manage(130)
+        assert load.voltage == 12.0
+        assert device.heartbeats() == [NodeState.BOOT_UP]
+        device.manage(129)
+        assert load.voltage == 0.0
+        device.manage(77)
+        assert device.state is NodeState.OPERATIONAL
+
+    def test_supply_that_is_switched_off(self, device):
+        device.battery_voltage = 0.0
+        device._trips = Fault(0)
+        with pytest.raises(DeviceError, match="under voltage"):
+            device.set(1.0)
+
+
+# What the manual prints, with the standard command bytes where it leaves the bits e and s clear.
+VECTORS = [
+    ("battery 24.0 V", b"t6018400D210200000000\r", b"t58184B0D2102F0000000\r"),
+    ("simplified query", b"t6018480D21020A000000\r", b"t58184B0D2102F0000000\r"),
+    ("emergency stop", b"t60182F0C200001000000\r", b"t5818600C200000000000\r"),
+    ("simplified emergency stop", b"t60182C0C200001000000\r", b"t5818600C200000000000\r"),
+    ("command 500", b"t601823002001F4010000\r", b"t58186000200100000000\r"),
+    ("command −500", b"t6018230020010CFEFFFF\r", b"t58186000200100000000\r"),
+    ("simplified command", b"t601820002001F4010000\r", b"t58186000200100000000\r"),
+    ("without its size", b"t601822002001F4010000\r", b"t58186000200100000000\r"),
+    ("heartbeat time", b"t60184017100000000000\r", b"t58184B17100064000000\r"),
+    ("device type", b"t60184000100000000000\r", b"t58184300100091010F00\r"),
+    ("temperature", b"t6018400F210100000000\r", b"t58184F0F210120000000\r"),
+    ("lower case", b"t6018400d210200000000\r", b"t58184B0D2102F0000000\r"),
+    ("no object", b"t60184000300000000000\r", b"t58188000300000000206\r"),
+    ("no subindex", b"t60184000200900000000\r", b"t58188000200911000906\r"),
+    ("write-only", b"t60184000200100000000\r", b"t58188000200101000106\r"),
+    ("read-only", b"t60182B02210100000000\r", b"t58188002210102000106\r"),
+    ("wrong length", b"t60182F00200101000000\r", b"t58188000200110000706\r"),
+    ("out of range", b"t601823002001E9030000\r", b"t58188000200130000906\r"),
+    ("segmented download", b"t60182100200104000000\r", b"t58188000200100000106\r"),
+    ("block upload", b"t6018A00D210200000000\r", b"t5818800D210201000405\r"),
+    ("segment of nothing", b"t60186000000000000000\r", b"t58188000000001000405\r"),
+    ("abort", b"t6018800D210200000000\r", b""),
+    ("another node", b"t6028400D210200000000\r", b""),
+    ("too short", b"t6017400D2102000000\r", b""),
+    ("empty", b"t6010\r", b""),
+    ("remote", b"r6018\r", b""),
+]
+
+
+class TestAdapter:
+    @pytest.mark.parametrize(("sent", "received"), [row[1:] for row in VECTORS], ids=[row[0] for row in VECTORS])
+    def test_bytes(self, server, sent, received):
+        assert server.receive(sent) == b"z\r" + received
+
+    def test_device_name_in_segments(self, server):
+        assert server.receive(b"t60184008100000000000\r") == b"z\rt5818410810000F000000\r"
+        assert server.receive(b"t60186000000000000000\r") == b"z\rt581800526F626F746571\r"
+        assert server.receive(b"t60187000000000000000\r") == b"z\rt58181020534443323136\r"
+        assert server.receive(b"t60186000000000000000\r") == b"z\rt58180D30000000000000\r"
+        assert server.receive(b"t60187000000000000000\r").startswith(b"z\rt581880")
+
+    def test_wrong_toggle_bit_ends_the_transfer(self, server):
+        server.receive(b"t60184008100000000000\r")
+        assert server.receive(b"t60187000000000000000\r") == b"z\rt58188008100000000305\r"
+        assert server.receive(b"t60186000000000000000\r") == b"z\rt58188008100001000405\r"
+
+    def test_abort_of_the_host_ends_the_transfer(self, server):
+        server.receive(b"t60184008100000000000\r")
+        server.receive(b"t60188008100000000000\r")
+        assert server.receive(b"t60186000000000000000\r").startswith(b"z\rt581880")
+
+    def test_what_python_can_sends_on_opening(self, device):
+        server = CanopenSlcanServer(device)
+        assert server.receive(b"C\rS4\r\rO\rO\r") == b"\r" * 5
+        assert server.receive(b"C\r") == b"\r"
+
+    @pytest.mark.parametrize(
+        "line",
+        [b"t60184", b"t601840", b"t601940" * 18, b"t80180" * 16, b"T6018", b"x", b"S9", b"Z1", b"\xff"],
+    )
+    def test_lines_that_make_no_sense(self, server, line):
+        assert server.receive(line + b"\r") == b"\a"
+        assert server.receive(b"t6018400D210200000000\r").startswith(b"z\rt58184B")
+
+    def test_closed_channel_and_listening(self, device):
+        server = CanopenSlcanServer(device)
+        frame = b"t6018400D210200000000\r"
+        assert server.receive(frame) == b"\a"
+        assert server.receive(b"S4\rL\r" + frame) == b"\r\r\a"
+        assert server.receive(b"C\rO\r" + frame).endswith(b"0000\r")
+        assert server.receive(b"S4\r") == b"\a"
+        assert server.receive(b"Z0\r") == b"\a"
+
+    def test_questions_to_the_adapter(self, device):
+        server = CanopenSlcanServer(device)
+        assert server.receive(b"V\rN\rZ0\rF\r") == b"V1013\rNEMUL\r\r\a"
+        assert server.receive(b"S4\rO\rF\r") == b"\r\rF00\r"
+
+    def test_long_frames_go_through_and_nobody_answers(self, server):
+        assert server.receive(b"T000006018400D210200000000\r") == b"Z\r"
+        assert server.receive(b"R000006018\r") == b"Z\r"
+
+    @pytest.mark.parametrize("code", [code for code in BITRATES if code != b"S4"])
+    def test_other_bit_rates_reach_nobody(self, device, clock, code):
+        server = CanopenSlcanServer(device)
+        server.receive(code + b"\rO\r")
+        clock.sleep(1.0)
+        assert server.receive(b"t6018400D210200000000\r") == b"z\r"
+
+    def test_pieces(self, server):
+        whole = b"t6018400D210200000000\r"
+        answers = [server.receive(bytes((byte,))) for byte in whole]
+        assert answers[:-1] == [b""] * (len(whole) - 1)
+        assert answers[-1] == b"z\rt58184B0D2102F0000000\r"
+        assert len(server.receive(whole * 3)) == 3 * len(answers[-1])
+
+    def test_heartbeats_come_before_the_answer(self, server, clock):
+        clock.sleep(0.25)
+        assert server.receive(b"t6018400D210200000000\r") == b"t701105\r" * 2 + b"z\rt58184B0D2102F0000000\r"
+        assert server.receive(b"\r") == b"\r"
+        server.receive(b"C\r")
+        clock.sleep(1.0)
+        assert server.receive(b"O\r") == b"\r"
+
+    def test_network_management(self, server, device, clock):
+        query = b"t6018400D210200000000\r"
+        assert server.receive(b"t00020201\r") == b"z\r"
+        assert device.state is NodeState.STOPPED
+        assert server.receive(query) == b"z\r"
+        clock.sleep(0.1)
+        assert server.receive(b"\r") == b"t701104\r\r"
+        assert server.receive(b"t00028000\r") == b"z\r"
+        assert server.receive(query).startswith(b"z\rt5818")
+        clock.sleep(0.1)
+        assert server.receive(b"\r") == b"t70117F\r\r"
+        assert server.receive(b"t00020105\rt000101\r") == b"z\rz\r"
+        assert device.state is NodeState.PRE_OPERATIONAL
+        assert server.receive(b"t00020101\r") == b"z\r"
+        assert device.state is NodeState.OPERATIONAL
+        assert server.receive(b"t00028101\r") == b"z\rt701100\r"
+
+    def test_faults_of_the_line(self, server, device):
+        query = b"t6018400D210200000000\r"
+        device.drop_next_answer()
+        assert server.receive(query) == b"z\r"
+        device.damage_next_answer()
+        assert server.receive(query) == b"z\rt58184B0D21\r"
+        assert server.receive(query) == b"z\rt58184B0D2102F0000000\r"
+        device.unplug()
+        assert server.receive(query) == b"z\r"
+
+    def test_line_without_an_end_is_dropped(self, server):
+        assert server.receive(b"t" * (LONGEST_LINE + 1)) == b""
+        assert server.receive(b"6" * 10**6) == b""
+        assert len(server._received) <= LONGEST_LINE
+        assert server.receive(b"\rt6018400D210200000000\r") == b"\az\rt58184B0D2102F0000000\r"
+
+    @given(st.lists(st.one_of(st.binary(max_size=80), st.sampled_from([b"\r", b"O\r", b"C\r", b"S4\r", b"t"]))))
+    @example([b"O\r", b"t601\r" * 100])
+    @example([b"t\xb2\xb3\xb9\r"])
+    def test_no_bytes_bring_it_down(self, pieces):
+        server = CanopenSlcanServer(make_device()[0])
+        for piece in pieces:
+            server.receive(piece)
+            assert len(server._received) <= LONGEST_LINE
+        server.receive(b"\rC\rS4\rO\r")
+        server.receive(b"t00020101\r")
+        assert server.receive(b"t60184001100000000000\r").endswith(b"t58184F01100000000000\r")
+
+    @given(st.lists(st.tuples(st.sampled_from([0x000, 0x601, 0x701, 0x201]), st.binary(max_size=8)), max_size=30))
+    def test_no_frame_brings_it_down(self, frames):
+        server = CanopenSlcanServer(make_device()[0])
+        server.receive(b"S4\rO\r")
+        for identifier, data in frames:
+            line = b"t%03X%d%s\r" % (identifier, len(data), data.hex().encode())
+            answer = server.receive(line)
+            assert answer.startswith(b"z\r")
+            if identifier == 0x601 and len(answer) > 2:
+                assert len(answer) == 2 + 22
+
+    @given(st.sampled_from(NUMBERS), st.integers(0, 255), st.binary(min_size=4, max_size=4))
+    def test_answer_names_its_object(self, key, command, data):
+        server = CanopenSlcanServer(make_device()[0])
+        server.receive(b"S4\rO\r")
+        request = bytes((command,)) + struct.pack("<HB", *key) + data
+        answer = server.receive(b"t6018%s\r" % request.hex().encode())[2:]
+        if command >> 5 in (0, 1, 2, 5, 6, 7):
+            assert bytes.fromhex(answer[7:13].decode()) == request[1:4]
+
+
+class Bus:
+    """A canopen network whose frames go to a server in the same thread, as slcan lines."""
+
+    def __init__(self, canopen, server):
+        class Network(canopen.Network):
+            def send_message(network, can_id, data, remote=False):
+                line = b"%s%03X%d%s\r" % (b"r" if remote else b"t", can_id, len(data), bytes(data).hex().encode())
+                self.take(server.receive(line))
+
+        self.network = Network()
+        self.take(server.receive(b"S4\rO\r"))
+
+    def take(self, received):
+        for line in received.split(b"\r"):
+            if line.startswith(b"t"):
+                self.network.notify(int(line[1:4], 16), bytearray.fromhex(line[5:].decode()), 0.0)
+
+
+def dictionary(canopen):
+    types = canopen.objectdictionary.datatypes
+    codes = {
+        "S8": types.INTEGER8,
+        "U8": types.UNSIGNED8,
+        "S16": types.INTEGER16,
+        "U16": types.UNSIGNED16,
+        "S32": types.INTEGER32,
+        "U32": types.UNSIGNED32,
+        "text": types.VISIBLE_STRING,
+    }
+    objects = canopen.ObjectDictionary()
+    for (index, sub), row in DICTIONARY.items():
+        variable = canopen.objectdictionary.ODVariable(f"{index:04X}sub{sub}", index, sub)
+        variable.data_type = codes[row.kind]
+        if any(other == index and number for other, number in DICTIONARY):
+            if index not in objects:
+                objects.add_object(canopen.objectdictionary.ODRecord(f"{index:04X}", index))
+            objects[index].add_member(variable)
+        else:
+            objects.add_object(variable)
+    return objects
+
+
+class TestIndependentClient:
+    """The package canopen as the host, with no driver of ours in between."""
+
+    @pytest.fixture
+    def canopen(self):
+        return pytest.importorskip("canopen")
+
+    @pytest.fixture
+    def node(self, canopen, server):
+        bus = Bus(canopen, server)
+        return bus.network.add_node(1, dictionary(canopen))
+
+    def test_reads_every_object(self, canopen, node, device):
+        for (index, sub), row in DICTIONARY.items():
+            remote = node.sdo[index]
+            remote = remote if isinstance(remote, canopen.sdo.base.SdoVariable) else remote[sub]
+            if row.readable:
+                assert remote.raw == device.read_object(index, sub)
+            else:
+                with pytest.raises(canopen.SdoAbortedError) as caught:
+                    _ = remote.raw
+                assert caught.value.code == AbortCode.WRITE_ONLY
+
+    def test_drives_the_load(self, node, load):
+        node.sdo[COMMAND][1].raw = 500
+        assert load.voltage == 12.0
+        node.sdo[COMMAND][1].raw = -1000
+        assert load.voltage == -24.0
+        node.sdo[EMERGENCY_STOP].raw = 1
+        assert load.voltage == 0.0
+        node.sdo[COMMAND][1].raw = 0
+        node.sdo[RELEASE].raw = 1
+        assert node.sdo[0x2112].raw == 0
+
+    def test_is_told_what_is_wrong(self, canopen, node):
+        for call, code in (
+            (lambda: node.sdo.upload(0x3000, 0), AbortCode.NO_OBJECT),
+            (lambda: node.sdo.upload(0x2100, 9), AbortCode.NO_SUBINDEX),
+            (lambda: node.sdo.download(0x2102, 1, b"\0\0"), AbortCode.READ_ONLY),
+            (lambda: node.sdo.download(COMMAND, 1, b"\0\0"), AbortCode.LENGTH),
+            (lambda: node.sdo.download(COMMAND, 1, struct.pack("<i", 2000)), AbortCode.VALUE),
+        ):
+            with pytest.raises(canopen.SdoAbortedError) as caught:
+                call()
+            assert caught.value.code == code
+
+    def test_sees_heartbeats_and_manages_the_node(self, node, clock, device):
+        for command, state in (
+            ("PRE-OPERATIONAL", NodeState.PRE_OPERATIONAL),
+            ("OPERATIONAL", NodeState.OPERATIONAL),
+        ):
+            node.nmt.state = command
+            assert device.state is state
+            node.nmt._state = 0
+            clock.sleep(0.1)
+            assert node.sdo[0x2112].raw == 0
+            assert node.nmt.state == command
+        with node.nmt.state_update:
+            node.nmt._state_received = None
+        node.nmt.send_command(0x81)
+        assert node.nmt._state_received == 0
+
+    @pytest.mark.timeout(60)
+    def test_over_python_can_and_a_pseudo_terminal(self, canopen):
+        device, load = make_device(WallClock(), watchdog=0.0)
+        with Terminal(CanopenSlcanServer(device)) as path:
+            network = canopen.Network()
+            network.connect(interface="slcan", channel=path, bitrate=125_000, sleep_after_open=0)
+            try:
+                node = network.add_node(1, dictionary(canopen))
+                assert node.sdo[0x1008].raw == "Roboteq SDC2160"
+                node.sdo[COMMAND][1].raw = 250
+                assert load.voltage == 6.0
+                assert node.sdo[0x210D][2].raw == 240
+            finally:
+                network.disconnect()
+
+
+@pytest.mark.timeout(60)
+def test_driver_over_a_pseudo_terminal():
+    clock = WallClock()
+    device, load = make_device(clock, watchdog=0.0)
+    with Terminal(CanopenSlcanServer(device)) as path:
+        settings = RoboteqSupply.Settings(
+            port=path, output="average", voltage_limits=(0, 12), watchdog=0, heartbeat=5, timeout=2
+        )
+        supply = RoboteqSupply.connect("supply", settings, clock)
+        try:
+            supply.set(6.0).wait()
+            clock.sleep(0.3)
+            assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
+            assert supply._line.heartbeat_age() < 0.2
+            supply.safe()
+            assert load.voltage == 0.0
+        finally:
+            supply.close()
+        with pytest.raises(DeviceConnectionError, match=r"no answer within 0\.05 s .* node 2"):
+            RoboteqSupply.connect("supply", settings.model_copy(update={"node": 2, "timeout": 0.05}), clock)
+
+
+class Terminal:
+    """A pseudo-terminal that is served by a thread; `with` gives its path."""
+
+    def __init__(self, server):
+        self.server = server
+
+    def __enter__(self):
+        self.master, self.slave = os.openpty()
+        for end in (self.master, self.slave):
+            tty.setraw(end)
+        self.wake, self.stop = os.pipe()
+        self.failures = queue.Queue()
+        self.thread = threading.Thread(target=self.serve, daemon=True)
+        self.thread.start()
+        return os.ttyname(self.slave)
+
+    def serve(self):
+        try:
+            while True:
+                ready, _, _ = select.select([self.master, self.wake], [], [])
+                if self.wake in ready:
+                    return
+                os.write(self.master, self.server.receive(os.read(self.master, 4096)))
+        except Exception as error:
+            self.failures.put(error)
+
+    def __exit__(self, *_):
+        os.close(self.stop)
+        self.thread.join()
+        for end in (self.master, self.slave, self.wake):
+            os.close(end)
+        assert self.failures.empty(), self.failures.get()
