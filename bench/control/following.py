@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from bench.control.baselines import IntegralParameters, saturation
@@ -39,7 +40,7 @@ class FollowingParameters:
             raise ValueError(f"lead: expected a number of periods, at least 0, got {self.lead}")
 
 
-class _Follower(Actuator):
+class _Follower(Actuator, ABC):
     """What the followers share: the last reference and what was made of it."""
 
     def __init__(
@@ -77,9 +78,9 @@ class _Follower(Actuator):
             self._setpoint = self._clip(self._answer_to(step, output))
         return self._setpoint
 
+    @abstractmethod
     def _answer_to(self, step: float, output: float) -> float:
         """Return the wanted set-point; `step` is what the reference has moved in one period."""
-        raise NotImplementedError
 
 
 class OpenLoopFollower(_Follower):

@@ -24,6 +24,7 @@ nonmonotonic hysteresis in VO2-coated microactuators*, IEEE/ASME Transactions on
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
@@ -285,7 +286,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
     return 2.0 * low - high, 2.0 * high - low
 
 
-class Scripted(Actuator):
+class Scripted(Actuator, ABC):
     """A target controller as a script: a generator that yields commands and is sent readings."""
 
     _poll = 0.1
@@ -348,8 +349,9 @@ class Scripted(Actuator):
         self._done = command.done
         return command
 
+    @abstractmethod
     def _run(self, target: float, reading: Reading) -> Script:
-        raise NotImplementedError
+        """Return the script that leads to a target."""
 
     def _command(self, setpoint: float, wait: float, done: bool = False) -> Command:
         """Return a command whose set-point is within the limits."""

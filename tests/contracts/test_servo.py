@@ -1,0 +1,556 @@
+"""What the role of a servo promises, of the emulated device itself and of the driver over the wire."""
+
+import itertools
+import math
+import os
+import select
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from bench.clock import VirtualClock, WallClock
+from bench.devices import Servo, role_of
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from drivers.dynamixel import DynamixelMX28
+from sim_devices.instruments.dynamixel import (
+    ACCELERATION_UNIT,
+    COUNT,
+    VELOCITY_UNIT,
+    EmulatedMX28,
+    ErrorNumber,
+    HardwareError,
+    RequestRefusedError,
+)
+from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire.dynamixel2 import Dynamixel2Server
+from sim_devices.world import World
+
+WATCHDOG = 2.5
+VELOCITY = 42 * VELOCITY_UNIT
+ACCELERATION = 10 * ACCELERATION_UNIT
+TURN = 2.0 * math.pi
+
+
+class Pendulum:
+    """Weighs on the shaft by at most `weight` N·m, and notes where it saw the shaft."""
+
+    def __init__(self):
+        self.weight = 0.0
+        self.stop = math.inf
+        self.time = 0.0
+        self.servo = None
+        self.seen = []
+
+    def torque(self, angle):
+        beyond = max(angle - self.stop, 0.0)
+        return -self.weight * math.sin(angle) - 1e4 * beyond
+
+    def advance(self, dt):
+        self.time += dt
+        if self.servo is not None:
+            self.seen.append((self.time, self.servo.position))
+
+
+@dataclass
+class Bench:
+    """One device under test and what is behind it."""
+
+    clock: VirtualClock
+    device: Servo
+    instrument: EmulatedMX28
+    plant: Pendulum
+    connect: Callable[..., Servo] | None
+    requests: list = field(default_factory=list)
+
+    def where(self):
+        """Return where the shaft is at the clock's present time, rad, without asking the device."""
+        self.instrument.world.advance()
+        return self.instrument.position
+
+    def beyond(self):
+        """Return angles that are not allowed."""
+        low, high = self.device.limits.low, self.device.limits.high
+        return low - 1e-3, high + 1e-3, math.nan, math.inf, -math.inf
+
+
+class RecordingServer:
+    def __init__(self, server, requests):
+        self.server = server
+        self.requests = requests
+
+    def receive(self, data):
+        self.requests.append(data)
+        return self.server.receive(data)
+
+
+names = (f"contract-servo-{number}" for number in itertools.count())
+
+
+def make_bench(kind, loaded):
+    clock, plant = VirtualClock(), Pendulum()
+    instrument = EmulatedMX28("servo", World(plant, clock), plant if loaded else None)
+    plant.servo = instrument
+    if kind == "emulated":
+        for address, value in ((11, 4), (108, 10), (112, 42), (98, 125)):
+            instrument.write_item(address, value)
+        return Bench(clock, instrument, instrument, plant, None), None
+    requests = []
+    name = next(names)
+    port = register(name, RecordingServer(Dynamixel2Server([instrument]), requests), clock)
+
+    def connect(kind=DynamixelMX28.connect, **changes):
+        keys = {
+            "port": port,
+            "position_limits": (-4 * math.pi, 6 * math.pi),
+            "profile_velocity": 1.0072,
+            "profile_acceleration": 3.746,
+            "watchdog": WATCHDOG,
+        }
+        return kind("servo", DynamixelMX28.Settings(**keys | changes), clock)
+
+    return Bench(clock, connect(), instrument, plant, connect, requests), name
+
+
+@pytest.fixture(params=["emulated", "driver"])
+def bench(request):
+    bench, name = make_bench(request.param, loaded=False)
+    yield bench
+    if name is not None:
+        bench.device.close()
+        unregister(name)
+
+
+@pytest.fixture(params=["emulated", "driver"])
+def loaded(request):
+    bench, name = make_bench(request.param, loaded=True)
+    yield bench
+    if name is not None:
+        bench.device.close()
+        unregister(name)
+
+
+def test_role_and_identity(bench):
+    assert role_of(type(bench.device)) == "servo"
+    assert str(bench.device.identity) == "ROBOTIS MX-28, serial number id 1, firmware 45"
+    assert bench.device.name == "servo"
+    assert bench.device.parent is None
+
+
+def test_nothing_moves_before_the_first_set_point(bench):
+    bench.clock.sleep(2.0)
+    assert not bench.device.torque_enabled
+    assert math.isnan(bench.device.setpoint)
+    assert {position for _, position in bench.plant.seen} == {math.pi}
+
+
+def test_signals_readings_and_units_agree(bench):
+    device = bench.device
+    expected = [("servo_position", "rad"), ("servo_velocity", "rad/s"), ("servo_load", "1")]
+    assert [(signal.name, signal.unit) for signal in device.signals] == expected
+    names = [signal.name for signal in device.signals]
+    assert list(device.measure()) == list(device.glance()) == names
+    readings, keys = device.read(), device.describe()
+    assert list(readings) == list(keys) == names
+    for signal in device.signals:
+        assert keys[signal.name]["units"] == signal.unit
+        assert keys[signal.name]["source"] == f"MX-28:id 1:{signal.name}"
+        assert readings[signal.name]["timestamp"] == pytest.approx(bench.clock.timestamp(), abs=0.1)
+    assert device.setpoint_signal.unit == device.limits.unit == "rad"
+
+
+@pytest.mark.parametrize("goal", [3.5, 1.25, 0.0, -2.0, 2.5 * TURN, -1.5 * TURN])
+def test_arrives_and_holds(bench, goal):
+    start = bench.clock.now()
+    status = bench.device.set(goal)
+    assert not status.update()
+    assert bench.device.torque_enabled
+    assert bench.device.setpoint == goal
+    status.wait()
+    assert status.success
+    distance = abs(goal - math.pi)
+    if distance * ACCELERATION >= VELOCITY**2:
+        expected = distance / VELOCITY + VELOCITY / ACCELERATION
+    else:
+        expected = 2.0 * math.sqrt(distance / ACCELERATION)
+    assert bench.clock.now() - start == pytest.approx(expected, abs=0.15)
+    for _ in range(5):
+        bench.clock.sleep(2.0)
+        values = bench.device.glance()
+        assert values["servo_position"] == pytest.approx(goal, abs=0.5 * COUNT + 1e-9)
+        assert values["servo_velocity"] == 0.0
+    assert bench.where() == pytest.approx(goal, abs=0.5 * COUNT + 1e-9)
+
+
+def test_where_it_stands_already_it_has_arrived_at_once(bench):
+    status = bench.device.set(math.pi)
+    assert status.update()
+    assert status.success
+
+
+def test_velocity_on_the_way_is_that_of_the_profile(bench):
+    for goal, sign in ((9.0, 1), (-3.0, -1)):
+        status = bench.device.set(goal)
+        bench.clock.sleep(1.0)
+        values = bench.device.measure()
+        assert values["servo_velocity"] == pytest.approx(sign * VELOCITY, abs=VELOCITY_UNIT)
+        status.wait()
+
+
+def test_plant_sees_the_way_in_small_steps(bench):
+    bench.device.set(5.0).wait()
+    positions = [position for _, position in bench.plant.seen]
+    steps = [after - before for before, after in itertools.pairwise(positions)]
+    assert all(0.0 <= step <= 0.0201 * VELOCITY for step in steps)
+    assert positions[-1] == pytest.approx(5.0, abs=COUNT)
+
+
+def test_new_goal_on_the_way_turns_round_without_a_jump(bench):
+    first = bench.device.set(9.0)
+    bench.clock.sleep(1.5)
+    bench.device.set(2.0).wait()
+    assert bench.device.measure()["servo_position"] == pytest.approx(2.0, abs=COUNT)
+    with pytest.raises(DeviceError, match="replaced"):
+        first.wait()
+    steps = [b - a for (_, a), (_, b) in itertools.pairwise(bench.plant.seen)]
+    assert max(map(abs, steps)) <= 0.0201 * VELOCITY
+
+
+def test_beyond_the_limits_nothing_is_sent(bench):
+    requests, goal = len(bench.requests), bench.instrument.read_item(116)
+    for value in bench.beyond():
+        with pytest.raises(LimitError, match=r"servo: set-point .* is outside of "):
+            bench.device.set(value)
+        with pytest.raises(LimitError):
+            bench.device.check(value)
+    assert len(bench.requests) == requests
+    assert bench.instrument.read_item(116) == goal
+    assert math.isnan(bench.device.setpoint)
+    assert not bench.device.torque_enabled
+
+
+def test_limits_themselves_are_allowed(bench):
+    for value in (bench.device.limits.low, bench.device.limits.high):
+        bench.device.check(value)
+        bench.device.set(value)
+        bench.device.stop()
+
+
+def test_stop_holds_the_angle_of_the_moment(bench):
+    status = bench.device.set(9.0)
+    bench.clock.sleep(2.0)
+    bench.device.stop()
+    held = bench.device.setpoint
+    assert math.pi + 1.0 < held < math.pi + 2.1
+    for _ in range(3):
+        bench.clock.sleep(1.0)
+        assert bench.device.measure()["servo_position"] == pytest.approx(held, abs=0.02)
+    assert bench.device.torque_enabled
+    with pytest.raises(DeviceError, match="replaced"):
+        status.wait()
+
+
+def test_stop_does_nothing_while_the_torque_is_off(bench):
+    bench.device.stop()
+    bench.device.stop(success=False)
+    assert not bench.device.torque_enabled
+    assert math.isnan(bench.device.setpoint)
+
+
+def test_safe_switches_the_torque_off_and_again_changes_nothing(bench):
+    bench.device.set(9.0)
+    bench.clock.sleep(1.0)
+    bench.device.safe()
+    assert not bench.device.torque_enabled
+    where = bench.where()
+    bench.device.safe()
+    bench.clock.sleep(10.0)
+    assert bench.where() == where
+    assert not bench.device.torque_enabled
+    assert bench.device.measure()["servo_velocity"] == 0.0
+
+
+def test_no_jump_to_the_goal_of_before(bench):
+    status = bench.device.set(9.0)
+    bench.clock.sleep(1.0)
+    bench.device.safe()
+    with pytest.raises(DeviceError, match="torque was switched off"):
+        status.wait()
+    where = bench.where()
+    bench.plant.seen.clear()
+    bench.device.set(where - 0.5).wait()
+    assert max(position for _, position in bench.plant.seen) <= where + COUNT
+
+
+def test_safe_from_an_error_state(bench):
+    bench.device.set(9.0)
+    bench.instrument.trip(HardwareError.OVERLOAD)
+    bench.device.safe()
+    bench.device.safe()
+    assert not bench.device.torque_enabled
+
+
+def test_safe_of_a_device_that_does_not_answer_raises(bench):
+    bench.device.set(9.0)
+    bench.instrument.unplug()
+    with pytest.raises(DeviceError, match="servo: "):
+        bench.device.safe()
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (HardwareError.INPUT_VOLTAGE, r"0x01 \(input voltage"),
+        (HardwareError.OVERHEATING, r"0x04 \(overheating"),
+        (HardwareError.MOTOR_ENCODER, r"0x08 \(motor encoder"),
+        (HardwareError.ELECTRICAL_SHOCK, r"0x10 \(electrical shock"),
+        (HardwareError.OVERLOAD, r"0x20 \(overload"),
+    ],
+)
+def test_every_call_tells_of_a_hardware_error(bench, error, text):
+    status = bench.device.set(9.0)
+    bench.instrument.trip(error)
+    for call in (bench.device.measure, bench.device.glance, bench.device.read, lambda: bench.device.set(5.0)):
+        with pytest.raises(DeviceError, match=f"servo: hardware error {text}"):
+            call()
+    with pytest.raises(DeviceError, match=f"hardware error {text}"):
+        status.wait()
+    assert status.done
+    assert not status.success
+    # As delivered, an encoder or a voltage error leaves the torque on.
+    assert bench.device.torque_enabled is (error in (HardwareError.INPUT_VOLTAGE, HardwareError.MOTOR_ENCODER))
+
+
+def test_silence_of_the_host_stops_the_shaft_at_that_instant(bench):
+    status = bench.device.set(15.0)
+    bench.device.glance()
+    last_request = bench.clock.now()
+    bench.clock.sleep(3600.0)
+    assert bench.where() == pytest.approx(math.pi + VELOCITY * WATCHDOG, abs=0.3)
+    held = bench.where()
+    seen = [instant for instant, position in bench.plant.seen if position != held]
+    # The answer to the last request took some milliseconds of the wire.
+    assert seen[-1] <= last_request + WATCHDOG
+    assert seen[-1] == pytest.approx(last_request + WATCHDOG, abs=0.03)
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(5.0), status.wait):
+        with pytest.raises(DeviceError, match="bus watchdog"):
+            call()
+    assert bench.device.torque_enabled
+    bench.device.stop()
+    bench.device.safe()
+    assert not bench.device.torque_enabled
+    bench.device.measure()
+    bench.device.set(5.0).wait()
+
+
+def test_ticks_of_two_seconds_keep_it_going(bench):
+    bench.device.set(9.0)
+    for _ in range(100):
+        bench.clock.sleep(2.0)
+        bench.device.glance()
+    assert bench.device.torque_enabled
+    assert bench.instrument.read_item(98) == 125
+
+
+def test_device_that_stops_answering(bench):
+    status = bench.device.set(9.0)
+    bench.instrument.unplug()
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(5.0), status.wait):
+        with pytest.raises(DeviceConnectionError, match="servo: "):
+            call()
+
+
+def test_load_is_seen_and_holds_the_shaft_off_its_goal(loaded):
+    device = loaded.device
+    loaded.plant.weight = 0.1
+    device.set(0.5 * math.pi).wait()
+    values = device.measure()
+    # It pushes up by 0.1 N·m of the 2.5 that it has, and stands 133 counts · 0.04 below.
+    assert values["servo_load"] == pytest.approx(0.04, abs=1e-3)
+    assert values["servo_position"] == pytest.approx(0.5 * math.pi - 133 * 0.04 * COUNT, abs=COUNT)
+
+
+def test_shaft_that_is_blocked_ends_in_an_overload(loaded):
+    loaded.plant.stop = 4.0
+    status = loaded.device.set(6.0)
+    with pytest.raises(DeviceError, match="overload"):
+        status.wait()
+    assert loaded.where() == pytest.approx(4.0, abs=0.01)
+    assert not loaded.device.torque_enabled
+    loaded.device.safe()
+
+
+def test_torque_that_goes_off_lets_the_weight_fall(loaded):
+    loaded.plant.weight = 0.5
+    loaded.device.set(0.5 * math.pi)
+    loaded.clock.sleep(2.4)
+    loaded.device.safe()
+    loaded.clock.sleep(5.0)
+    # Down to where the gear holds it.
+    assert loaded.where() == pytest.approx(math.asin(0.1 / 0.5), abs=1e-3)
+
+
+def test_bluesky_finds_its_protocols(bench):
+    from bluesky.protocols import Movable, Readable, Stoppable
+
+    assert isinstance(bench.device, Readable)
+    assert isinstance(bench.device, Movable)
+    assert isinstance(bench.device, Stoppable)
+
+
+# What only a wire can do.
+
+
+over_the_wire = pytest.mark.parametrize("bench", ["driver"], indirect=True)
+
+
+@over_the_wire
+@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
+def test_spoilt_answer_is_asked_for_again(bench, fault):
+    bench.device.set(5.0).wait()
+    for call in (bench.device.measure, lambda: bench.device.set(4.0), bench.device.safe):
+        getattr(bench.instrument, fault)()
+        bench.requests.clear()
+        call()
+        assert bench.requests[0] == bench.requests[1]
+    assert not bench.device.torque_enabled
+
+
+@over_the_wire
+def test_nothing_is_worn_out(bench):
+    assert bench.instrument.eeprom_writes == 2  # operating mode and return delay, at the first connection
+    for target in range(-5, 5):
+        bench.device.set(float(target))
+    bench.device.safe()
+    bench.connect().close()
+    bench.connect(direction=-1, zero_counts=100).close()
+    bench.device.reboot()
+    assert bench.instrument.eeprom_writes == 2
+
+
+@over_the_wire
+def test_hardware_error_is_told_and_cleared_by_a_reboot(bench):
+    bench.device.set(5.0).wait()
+    bench.instrument.trip(HardwareError.OVERLOAD | HardwareError.OVERHEATING)
+    with pytest.raises(DeviceError, match=r"0x24 \(overheating, overload; 12\.0 V, 25 °C\): .*reboot"):
+        bench.device.measure()
+    with pytest.raises(RequestRefusedError) as refused:
+        bench.instrument.write_item(64, 1)
+    assert refused.value.reason is ErrorNumber.RESULT_FAIL
+    bench.device.reboot()
+    assert math.isnan(bench.device.setpoint)
+    assert not bench.device.torque_enabled
+    bench.device.set(4.0).wait()
+
+
+@over_the_wire
+def test_cause_that_is_still_there_survives_the_reboot(bench):
+    bench.instrument.supply(9.0)
+    with pytest.raises(DeviceError, match=r"input voltage; 9\.0 V"):
+        bench.device.measure()
+    with pytest.raises(DeviceError, match=r"input voltage; 9\.0 V"):
+        bench.device.reboot()
+    bench.instrument.supply(12.0)
+    bench.device.reboot()
+    bench.device.measure()
+
+
+@over_the_wire
+def test_error_of_before_is_refused_and_recovered(bench):
+    bench.instrument.trip(HardwareError.ELECTRICAL_SHOCK)
+    bench.device.close()
+    with pytest.raises(DeviceError, match=r"electrical shock.*recover"):
+        bench.connect()
+    device = bench.connect(DynamixelMX28.recover)
+    device.set(5.0).wait()
+    device.safe()
+    device.close()
+
+
+@over_the_wire
+def test_host_that_died_leaves_a_servo_that_the_next_one_takes_over(bench):
+    bench.device.set(15.0)
+    bench.device.close()
+    bench.clock.sleep(60.0)
+    assert bench.instrument.read_item(98) == -1
+    device = bench.connect()
+    assert not device.torque_enabled
+    assert bench.instrument.read_item(98) == 0
+    device.set(5.0).wait()
+    device.close()
+
+
+@over_the_wire
+def test_watchdog_is_idle_while_the_torque_is_off(bench):
+    bench.clock.sleep(100.0)
+    bench.device.measure()
+    bench.device.set(5.0).wait()
+    bench.device.safe()
+    bench.clock.sleep(100.0)
+    bench.device.measure()
+    bench.device.set(4.0).wait()
+
+
+@over_the_wire
+def test_zero_and_direction(bench):
+    device = bench.connect(zero_counts=2048, direction=-1, position_limits=(-3.0, 3.0))
+    assert device.measure()["servo_position"] == 0.0
+    status = device.set(1.0)
+    bench.clock.sleep(0.6)
+    assert device.measure()["servo_velocity"] == pytest.approx(VELOCITY, abs=VELOCITY_UNIT)
+    status.wait()
+    assert bench.where() == pytest.approx(math.pi - 1.0, abs=COUNT)
+    assert device.measure()["servo_position"] == pytest.approx(1.0, abs=COUNT)
+    device.stop()
+    assert device.setpoint == pytest.approx(1.0, abs=COUNT)
+    device.close()
+
+
+@over_the_wire
+def test_connecting_under_torque_switches_it_off(bench):
+    bench.device.set(9.0)
+    bench.device.close()
+    device = bench.connect()
+    assert not device.torque_enabled
+    device.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pty")
+def test_over_a_pty_in_the_time_of_the_room():
+    import tty
+
+    clock = WallClock()
+    instrument = EmulatedMX28("servo", World(Pendulum(), clock))
+    server = Dynamixel2Server([instrument])
+    ours, theirs = os.openpty()
+    tty.setraw(ours)
+    tty.setraw(theirs)
+    wake, ending = os.pipe()
+
+    def serve():
+        while wake not in (ready := select.select([ours, wake], [], [])[0]):
+            if ready:
+                os.write(ours, server.receive(os.read(ours, 4096)))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        settings = DynamixelMX28.Settings(
+            port=os.ttyname(theirs), timeout=2.0, position_limits=(0.0, 6.0), profile_velocity=5.0, watchdog=0.2
+        )
+        device = DynamixelMX28.connect("servo", settings, clock)
+        device.set(3.3).wait()
+        assert device.measure()["servo_position"] == pytest.approx(3.3, abs=COUNT)
+        clock.sleep(0.3)
+        with pytest.raises(DeviceError, match="bus watchdog"):
+            device.measure()
+        device.safe()
+        assert not device.torque_enabled
+        device.close()
+    finally:
+        os.write(ending, b"x")
+        thread.join()
+        for each in (ours, theirs, wake, ending):
+            os.close(each)

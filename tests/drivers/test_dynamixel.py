@@ -1,0 +1,723 @@
+"""The driver of the MX-28, against a scripted servo at the other end of its line."""
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bench.clock import VirtualClock
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from drivers import dynamixel
+from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelMX28
+from sim_devices.protocol_emulated import register, unregister
+
+PORT = "emulated://scripted-servo"
+COUNT = 2.0 * math.pi / 4096
+SIGNED = {116, 126, 128, 132}
+SIZES = {0: 2, 6: 1, 9: 1, 10: 1, 11: 1, 40: 4, 44: 4, 63: 1, 64: 1, 68: 1, 70: 1, 98: 1, 100: 2, 108: 4, 112: 4}
+SIZES |= {116: 4, 122: 1, 123: 1, 124: 2, 126: 2, 128: 4, 132: 4, 136: 4, 140: 4, 144: 2, 146: 1}
+
+
+def crc(data):
+    """Return the CRC, bit by bit."""
+    value = 0
+    for byte in data:
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (0x18005 if value & 0x8000 else 0)
+    return struct.pack("<H", value)
+
+
+def packet(servo_id, instruction, parameters=b""):
+    body = (bytes((instruction,)) + parameters).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+    head = b"\xff\xff\xfd\x00" + struct.pack("<BH", servo_id, len(body) + 2) + body
+    return head + crc(head)
+
+
+class Script:
+    """A servo of a few lines: a table of values, what it received, and answers put into its mouth.
+
+    `instead` holds, request by request, bytes to send in place of the right answer (None for the right
+    one); `refusals` error numbers by instruction and address.
+    """
+
+    def __init__(self):
+        self.values = dict.fromkeys(SIZES, 0) | {0: 30, 6: 45, 9: 250, 11: 3, 40: 32767, 44: 380, 63: 52, 68: 2}
+        self.values |= {126: 100, 128: -42, 132: 1000, 144: 121, 146: 31}
+        self.received = []
+        self.instead = []
+        self.refusals = {}
+        self.silent = False
+        self.keeps = set()
+        self.on_write = lambda _address, _value: None
+
+    def receive(self, data):
+        assert data[:4] == b"\xff\xff\xfd\x00"
+        assert crc(data[:-2]) == data[-2:]
+        self.received.append(data)
+        right = self.right_answer(data)
+        if self.silent:
+            return b""
+        if self.instead:
+            other = self.instead.pop(0)
+            if other is not None:
+                return other(data, right) if callable(other) else other
+        return right
+
+    def right_answer(self, data):
+        servo_id, instruction, parameters = data[4], data[7], data[8:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+        address = int.from_bytes(parameters[:2], "little")
+        error = self.refusals.get((instruction, address), 0)
+        content, level = b"", 2
+        if error:
+            pass
+        elif instruction == 1:
+            content, level = struct.pack("<HB", self.values[0], self.values[6]), 0
+        elif instruction == 2:
+            content, level = self.table(address, int.from_bytes(parameters[2:], "little")), 1
+        elif instruction == 3:
+            size = SIZES[address]
+            assert len(parameters) == 2 + size
+            value = int.from_bytes(parameters[2:], "little", signed=address in SIGNED)
+            self.on_write(address, value)
+            if address not in self.keeps:
+                self.values[address] = value
+        elif instruction == 8:
+            self.values |= {64: 0, 70: 0, 98: 0}
+            self.on_write("reboot", 0)
+        if self.values[68] < level:
+            return b""
+        flags = error | (0x80 if self.values[70] else 0)
+        return packet(servo_id, 0x55, bytes((flags,)) + content)
+
+    def table(self, address, length):
+        data = b""
+        while len(data) < length:
+            at = address + len(data)
+            data += (self.values[at]).to_bytes(SIZES[at], "little", signed=at in SIGNED)
+        assert len(data) == length
+        return data
+
+    def orders(self):
+        """Return address and value of all that was written, and the names of other orders, once each."""
+        orders = []
+        for data in dict.fromkeys(self.received):
+            if data[7] == 3:
+                address = int.from_bytes(data[8:10], "little")
+                orders.append((address, int.from_bytes(data[10:-2], "little", signed=address in SIGNED)))
+            elif data[7] == 8:
+                orders.append("reboot")
+        return orders
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def script(clock):
+    script = Script()
+    register("scripted-servo", script, clock)
+    yield script
+    unregister("scripted-servo")
+
+
+def make_settings(**changes):
+    keys = {"port": PORT, "position_limits": (-3.0, 3.0)}
+    return DynamixelMX28.Settings(**keys | changes)
+
+
+def connect(clock, **changes):
+    return DynamixelMX28.connect("servo", make_settings(**changes), clock)
+
+
+@pytest.fixture
+def servo(script, clock):
+    servo = connect(clock)
+    script.received.clear()
+    return servo
+
+
+# Packets.
+
+
+@pytest.mark.parametrize(
+    ("instruction", "parameters", "sent"),
+    [
+        (0x01, "", "FFFFFD00 01 0300 01 194E"),
+        (0x02, "84000400", "FFFFFD00 01 0700 02 84000400 1D15"),
+        (0x03, "7400FFFFFD00", "FFFFFD00 01 0A00 03 7400FFFFFDFD00 21E7"),
+        (0x03, "620005", "FFFFFD00 01 0600 03 620005 68E4"),
+        (0x03, "740000020000", "FFFFFD00 01 0900 03 740000020000 CA89"),
+        (0x08, "", "FFFFFD00 01 0300 08 2F4E"),
+    ],
+)
+def test_packets_of_the_maker(instruction, parameters, sent):
+    assert dynamixel._frame(1, instruction, bytes.fromhex(parameters)) == bytes.fromhex(sent)
+
+
+def test_answers_of_the_maker(script, clock):
+    line = dynamixel._Line("servo", make_settings(), clock)
+    script.instead = [bytes.fromhex("FFFFFD00 01 0800 55 00A6000000 8CC0")]
+    assert line.ask(0x02, bytes.fromhex("84000400"), 4) == b"\xa6\x00\x00\x00"
+    script.instead = [bytes.fromhex("FFFFFD00 01 0700 55 00060426 655D")]
+    assert line.ask(0x01, b"", 3) == b"\x06\x04\x26"
+    script.instead = [bytes.fromhex("FFFFFD00 01 0400 55 00 A10C")]
+    line.order(0x03, bytes.fromhex("740000020000"))
+
+
+@given(st.integers(0, 252), st.binary(max_size=30))
+def test_content_survives_the_stuffing(servo_id, content):
+    script, clock = Script(), VirtualClock()
+    register("stuffed-servo", script, clock)
+    try:
+        line = dynamixel._Line("servo", make_settings(port="emulated://stuffed-servo", id=servo_id), clock)
+        script.instead = [packet(servo_id, 0x55, b"\x00" + content)]
+        assert line.ask(0x10, b"\xff\xff\xfd\x00", len(content)) == content
+        assert script.received == [packet(servo_id, 0x10, b"\xff\xff\xfd\x00")]
+    finally:
+        unregister("stuffed-servo")
+
+
+@given(st.binary(max_size=60))
+def test_crc_is_that_of_the_polynomial(data):
+    assert struct.pack("<H", dynamixel._crc(data)) == crc(data)
+
+
+# Connecting.
+
+
+def test_identity(servo):
+    assert str(servo.identity) == "ROBOTIS MX-28, serial number id 1, firmware 45"
+
+
+def test_connecting_configures_and_leaves_the_torque_off(script, clock):
+    script.values |= {64: 1, 98: 255, 10: 1, 63: 1}
+    connect(clock, return_delay=100e-6)
+    assert script.orders() == [(64, 0), (98, 0), (11, 4), (10, 0), (9, 50), (63, 0b110101)]
+    script.received.clear()
+    connect(clock, return_delay=100e-6)
+    assert script.orders() == [(64, 0), (98, 0)]
+
+
+def test_torque_that_does_not_go_off_ends_the_connection_before_the_eeprom(script, clock):
+    script.values[64] = 1
+    script.keeps.add(64)
+    with pytest.raises(DeviceError, match="does not switch its torque off"):
+        connect(clock)
+    assert script.orders() == [(64, 0)]
+
+
+def test_eeprom_that_does_not_take_a_value(script, clock):
+    script.keeps.add(11)
+    with pytest.raises(DeviceError, match="keeps its operating mode at 3 instead of 4"):
+        connect(clock)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_servo_that_does_not_answer_everything_is_made_to(script, clock, level):
+    script.values[68] = level
+    servo = connect(clock)
+    assert script.values[68] == 2
+    assert servo.measure()["servo_position"] == pytest.approx(1000 * COUNT)
+
+
+def test_wrong_device(script, clock):
+    script.values[0] = 29
+    with pytest.raises(DeviceConnectionError, match=r"expected a Dynamixel MX-28 .* id 1, found model 29"):
+        connect(clock)
+    script.values |= {0: 30, 6: 38}
+    with pytest.raises(DeviceConnectionError, match=r"firmware 38, expected 39 or newer"):
+        connect(clock)
+    assert script.orders() == []
+
+
+def test_settings_beyond_the_limits_of_the_servo_are_told_by_their_key(script, clock):
+    for changes, key in (({44: 40}, "profile_velocity"), ({40: 4}, "profile_acceleration")):
+        script.values |= {40: 32767, 44: 380}
+        script.values |= changes
+        with pytest.raises(ConfigurationError, match=rf"servo: {key}: .* is beyond the .* limit that is set"):
+            connect(clock)
+    assert script.orders() == []
+
+
+@pytest.mark.parametrize("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+def test_port_that_cannot_be_opened(script, clock, port):
+    with pytest.raises(DeviceConnectionError, match=f"servo: cannot open {port}"):
+        connect(clock, port=port)
+
+
+def test_servo_that_never_answered(script, clock):
+    script.silent = True
+    with pytest.raises(DeviceConnectionError, match=r"no answer within 0\.1 s at emulated://scripted-servo, id 7"):
+        connect(clock, id=7)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": ""},
+        {"id": -1},
+        {"id": 253},
+        {"baudrate": 1200},
+        {"timeout": 0},
+        {"return_delay": 1e-3},
+        {"position_limits": (1.0, 1.0)},
+        {"position_limits": (2.0, 1.0)},
+        {"position_limits": (0.0, 1700.0)},
+        {"position_limits": (0.0, 1000.0), "zero_counts": 500_000},
+        {"position_limits": (math.nan, 1.0)},
+        {"zero_counts": 1_048_576},
+        {"direction": 0},
+        {"direction": 2},
+        {"profile_velocity": 0.0},
+        {"profile_velocity": 25.0},
+        {"profile_acceleration": 0.3},
+        {"profile_acceleration": 13_000},
+        {"watchdog": 0.01},
+        {"watchdog": 2.6},
+        {"tolerance": 0.0},
+        {"arrival_timeout": 0.0},
+        {"speed": 9600},
+    ],
+)
+def test_settings_that_make_no_sense(changes):
+    with pytest.raises(ValidationError):
+        make_settings(**changes)
+
+
+def test_settings_say_what_they_are():
+    for name, field in DynamixelMX28.Settings.model_fields.items():
+        assert field.description, name
+    settings = make_settings()
+    assert (settings.watchdog, settings.direction, settings.baudrate) == (2.5, 1, 57600)
+    assert make_settings(watchdog=0).watchdog == 0.0
+    assert make_settings(direction=-1).direction == -1
+
+
+# Measuring.
+
+
+def test_feedback_is_one_read_of_one_block(script, servo):
+    assert servo.measure() == pytest.approx(
+        {"servo_position": 1000 * COUNT, "servo_velocity": -42 * 0.229 * 2 * math.pi / 60, "servo_load": 0.1}
+    )
+    assert script.received == [packet(1, 0x02, bytes.fromhex("7E001500"))]
+
+
+def test_zero_and_direction(script, clock):
+    servo = connect(clock, zero_counts=1200, direction=-1, id=9)
+    values = servo.measure()
+    assert values["servo_position"] == pytest.approx(200 * COUNT)
+    assert values["servo_velocity"] > 0
+    assert values["servo_load"] == -0.1
+    servo.set(-1.0)
+    assert script.values[116] == 1200 + 652
+    assert all(data[4] == 9 for data in script.received)
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_every_hardware_error_is_told_with_advice(script, servo, bit):
+    script.values[70] = 1 << bit
+    text, advice = HARDWARE_ERRORS.get(bit, ("unknown to this driver", "look it up in the manual of the servo"))
+    with pytest.raises(DeviceError) as caught:
+        servo.measure()
+    assert str(caught.value) == (
+        f"servo: hardware error 0x{1 << bit:02X} ({text}; 12.1 V, 31 °C): {advice}; "
+        "then clear it by a power cycle, by reboot or by DynamixelMX28.recover"
+    )
+
+
+def test_alert_whose_cause_has_gone(script, servo):
+    script.values[70] = 1
+    script.instead = [lambda _sent, right: (script.values.update({70: 0}), right)[1]]
+    with pytest.raises(DeviceError, match=r"0x00 \(none any more"):
+        servo.measure()
+
+
+@pytest.mark.parametrize("code", sorted(STATUS_ERRORS))
+def test_every_refusal_is_told(script, servo, code):
+    script.refusals[3, 116] = code
+    if code == 3:
+        # It arrived damaged: sent again until it is given up.
+        with pytest.raises(DeviceConnectionError, match=r"the instruction arrived damaged at .* after 3 requests"):
+            servo.set(1.0)
+        return
+    with pytest.raises(DeviceError) as caught:
+        servo.set(1.0)
+    assert str(caught.value) == f"servo: refused 1000 as its goal position: {STATUS_ERRORS[code]}"
+
+
+@pytest.mark.parametrize(("key", "text"), [((2, 126), "feedback"), ((2, 64), "torque enable")])
+def test_refused_reading(script, servo, key, text):
+    script.refusals[key] = 7
+    with pytest.raises(DeviceError, match=f"refused to tell its {text}: the address cannot be accessed"):
+        servo.set(1.0)
+
+
+def test_refused_ping_and_unknown_error_number(script, clock):
+    script.refusals[1, 0] = 0x55
+    with pytest.raises(DeviceError, match="refused a ping: error number 85"):
+        connect(clock)
+
+
+# Moving.
+
+
+def test_first_set_point_switches_on_under_the_watchdog_where_it_stands(script, servo):
+    status = servo.set(2.0)
+    assert script.orders() == [
+        (98, 0),
+        (108, 5),
+        (112, 41),
+        (116, 1000),
+        (98, 125),
+        (64, 1),
+        (116, 1304),
+    ]
+    assert servo.torque_enabled
+    script.values |= {122: 1, 132: 1304}
+    assert not status.update()
+    script.values[122] = 0
+    assert status.update()
+    assert status.success
+    script.received.clear()
+    servo.set(1.0)
+    assert script.orders() == [(116, 652)]
+
+
+def test_profile_is_rounded_down(script, clock):
+    servo = connect(clock, profile_velocity=42 * 0.229 * 2 * math.pi / 60, profile_acceleration=0.7)
+    servo.set(1.0)
+    assert (script.values[112], script.values[108]) == (42, 1)
+
+
+def test_no_set_point_beyond_the_limits_is_sent(script, servo):
+    for value in (-3.01, 3.01, math.nan, math.inf):
+        with pytest.raises(LimitError, match="-3 to 3 rad"):
+            servo.set(value)
+    assert script.received == []
+    assert math.isnan(servo.setpoint)
+
+
+def test_tolerance_decides_about_the_arrival(script, clock):
+    servo = connect(clock, tolerance=0.02)
+    status = servo.set(2.0)
+    script.values[132] = 1304 - 14
+    assert not status.update()
+    script.values[132] = 1304 + 13
+    assert status.update()
+    assert status.success
+
+
+def test_shaft_that_stands_elsewhere(script, servo, clock):
+    status = servo.set(2.0)
+    script.values |= {132: 1200, 126: -350}
+    begin = clock.now()
+    with pytest.raises(DeviceError, match=r"stands at 1\.841 rad instead of 2 rad, under a load of 35 %: take away"):
+        status.wait()
+    assert clock.now() - begin == pytest.approx(1.0, abs=0.2)
+
+
+def test_standstill_counts_from_the_last_motion(script, servo, clock):
+    status = servo.set(2.0)
+    for moving in (0, 1, 0):
+        script.values[122] = moving
+        clock.sleep(0.7)
+        assert not status.update()
+    script.values[132] = 1304
+    assert status.update()
+
+
+def test_motion_that_does_not_end(script, servo, clock):
+    status = servo.set(2.0)
+    script.values[122] = 1
+    begin = clock.now()
+    with pytest.raises(DeviceError, match="did not arrive within"):
+        status.wait()
+    assert 5.0 < clock.now() - begin < 9.0
+
+
+def test_torque_that_goes_off_by_itself_fails_the_status(script, servo):
+    status = servo.set(2.0)
+    script.values[64] = 0
+    with pytest.raises(DeviceError, match="torque was switched off before it reached 2 rad"):
+        status.wait()
+    script.received.clear()
+    servo.set(2.0)
+    assert (64, 1) in script.orders()
+
+
+def test_refused_question_for_the_arrival(script, servo):
+    status = servo.set(2.0)
+    script.refusals[2, 122] = 7
+    with pytest.raises(DeviceError, match="refused to tell whether it moves"):
+        status.wait()
+
+
+def test_hardware_error_when_the_torque_is_switched_on(script, servo):
+    script.on_write = lambda address, value: script.values.update({70: 0x10} if (address, value) == (64, 1) else {})
+    with pytest.raises(DeviceError, match="electrical shock"):
+        servo.set(1.0)
+    assert script.orders()[-1] == (64, 1)
+
+
+def test_stop_takes_the_present_position_for_the_goal(script, servo):
+    servo.stop()
+    assert script.orders() == []
+    servo.set(2.0)
+    script.values[132] = -1100
+    servo.stop()
+    assert script.values[116] == -1100
+    assert servo.setpoint == pytest.approx(-1100 * COUNT)
+    script.values[98] = 255
+    script.received.clear()
+    servo.stop()
+    assert script.orders() == []
+
+
+# The watchdog.
+
+
+def test_watchdog_is_asked_for_only_after_a_silence(script, servo, clock):
+    servo.set(2.0)
+    ask = packet(1, 0x02, bytes.fromhex("62000100"))
+    for pause, asked in ((1.0, False), (1.9, False), (2.1, True), (0.1, False)):
+        clock.sleep(pause)
+        script.received.clear()
+        servo.measure()
+        assert (ask in script.received) is asked
+    clock.sleep(2.1)
+    assert servo.torque_enabled
+    script.received.clear()
+    servo.measure()
+    assert ask in script.received
+
+
+def test_expired_watchdog_is_told_until_it_is_cleared(script, servo, clock):
+    servo.set(2.0)
+    clock.sleep(2.4)
+    script.values[98] = 255
+    for _ in range(3):
+        with pytest.raises(DeviceError, match=r"bus watchdog .* silent for 2\.5 s: .*key watchdog; the safe state"):
+            servo.measure()
+    servo.safe()
+    assert script.values[98] == 0
+    servo.measure()
+    servo.set(1.0)
+    assert script.values[98] == 125
+
+
+def test_goal_that_an_expired_watchdog_refuses(script, servo):
+    servo.set(2.0)
+    script.refusals[3, 116] = 4
+    with pytest.raises(DeviceError, match="refused 652 as its goal position: the value is out of range"):
+        servo.set(1.0)
+    script.values[98] = 255
+    with pytest.raises(DeviceError, match="bus watchdog"):
+        servo.set(1.0)
+
+
+def test_without_a_watchdog_it_is_not_asked_for(script, clock):
+    servo = connect(clock, watchdog=0.0)
+    servo.set(2.0)
+    clock.sleep(100.0)
+    script.received.clear()
+    servo.measure()
+    assert len(script.received) == 1
+    assert script.values[98] == 0
+
+
+# Safe state, reboot.
+
+
+def test_safe_switches_off_and_disarms(script, servo):
+    servo.set(2.0)
+    script.received.clear()
+    servo.safe()
+    assert script.orders() == [(64, 0), (98, 0)]
+    script.received.clear()
+    servo.safe()
+    assert script.orders() == [(64, 0), (98, 0)]
+
+
+def test_safe_goes_on_to_the_reboot(script, servo):
+    servo.set(2.0)
+    script.refusals[3, 64] = 1
+    script.received.clear()
+    servo.safe()
+    assert script.orders() == [(64, 0), (100, 0), "reboot", (98, 0)]
+    assert script.values[64] == 0
+
+
+def test_safe_raises_only_after_everything_was_tried(script, servo):
+    servo.set(2.0)
+    script.refusals |= {(3, 64): 1, (3, 100): 1, (8, 0): 1}
+    script.received.clear()
+    with pytest.raises(DeviceError, match=r"does not confirm .*refused 0 as its torque enable.*disconnect its power"):
+        servo.safe()
+    assert script.orders() == [(64, 0), (100, 0), "reboot"]
+
+
+def test_safe_of_a_silent_servo_tries_everything_and_does_not_take_long(script, servo, clock):
+    script.silent = True
+    begin = clock.now()
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        servo.safe()
+    assert script.orders() == [(64, 0), (100, 0), "reboot"]
+    assert clock.now() - begin < 4.0
+
+
+def test_safe_succeeds_when_only_answers_were_lost(script, servo):
+    servo.set(2.0)
+    script.instead = [b"", b"", b"", None]
+    servo.safe()
+    assert "reboot" not in script.orders()
+    assert script.values[64] == 0
+
+
+def test_reboot_waits_and_configures_again(script, servo):
+    servo.set(2.0)
+    script.values[70] = 0x20
+    script.on_write = lambda address, _value: script.instead.extend([b""] * 7) if address == "reboot" else None
+    script.received.clear()
+    servo.reboot()
+    assert script.orders()[0] == "reboot"
+    assert math.isnan(servo.setpoint)
+    servo.measure()
+
+
+def test_servo_that_does_not_come_back(script, servo, clock):
+    script.silent = True
+    begin = clock.now()
+    with pytest.raises(DeviceConnectionError, match="no answer"):
+        servo.reboot()
+    assert clock.now() - begin == pytest.approx(5.5, abs=0.7)
+
+
+def test_servo_with_an_error_is_refused_and_recovered_on_request(script, clock):
+    script.values[70] = 0x20
+    with pytest.raises(DeviceError, match=r"overload.*recover"):
+        connect(clock)
+    assert script.orders() == []
+    servo = DynamixelMX28.recover("servo", make_settings(), clock)
+    assert script.orders()[:2] == ["reboot", (64, 0)]
+    servo.measure()
+
+
+def test_closing_leaves_the_servo_alone(script, servo):
+    servo.set(2.0)
+    before = len(script.received)
+    servo.close()
+    assert len(script.received) == before
+    with pytest.raises(DeviceConnectionError):
+        servo.measure()
+
+
+# A line that is not good.
+
+
+def flipped(sent, right):
+    return right[:9] + bytes((right[9] ^ 1,)) + right[10:]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        flipped,
+        lambda _sent, right: right[:-1],
+        lambda _sent, right: right[1:],
+        lambda _sent, right: right[:5],
+        lambda _sent, right: right[:5] + b"\x10\x02" + right[7:],
+        lambda _sent, right: right[:5] + b"\xff\xff" + right[7:],
+        lambda _sent, right: right[:5] + b"\x30\x00" + right[7:],
+        lambda _sent, right: packet(1, 0x55, right[8:-3]),
+        lambda _sent, _right: packet(1, 0x55, b"\x00"),
+        lambda _sent, _right: packet(1, 0x55, b"\x03"),
+        lambda _sent, _right: packet(1, 0x55),
+        lambda _sent, right: packet(2, 0x55, right[8:-2]),
+        b"\xff" * 3000,
+    ],
+)
+def test_a_damaged_answer_costs_a_resend(script, servo, damaged):
+    script.instead = [damaged, damaged]
+    assert servo.measure()["servo_position"] == pytest.approx(1000 * COUNT)
+    assert len(script.received) == 3
+    assert len(set(script.received)) == 1
+    assert servo.torque_enabled is False
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        lambda sent, _right: sent,
+        lambda _sent, _right: b"noise\xff\xff",
+        lambda _sent, right: packet(2, 0x55, right[8:-2]),
+        lambda sent, _right: sent + packet(2, 0x55, b"\x00"),
+        lambda _sent, _right: b"\xff\xff\xfd\x00\xff\xff\xff",
+    ],
+    ids=["echo", "noise", "other servo", "echo and other servo", "half a head"],
+)
+def test_what_is_not_the_answer_is_passed_over(script, servo, before):
+    script.instead = [lambda sent, right: before(sent, right) + right] * 2
+    assert servo.measure()["servo_position"] == pytest.approx(1000 * COUNT)
+    assert not servo.torque_enabled
+    assert len(script.received) == 2
+
+
+def test_answer_that_comes_after_its_resend_is_not_taken_for_the_next(script, servo):
+    late = packet(1, 0x55, b"\x00\x01")
+    script.instead = [b"", lambda _sent, right: right + late]
+    assert servo.torque_enabled is False
+    assert servo.torque_enabled is False
+    script.instead = [b"", b"", b""]
+    with pytest.raises(DeviceConnectionError):
+        servo.measure()
+    servo._line._port._received += late
+    assert servo.torque_enabled is False
+
+
+def test_only_packets_of_others(script, servo):
+    script.instead = [packet(2, 0x55, b"\x00") * 20] * 3
+    with pytest.raises(DeviceConnectionError, match="only packets of others"):
+        servo.measure()
+
+
+def test_line_that_is_pulled_out(script, servo):
+    unregister("scripted-servo")
+    with pytest.raises(DeviceConnectionError, match="lost the line emulated://scripted-servo"):
+        servo.measure()
+    with pytest.raises(DeviceError, match="does not confirm that its torque is off"):
+        servo.safe()
+
+
+def test_line_that_is_pulled_out_while_the_servo_is_told(script, clock, monkeypatch):
+    script.values[68] = 1
+    line_tell = dynamixel._Line.tell
+
+    def tell(line, *arguments):
+        unregister("scripted-servo")
+        line_tell(line, *arguments)
+
+    monkeypatch.setattr(dynamixel._Line, "tell", tell)
+    with pytest.raises(DeviceConnectionError, match="lost the line"):
+        connect(clock)
+
+
+@given(st.lists(st.one_of(st.binary(max_size=40), st.just(packet(1, 0x55, b"\x00")[:-1])), min_size=3, max_size=3))
+def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
+    script, clock = Script(), VirtualClock()
+    register("fuzzed-servo", script, clock)
+    try:
+        line = dynamixel._Line("servo", make_settings(port="emulated://fuzzed-servo"), clock)
+        script.instead = list(replies)
+        with pytest.raises(DeviceConnectionError):
+            line.feedback()
+        assert line.ask(0x02, bytes.fromhex("84000400"), 4) == (1000).to_bytes(4, "little")
+    finally:
+        unregister("fuzzed-servo")
