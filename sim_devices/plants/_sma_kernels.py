@@ -1,0 +1,455 @@
+"""Compiled inner loops of the SMA wire plant.
+
+The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
+a microsecond and the plant is advanced hundreds of thousands of times a run. The constants below name
+the places in these arrays. Here stresses are in MPa, forces in N, lengths in mm and temperatures in °C.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# Continuous state: wire temperature, ambient deviation (K), stress, position of the moving end (mm),
+# number of martensite grains and of oriented martensite grains.
+TEMPERATURE, AMBIENT_OFFSET, STRESS, POSITION, MARTENSITE, ORIENTED = range(6)
+STATE_SIZE = 6
+
+# Command: heating voltage (V), fan (1 on), length imposed (1) or force imposed (0), load (N), position (mm).
+VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
+COMMAND_SIZE = 5
+
+# Rows of the grain table: austenite finish (°C) and width (K) of the transformation, Clausius-Clapeyron
+# slope (MPa/K), detwinning stress, orientation stress on cooling, re-twinning stress (MPa).
+AUSTENITE, WIDTH, SLOPE, DETWIN, ORIENT, RETWIN = range(6)
+GRAIN_ROWS = 6
+
+# Coefficients, prepared once from the parameters.
+(
+    AMBIENT,
+    HEATING,
+    STILL_DECAY,
+    FAN_DECAY,
+    FAN_SHARE,
+    AMBIENT_DECAY,
+    AMBIENT_KICK,
+    AMBIENT_GAIN,
+    AREA,
+    REST_LENGTH,
+    SERIES_COMPLIANCE,
+    MARTENSITE_MODULUS,
+    AUSTENITE_MODULUS,
+    EXPANSION,
+    EXPANSION_REFERENCE,
+    TRANSFORMATION_STRAIN,
+    UNORIENTED_SHARE,
+    REST_STRAIN,
+    STRESS_LIMIT,
+    TEMPERATURE_STEP,
+    STRESS_STEP,
+    LENGTH_STEP,
+) = range(22)
+COEFFICIENT_SIZE = 22
+
+# Halvings of the stress interval: 600 MPa come down to 3.5e-8 MPa, a nanonewton of force.
+HALVINGS = 34
+FIRST_HALVINGS = 5
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@njit(cache=True)
+def update_grains(
+    temperature: float, stress: float, unoriented_share: float, grains: Floats, martensite: Flags, oriented: Flags
+) -> tuple[int, int]:
+    """Bring every grain to one new value of temperature and stress.
+
+    Parameters
+    ----------
+    temperature : float
+        Temperature, °C.
+    stress : float
+        Tensile stress, MPa.
+    unoriented_share : float
+        Share of the stress that stabilises an unoriented martensite grain.
+    grains : ndarray
+        Grain table, `GRAIN_ROWS` rows.
+    martensite, oriented : ndarray
+        Grain states, changed in place.
+
+    Returns
+    -------
+    tuple of int
+        Number of martensite grains and of oriented ones.
+    """
+    martensites = 0
+    orienteds = 0
+    for g in range(martensite.size):
+        cold = temperature - stress / grains[SLOPE, g] < grains[AUSTENITE, g] - grains[WIDTH, g]
+        m = martensite[g]
+        o = oriented[g]
+        if m:
+            share = 1.0 if o else unoriented_share
+            # Where the stress would bring the austenite back at once, the grain stays what it is.
+            if temperature - share * stress / grains[SLOPE, g] > grains[AUSTENITE, g] and not cold:
+                m = False
+                o = False
+        elif cold:
+            m = True
+            o = stress > grains[ORIENT, g]
+        if m:
+            if stress > grains[DETWIN, g]:
+                o = True
+            elif stress < grains[RETWIN, g]:
+                o = False
+            martensites += 1
+            if o:
+                orienteds += 1
+        martensite[g] = m
+        oriented[g] = o
+    return martensites, orienteds
+
+
+@njit(cache=True)
+def wire_length(
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Floats
+) -> float:
+    """Elongation of the wire from its resting length, mm.
+
+    Parameters
+    ----------
+    temperature, stress : float
+        Temperature, °C, and stress, MPa.
+    martensites, orienteds : float
+        Number of martensite grains and of oriented ones.
+    count : int
+        Number of grains.
+    c : ndarray
+        Coefficients.
+
+    Returns
+    -------
+    float
+        Elongation, mm.
+    """
+    share = martensites / count
+    strain = stress * (share / c[MARTENSITE_MODULUS] + (1.0 - share) / c[AUSTENITE_MODULUS])
+    strain += c[EXPANSION] * (temperature - c[EXPANSION_REFERENCE]) + c[TRANSFORMATION_STRAIN] * orienteds / count
+    length: float = c[REST_LENGTH] * (strain - c[REST_STRAIN])
+    return length
+
+
+@njit(cache=True)
+def end_position(
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Floats
+) -> float:
+    """Position of the moving end of a taut wire: its elongation and that of frame and load cell, mm.
+
+    Parameters
+    ----------
+    temperature, stress, martensites, orienteds, count, c
+        See `wire_length`.
+
+    Returns
+    -------
+    float
+        Position, mm.
+    """
+    length = wire_length(temperature, stress, martensites, orienteds, count, c)
+    position: float = length + stress * c[AREA] * c[SERIES_COMPLIANCE]
+    return position
+
+
+@njit(cache=True)
+def switching_stresses(
+    temperature: float, c: Floats, grains: Floats, martensite: Flags, oriented: Flags, scratch: Floats
+) -> None:
+    """Find the stress above which each grain will be martensite, and oriented, in a trial from its state.
+
+    Parameters
+    ----------
+    temperature : float
+        Temperature of the trial, °C.
+    c, grains : ndarray
+        Coefficients and grain table.
+    martensite, oriented : ndarray
+        Committed grain states.
+    scratch : ndarray
+        Two rows to write to: stresses for martensite and for orientation, MPa.
+    """
+    for g in range(martensite.size):
+        cold = (temperature - grains[AUSTENITE, g] + grains[WIDTH, g]) * grains[SLOPE, g]
+        hot = (temperature - grains[AUSTENITE, g]) * grains[SLOPE, g]
+        if not martensite[g]:
+            switch = cold
+            orient = max(min(grains[ORIENT, g], grains[DETWIN, g]), grains[RETWIN, g])
+        elif oriented[g]:
+            switch = hot
+            orient = grains[RETWIN, g]
+        else:
+            switch = min(hot / c[UNORIENTED_SHARE], cold)
+            orient = grains[DETWIN, g]
+        scratch[0, g] = switch
+        scratch[1, g] = max(switch, orient)
+
+
+@njit(cache=True)
+def solve_stress(
+    position: float,
+    temperature: float,
+    committed: float,
+    c: Floats,
+    grains: Floats,
+    martensite: Flags,
+    oriented: Flags,
+    scratch: Floats,
+) -> float:
+    """Find the stress at which the wire is as long as imposed, by bisection on trials from the committed state.
+
+    The trial length is non-decreasing in stress with a jump where a grain switches. Of the last
+    interval the end next to the committed stress is taken, so that a grain whose switch alone would
+    overshoot the imposed length waits. Grains that the interval has left behind need not be looked at
+    again, so the whole bisection costs little more than one trial.
+
+    Parameters
+    ----------
+    position : float
+        Imposed position of the moving end, mm.
+    temperature : float
+        Temperature, °C.
+    committed : float
+        Stress of the committed state, MPa.
+    c, grains, martensite, oriented, scratch : ndarray
+        See `switching_stresses`; the grain states are not changed.
+
+    Returns
+    -------
+    float
+        Stress, MPa: 0 if the wire is slack, the stress limit if it cannot be stretched so far.
+    """
+    count = martensite.size
+    limit = float(c[STRESS_LIMIT])
+    below = np.zeros(2, dtype=np.int64)
+    inside = np.zeros(2, dtype=np.int64)
+    low = 0.0
+    high = limit
+    halvings = HALVINGS
+    # Mostly the stress stays in the interval that the first halvings would end in: look there first.
+    for attempt in range(2):
+        if attempt == 0:
+            halvings = HALVINGS - FIRST_HALVINGS
+            part = limit / 2**FIRST_HALVINGS
+            low = part * math.floor(min(committed, limit - 0.5 * part) / part)
+            high = low + part
+        else:
+            halvings = HALVINGS
+            low = 0.0
+            high = limit
+        switching_stresses(temperature, c, grains, martensite, oriented, scratch)
+        # Count the switches below the interval and move those inside it to the front of their row.
+        for row in range(2):
+            passed_by = 0
+            kept = 0
+            for g in range(count):
+                value = scratch[row, g]
+                passed_by += value < low
+                if low <= value < high:
+                    scratch[row, kept] = value
+                    kept += 1
+            below[row] = passed_by
+            inside[row] = kept
+        shortest = end_position(temperature, low, below[0], below[1], count, c)
+        longest = end_position(temperature, high, below[0] + inside[0], below[1] + inside[1], count, c)
+        if low == 0.0 and shortest >= position:
+            return low
+        if high >= limit and longest <= position:
+            return high
+        if shortest <= position < longest:
+            break
+    passed = np.zeros(2, dtype=np.int64)
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        for row in range(2):
+            passed[row] = 0
+            for g in range(inside[row]):
+                if scratch[row, g] < middle:
+                    passed[row] += 1
+        upwards = end_position(temperature, middle, below[0] + passed[0], below[1] + passed[1], count, c) <= position
+        for row in range(2):
+            if 0 < passed[row] < inside[row]:
+                kept = 0
+                for g in range(inside[row]):
+                    value = scratch[row, g]
+                    if (value >= middle) == upwards:
+                        scratch[row, kept] = value
+                        kept += 1
+                inside[row] = kept
+            elif (passed[row] == 0) != upwards:
+                inside[row] = 0
+            if upwards:
+                below[row] += passed[row]
+        if upwards:
+            low = middle
+        else:
+            high = middle
+    return low if low >= committed else high
+
+
+@njit(cache=True)
+def commit(
+    temperature: float,
+    stress: float,
+    state: Floats,
+    c: Floats,
+    grains: Floats,
+    martensite: Flags,
+    oriented: Flags,
+) -> None:
+    """Take over temperature and stress and bring the grains there.
+
+    Parameters
+    ----------
+    temperature, stress : float
+        Temperature, °C, and stress, MPa.
+    state, martensite, oriented : ndarray
+        Changed in place.
+    c, grains : ndarray
+        Coefficients and grain table.
+    """
+    martensites, orienteds = update_grains(temperature, stress, c[UNORIENTED_SHARE], grains, martensite, oriented)
+    state[TEMPERATURE] = temperature
+    state[STRESS] = stress
+    state[MARTENSITE] = martensites
+    state[ORIENTED] = orienteds
+
+
+@njit(cache=True)
+def load_to(stress: float, state: Floats, c: Floats, grains: Floats, martensite: Flags, oriented: Flags) -> None:
+    """Move the imposed stress at constant temperature, in sub-steps.
+
+    Parameters
+    ----------
+    stress : float
+        Stress to reach, MPa.
+    state, c, grains, martensite, oriented : ndarray
+        See `commit`.
+    """
+    temperature = state[TEMPERATURE]
+    begin = state[STRESS]
+    steps = math.ceil(abs(stress - begin) / c[STRESS_STEP])
+    for k in range(1, steps + 1):
+        commit(temperature, begin + (stress - begin) * k / steps, state, c, grains, martensite, oriented)
+    state[STRESS] = stress
+    state[POSITION] = end_position(temperature, stress, state[MARTENSITE], state[ORIENTED], martensite.size, c)
+
+
+@njit(cache=True)
+def stretch_to(
+    position: float,
+    state: Floats,
+    c: Floats,
+    grains: Floats,
+    martensite: Flags,
+    oriented: Flags,
+    scratch: Floats,
+) -> None:
+    """Move the imposed position at constant temperature, in sub-steps.
+
+    Parameters
+    ----------
+    position : float
+        Position to reach, mm.
+    state, c, grains, martensite, oriented, scratch : ndarray
+        See `commit` and `solve_stress`.
+    """
+    temperature = state[TEMPERATURE]
+    begin = state[POSITION]
+    steps = math.ceil(abs(position - begin) / c[LENGTH_STEP])
+    for k in range(1, steps + 1):
+        place = begin + (position - begin) * k / steps
+        stress = solve_stress(place, temperature, state[STRESS], c, grains, martensite, oriented, scratch)
+        commit(temperature, stress, state, c, grains, martensite, oriented)
+    state[POSITION] = position
+
+
+@njit(cache=True)
+def heat_to(
+    temperature: float,
+    clamped: bool,
+    state: Floats,
+    c: Floats,
+    grains: Floats,
+    martensite: Flags,
+    oriented: Flags,
+    scratch: Floats,
+) -> None:
+    """Move the temperature at constant load or at constant position, in sub-steps.
+
+    Parameters
+    ----------
+    temperature : float
+        Temperature to reach, °C.
+    clamped : bool
+        Whether the position is held; the stress is otherwise.
+    state, c, grains, martensite, oriented, scratch : ndarray
+        See `commit` and `solve_stress`.
+    """
+    begin = state[TEMPERATURE]
+    position = state[POSITION]
+    steps = math.ceil(abs(temperature - begin) / c[TEMPERATURE_STEP])
+    for k in range(1, steps + 1):
+        warm = begin + (temperature - begin) * k / steps
+        stress = state[STRESS]
+        if clamped:
+            stress = solve_stress(position, warm, stress, c, grains, martensite, oriented, scratch)
+        commit(warm, stress, state, c, grains, martensite, oriented)
+    state[TEMPERATURE] = temperature
+    if not clamped:
+        state[POSITION] = end_position(
+            temperature, state[STRESS], state[MARTENSITE], state[ORIENTED], martensite.size, c
+        )
+
+
+@njit(cache=True)
+def advance_steps(
+    normals: Floats,
+    state: Floats,
+    command: Floats,
+    c: Floats,
+    grains: Floats,
+    martensite: Flags,
+    oriented: Flags,
+    scratch: Floats,
+) -> None:
+    """Advance the whole plant by one grid step for each element of `normals`.
+
+    The mechanical command is carried out first, at the temperature of the step before, and then the
+    wire is heated: this order of the two moves decides the memory when both change in one step.
+
+    Parameters
+    ----------
+    normals : ndarray
+        Standard normal numbers, one a step: the ambient temperature.
+    state, command, c, grains, martensite, oriented, scratch : ndarray
+        See the functions above; `state`, `martensite` and `oriented` are changed in place.
+    """
+    clamped = command[CLAMPED] != 0.0
+    for row in range(normals.size):
+        if clamped:
+            stretch_to(command[PLACE], state, c, grains, martensite, oriented, scratch)
+        else:
+            load_to(command[LOAD] / c[AREA], state, c, grains, martensite, oriented)
+        offset = c[AMBIENT_DECAY] * state[AMBIENT_OFFSET] + c[AMBIENT_KICK] * normals[row]
+        state[AMBIENT_OFFSET] = offset
+        rise = c[HEATING] * (1.0 + c[AMBIENT_GAIN] * offset) * command[VOLTAGE] * command[VOLTAGE]
+        decay = c[STILL_DECAY]
+        if command[FAN] != 0.0:
+            rise *= c[FAN_SHARE]
+            decay = c[FAN_DECAY]
+        steady = c[AMBIENT] + offset + rise
+        warm = steady + (state[TEMPERATURE] - steady) * decay
+        heat_to(warm, clamped, state, c, grains, martensite, oriented, scratch)

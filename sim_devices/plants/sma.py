@@ -1,0 +1,609 @@
+"""Shape-memory-alloy wire, heated by a voltage: the physics behind the ``sma`` rig.
+
+The plant is deliberately not of the structure that identification fits. A fitted model is a pair of
+nested Preisach operators in voltage and force; the plant is a population of grains that transform
+between austenite and martensite at stress-dependent temperatures, remember whether their martensite
+is oriented, and share one stress. The same grains answer an imposed force and an imposed length.
+
+Source of the dimensions, of the ranges and of the observed behaviour: Zhang and Yip, "Three-dimensional
+hysteresis modeling of robotic artificial muscles with application to shape memory alloy actuators",
+Robotics: Science and Systems, 2017: a Flexinol wire of 0.20 mm by 105 mm, 0 to 3 V, force range
+[0.3, 11.2] N at constant length, dead loads of 0.98 to 8.82 N, a thermal time constant of about 5 s.
+Numbers marked *assumed* are ours, chosen so that the plant behaves as the paper's specimen does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.plants import _sma_kernels as kernels
+
+# A grid point counts as reached this early (s), so that rounding in the caller's clock, even one
+# that counts from 1970, does not decide on which side of a call a step falls.
+_GRID_TOLERANCE = 5e-7
+
+# Random numbers drawn at a time.
+_NOISE_BLOCK = 4096
+
+_MILLIMETRE = 1e-3
+_MEGAPASCAL = 1e6
+
+# The smallest transformation width (K), Clausius-Clapeyron slope (MPa/K) and detwinning stress (MPa) of a
+# grain, and how far below its detwinning stress a grain re-twins at the latest (MPa).
+_LEAST_WIDTH = 3.0
+_LEAST_SLOPE = 1.0
+_LEAST_DETWIN = 5.0
+_RETWIN_GAP = 10.0
+
+_POSITIVE = (
+    "grain_count",
+    "austenite_finish",
+    "width",
+    "slope",
+    "unoriented_share",
+    "martensite_modulus",
+    "austenite_modulus",
+    "rest_length",
+    "diameter",
+    "series_stiffness",
+    "stress_limit",
+    "step",
+    "time_constant",
+    "fan_time_constant",
+    "rise",
+    "rated_voltage",
+    "maximum_voltage",
+    "resistance",
+    "ambient_time",
+    "temperature_step",
+    "stress_step",
+    "length_step",
+)
+_NOT_NEGATIVE = (
+    "austenite_finish_spread",
+    "width_spread",
+    "slope_spread",
+    "detwin_spread",
+    "orient_spread",
+    "retwin_spread",
+    "expansion",
+    "transformation_strain",
+    "pretension",
+    "ambient_sd",
+)
+
+
+@dataclass(frozen=True)
+class SMAParameters:
+    """Every number of the plant.
+
+    The values that come from the paper are the wire's length and diameter, the rated voltage, the time
+    constant and the ranges that the rest was tuned to. All others are assumed.
+
+    Attributes
+    ----------
+    grain_count : int
+        Number of grains; at least 1.
+    specimen_seed : int
+        Seed of the grains. The specimen is the same piece whatever the session's seed.
+    austenite_finish, austenite_finish_spread : float
+        Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes
+        austenite.
+    width, width_spread : float
+        Mean and standard deviation of a grain's transformation hysteresis, K; at least 3 K each.
+    slope, slope_spread : float
+        Mean and standard deviation of the Clausius-Clapeyron slope, MPa/K.
+    unoriented_share : float
+        Share of the stress that stabilises an unoriented grain against austenite, in (0, 1].
+    detwin, detwin_spread : float
+        Mean and standard deviation of the stress that orients martensite, MPa; at least 5 MPa each.
+    orient, orient_spread : float
+        Mean and standard deviation of the stress above which a grain that cools to martensite comes out
+        oriented, MPa. Negative is a trained grain.
+    orient_correlation : float
+        Correlation of orientation and detwinning stress, in [-1, 1].
+    retwin, retwin_spread : float
+        Mean and standard deviation of the stress below which martensite loses its orientation, MPa; at
+        least 10 MPa below the detwinning stress.
+    martensite_modulus, austenite_modulus : float
+        Elastic moduli, Pa.
+    transformation_strain : float
+        Strain of a completely oriented wire.
+    expansion : float
+        Coefficient of thermal expansion, 1/K.
+    rest_length : float
+        Length of the unloaded cold wire, m (paper: 105 mm).
+    diameter : float
+        Diameter of the wire, m (paper: 0.20 mm).
+    series_stiffness : float
+        Stiffness of frame and load cell in series with the wire, N/m.
+    stress_limit : float
+        Largest stress that is solved for, Pa; 600 MPa are 18.85 N. A load beyond it is refused, and
+        the force of a wire that is stretched further stays there.
+    pretension : float
+        Load under which the wire is cooled when it is conditioned, N (paper: 0.3 N).
+    step : float
+        Step of the internal time grid, s.
+    temperature_step, stress_step, length_step : float
+        Largest sub-steps of a path: K, Pa and m.
+    ambient_temperature : float
+        Mean temperature of the room, °C.
+    time_constant : float
+        Thermal time constant in still air, s (paper: about 5 s).
+    fan_time_constant : float
+        Thermal time constant with the fan on, s (assumed). The fan raises the heat loss, so that the
+        steady temperature rise falls in the same ratio.
+    rise, rated_voltage : float
+        Steady temperature rise (K) in still air at the rated voltage (V). It goes as the voltage squared.
+    maximum_voltage : float
+        Highest effective voltage, V; 5 V would be 261 °C. Higher commands are refused.
+    resistance : float
+        Electrical resistance of the wire, ohm, taken as constant as in the paper; 0.20 mm by 105 mm of
+        NiTi have about 3 ohm.
+    ambient_sd, ambient_time : float
+        Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default,
+        switches it off; 0.3 K is sensible for dynamic tests.
+    ambient_gain : float
+        Relative change of the heating gain with the deviation of the room temperature, 1/K.
+    """
+
+    grain_count: int = 2000
+    specimen_seed: int = 2017
+    austenite_finish: float = 48.0
+    austenite_finish_spread: float = 15.0
+    width: float = 11.0
+    width_spread: float = 3.0
+    slope: float = 7.0
+    slope_spread: float = 0.8
+    unoriented_share: float = 0.4
+    detwin: float = 110.0
+    detwin_spread: float = 60.0
+    orient: float = -5.0
+    orient_spread: float = 60.0
+    orient_correlation: float = 0.6
+    retwin: float = -40.0
+    retwin_spread: float = 35.0
+    martensite_modulus: float = 28e9
+    austenite_modulus: float = 55e9
+    transformation_strain: float = 0.045
+    expansion: float = 6.6e-6
+    rest_length: float = 105e-3
+    diameter: float = 0.20e-3
+    series_stiffness: float = 20e3
+    stress_limit: float = 600e6
+    pretension: float = 0.3
+    step: float = 0.1
+    temperature_step: float = 1.0
+    stress_step: float = 4e6
+    length_step: float = 0.03e-3
+    ambient_temperature: float = 25.0
+    time_constant: float = 5.0
+    fan_time_constant: float = 2.0
+    rise: float = 85.0
+    rated_voltage: float = 3.0
+    maximum_voltage: float = 5.0
+    resistance: float = 3.05
+    ambient_sd: float = 0.0
+    ambient_time: float = 120.0
+    ambient_gain: float = 0.004
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not math.isfinite(getattr(self, field.name)):
+                raise ValueError(f"{field.name} must be finite, not {getattr(self, field.name)}")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in _NOT_NEGATIVE:
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+        if not self.unoriented_share <= 1.0:
+            raise ValueError(f"unoriented_share must lie in (0, 1], not {self.unoriented_share}")
+        if not -1.0 <= self.orient_correlation <= 1.0:
+            raise ValueError(f"orient_correlation must lie in [-1, 1], not {self.orient_correlation}")
+        if not self.martensite_modulus <= self.austenite_modulus:
+            # Otherwise the wire would shorten under a rising load where austenite turns to martensite.
+            raise ValueError(
+                f"martensite_modulus must not exceed austenite_modulus, not {self.martensite_modulus} "
+                f"> {self.austenite_modulus} Pa"
+            )
+        if not self.pretension <= self.largest_load:
+            raise ValueError(f"pretension must not exceed {self.largest_load:.4g} N, not {self.pretension} N")
+        if not self.ambient_temperature > -273.15:
+            raise ValueError(f"ambient_temperature must be above absolute zero, not {self.ambient_temperature} °C")
+
+    @property
+    def area(self) -> float:
+        """Cross-section of the wire, m²."""
+        return 0.25 * math.pi * self.diameter**2
+
+    @property
+    def largest_load(self) -> float:
+        """Force at the stress limit, N."""
+        return self.stress_limit * self.area
+
+
+class SMASnapshot(NamedTuple):
+    """Every output of the plant at one instant.
+
+    Attributes
+    ----------
+    temperature, ambient_temperature : float
+        Temperature of the wire and of the room, °C.
+    voltage : float
+        Effective heating voltage, V.
+    current : float
+        Current through the wire, A.
+    force : float
+        Tension of the wire, N.
+    length : float
+        Elongation of the wire from its resting length, m; contraction is negative.
+    position : float
+        Position of the moving end, m: elongation of wire, frame and load cell.
+    martensite_fraction, oriented_fraction : float
+        Share of martensite and of oriented martensite in the wire, in [0, 1].
+    """
+
+    temperature: float
+    ambient_temperature: float
+    voltage: float
+    current: float
+    force: float
+    length: float
+    position: float
+    martensite_fraction: float
+    oriented_fraction: float
+
+
+def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
+    """Make the specimen: the properties of its grains.
+
+    Parameters
+    ----------
+    parameters : SMAParameters
+        Parameters of the population.
+
+    Returns
+    -------
+    ndarray
+        One column a grain. Rows: austenite finish (°C), transformation width (K), Clausius-Clapeyron
+        slope (MPa/K), detwinning, orientation and re-twinning stress (MPa).
+    """
+    p = parameters
+    score = np.random.default_rng(p.specimen_seed).standard_normal((kernels.GRAIN_ROWS, p.grain_count))
+    mixed = p.orient_correlation * score[3] + math.sqrt(1.0 - p.orient_correlation**2) * score[4]
+    detwin = np.maximum(p.detwin + p.detwin_spread * score[3], _LEAST_DETWIN)
+    return np.array(
+        [
+            p.austenite_finish + p.austenite_finish_spread * score[0],
+            np.maximum(p.width + p.width_spread * score[1], _LEAST_WIDTH),
+            np.maximum(p.slope + p.slope_spread * score[2], _LEAST_SLOPE),
+            detwin,
+            p.orient + p.orient_spread * mixed,
+            np.minimum(p.retwin + p.retwin_spread * score[5], detwin - _RETWIN_GAP),
+        ]
+    )
+
+
+class SMAWire:
+    """Length and force of a shape-memory-alloy wire, advanced in time.
+
+    Each grain follows, at temperature T and tensile stress s::
+
+        martensite to austenite   T - k s/C > A       k = 1 if oriented, 0.4 if not
+        austenite to martensite   T - s/C < A - w     then oriented if s > s_f
+        martensite                oriented if s > s_d, no longer if s < s_r
+        strain = s [x/E_M + (1 - x)/E_A] + a (T - 25 °C) + e <oriented>
+
+    An unoriented martensite grain that would have to turn to austenite and at once back stays as it
+    is: so a constant temperature and stress hold every grain, and a trial's strain never falls with
+    stress.
+
+    The wire's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is
+    held by a servo (`clamp`: the length is imposed, the force follows). Changing between them keeps
+    grains, force and position: clamping starts from where the end hangs, hanging from the force it has.
+    Only a slack wire's end has a position of the servo's alone; it comes back to the wire when a load
+    is hung on. Frame and load cell are in series with the wire, so `position`, which is what `clamp`
+    imposes, exceeds `length` by the force over their stiffness.
+
+    Time runs on a fixed grid of ``parameters.step`` seconds from construction. `advance` carries out
+    the grid steps that have become due and holds the remainder, and outputs stay constant between
+    grid points. A command acts from the next grid step on, at once: first the load or the position is
+    moved there, at the temperature of the step before, then the wire is heated. So neither the number
+    nor the size of the calls of `advance` changes the trajectory, the noise included. There is no
+    sensor noise here and no protection either.
+
+    At the start the wire is cold and hangs without load, after it was cooled from austenite under the
+    pretension and went twice through 0 V, rated voltage, 0 V at constant position; `length` counts from
+    there.
+
+    Parameters
+    ----------
+    parameters : SMAParameters
+        The numbers.
+    rng : numpy.random.Generator
+        The session's randomness: the temperature of the room. The plant spawns its own generator from
+        it and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+    """
+
+    def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
+        self._parameters = parameters
+        self._coefficients = _coefficients(parameters)
+        self._grains = grain_table(parameters)
+        self._martensite = np.zeros(parameters.grain_count, dtype=np.bool_)
+        self._oriented = np.zeros(parameters.grain_count, dtype=np.bool_)
+        self._scratch = np.empty((2, parameters.grain_count))
+        self._state = np.zeros(kernels.STATE_SIZE)
+        self._command = np.zeros(kernels.COMMAND_SIZE)
+        self._pending = 0.0
+        (self._noise,) = rng.spawn(1)
+        self._normals = np.empty(0)
+        self._used = 0
+        self._condition()
+
+        offset = parameters.ambient_sd * float(self._noise.standard_normal())
+        self._state[kernels.AMBIENT_OFFSET] = offset
+        self._heat(parameters.ambient_temperature + offset, clamped=False)
+
+    @property
+    def parameters(self) -> SMAParameters:
+        """The numbers of this plant."""
+        return self._parameters
+
+    def apply(self, voltage: float) -> None:
+        """Apply a heating voltage.
+
+        Parameters
+        ----------
+        voltage : float
+            Effective (root mean square) voltage, V, from 0 to ``parameters.maximum_voltage``. The wire
+            settles at 25 + 85 (voltage / 3 V)² °C.
+
+        Raises
+        ------
+        ValueError
+            If the voltage is out of range.
+        """
+        highest = self._parameters.maximum_voltage
+        if not 0.0 <= voltage <= highest:
+            raise ValueError(f"voltage must lie within 0 and {highest} V, not {voltage} V")
+        self._command[kernels.VOLTAGE] = voltage
+
+    def blow(self, on: bool) -> None:
+        """Switch the fan, which shortens the time constant and lowers the steady rise alike.
+
+        Parameters
+        ----------
+        on : bool
+            Whether the fan runs; it does not at the start.
+        """
+        self._command[kernels.FAN] = float(on)
+
+    def hang(self, load_newton: float) -> None:
+        """Hang a dead load on the wire: force imposed, length follows.
+
+        Parameters
+        ----------
+        load_newton : float
+            Load, N, from 0 to ``parameters.largest_load`` (18.85 N).
+
+        Raises
+        ------
+        ValueError
+            If the load is out of range.
+        """
+        largest = self._parameters.largest_load
+        if not 0.0 <= load_newton <= largest:
+            raise ValueError(f"load_newton must lie within 0 and {largest:.4g} N, not {load_newton} N")
+        self._command[kernels.CLAMPED] = 0.0
+        self._command[kernels.LOAD] = load_newton
+
+    def clamp(self, length_metre: float) -> None:
+        """Hold the wire's end by the servo: length imposed, force follows.
+
+        Parameters
+        ----------
+        length_metre : float
+            Position of the moving end, m, positive when the wire is elongated; within ±`rest_length`.
+            It is the elongation of the wire with frame and load cell. A wire that is longer is slack,
+            at 0 N.
+
+        Raises
+        ------
+        ValueError
+            If the position is out of range.
+        """
+        longest = self._parameters.rest_length
+        if not abs(length_metre) <= longest:
+            raise ValueError(f"length_metre must lie within ±{longest} m, not {length_metre} m")
+        self._command[kernels.CLAMPED] = 1.0
+        self._command[kernels.PLACE] = length_metre / _MILLIMETRE
+
+    def advance(self, dt: float) -> None:
+        """Advance the plant in time.
+
+        Parameters
+        ----------
+        dt : float
+            Time to advance, s, at least 0. Any size: what does not fill a grid step is held for the
+            next call. A grid point less than half a microsecond ahead counts as reached.
+
+        Raises
+        ------
+        ValueError
+            If `dt` is negative or not finite.
+        """
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f"dt must be finite and not negative, not {dt} s")
+        step = self._parameters.step
+        pending = self._pending + dt
+        due = math.floor((pending + _GRID_TOLERANCE) / step)
+        self._pending = pending - due * step
+        while due > 0:
+            if self._used == self._normals.size:
+                self._normals = self._noise.standard_normal(_NOISE_BLOCK)
+                self._used = 0
+            count = min(due, self._normals.size - self._used)
+            kernels.advance_steps(
+                self._normals[self._used : self._used + count],
+                self._state,
+                self._command,
+                self._coefficients,
+                self._grains,
+                self._martensite,
+                self._oriented,
+                self._scratch,
+            )
+            self._used += count
+            due -= count
+
+    @property
+    def temperature(self) -> float:
+        """Temperature of the wire, °C."""
+        return float(self._state[kernels.TEMPERATURE])
+
+    @property
+    def ambient_temperature(self) -> float:
+        """Temperature of the room, °C."""
+        return float(self._parameters.ambient_temperature + self._state[kernels.AMBIENT_OFFSET])
+
+    @property
+    def voltage(self) -> float:
+        """Effective heating voltage, V."""
+        return float(self._command[kernels.VOLTAGE])
+
+    @property
+    def current(self) -> float:
+        """Current through the wire, A: the voltage over the (constant) resistance, without delay."""
+        return self.voltage / self._parameters.resistance
+
+    @property
+    def force(self) -> float:
+        """Tension of the wire, N; 0 to about 11.3 N at constant length between 0 and 3 V."""
+        return float(self._state[kernels.STRESS] * self._coefficients[kernels.AREA])
+
+    @property
+    def length(self) -> float:
+        """Elongation of the wire from its resting length, m; contraction is negative.
+
+        About 5.7 mm of travel under dead loads of 0.98 to 8.82 N between 0 and 3 V. A slack wire has the
+        length that it has without stress.
+        """
+        state = self._state
+        length = kernels.wire_length(
+            state[kernels.TEMPERATURE],
+            state[kernels.STRESS],
+            state[kernels.MARTENSITE],
+            state[kernels.ORIENTED],
+            self._parameters.grain_count,
+            self._coefficients,
+        )
+        return float(length * _MILLIMETRE)
+
+    @property
+    def position(self) -> float:
+        """Position of the moving end, m: the elongation of wire, frame and load cell; a servo imposes it."""
+        return float(self._state[kernels.POSITION] * _MILLIMETRE)
+
+    @property
+    def martensite_fraction(self) -> float:
+        """Share of the wire that is martensite, in [0, 1]."""
+        return float(self._state[kernels.MARTENSITE] / self._parameters.grain_count)
+
+    @property
+    def oriented_fraction(self) -> float:
+        """Share of the wire that is oriented martensite, in [0, 1]."""
+        return float(self._state[kernels.ORIENTED] / self._parameters.grain_count)
+
+    def snapshot(self) -> SMASnapshot:
+        """Take all outputs at the present instant.
+
+        Returns
+        -------
+        SMASnapshot
+            The outputs.
+        """
+        return SMASnapshot(
+            temperature=self.temperature,
+            ambient_temperature=self.ambient_temperature,
+            voltage=self.voltage,
+            current=self.current,
+            force=self.force,
+            length=self.length,
+            position=self.position,
+            martensite_fraction=self.martensite_fraction,
+            oriented_fraction=self.oriented_fraction,
+        )
+
+    def _condition(self) -> None:
+        """Erase the memory, train the wire and find its resting length, outside time."""
+        p = self._parameters
+        cold, hot = p.ambient_temperature, p.ambient_temperature + p.rise
+        self._state[kernels.TEMPERATURE] = hot
+        self._load(p.pretension)
+        self._heat(cold, clamped=False)
+        for _ in range(2):
+            self._heat(hot, clamped=True)
+            self._heat(cold, clamped=True)
+        self._load(0.0)
+        # Lengths so far count from the strain-free state: the cold length is the resting strain.
+        self._coefficients[kernels.REST_STRAIN] = self.length / p.rest_length
+        self._load(0.0)
+
+    def _load(self, newton: float) -> None:
+        kernels.load_to(
+            newton / self._coefficients[kernels.AREA],
+            self._state,
+            self._coefficients,
+            self._grains,
+            self._martensite,
+            self._oriented,
+        )
+
+    def _heat(self, celsius: float, clamped: bool) -> None:
+        kernels.heat_to(
+            celsius,
+            clamped,
+            self._state,
+            self._coefficients,
+            self._grains,
+            self._martensite,
+            self._oriented,
+            self._scratch,
+        )
+
+
+def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
+    """Prepare the numbers that the compiled loop needs every step."""
+    p = parameters
+    ambient_decay = math.exp(-p.step / p.ambient_time)
+    values = {
+        kernels.AMBIENT: p.ambient_temperature,
+        kernels.HEATING: p.rise / p.rated_voltage**2,
+        kernels.STILL_DECAY: math.exp(-p.step / p.time_constant),
+        kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
+        kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
+        kernels.AMBIENT_DECAY: ambient_decay,
+        kernels.AMBIENT_KICK: p.ambient_sd * math.sqrt(1.0 - ambient_decay**2),
+        kernels.AMBIENT_GAIN: p.ambient_gain,
+        kernels.AREA: p.area / _MILLIMETRE**2,
+        kernels.REST_LENGTH: p.rest_length / _MILLIMETRE,
+        kernels.SERIES_COMPLIANCE: 1.0 / (p.series_stiffness * _MILLIMETRE),
+        kernels.MARTENSITE_MODULUS: p.martensite_modulus / _MEGAPASCAL,
+        kernels.AUSTENITE_MODULUS: p.austenite_modulus / _MEGAPASCAL,
+        kernels.EXPANSION: p.expansion,
+        kernels.EXPANSION_REFERENCE: p.ambient_temperature,
+        kernels.TRANSFORMATION_STRAIN: p.transformation_strain,
+        kernels.UNORIENTED_SHARE: p.unoriented_share,
+        kernels.REST_STRAIN: 0.0,
+        kernels.STRESS_LIMIT: p.stress_limit / _MEGAPASCAL,
+        kernels.TEMPERATURE_STEP: p.temperature_step,
+        kernels.STRESS_STEP: p.stress_step / _MEGAPASCAL,
+        kernels.LENGTH_STEP: p.length_step / _MILLIMETRE,
+    }
+    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])
