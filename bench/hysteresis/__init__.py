@@ -13,9 +13,12 @@ from bench.hysteresis.reversible import (
     ThermalExpansion,
     reversible_from_json,
 )
+from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage, TwoStageState, coupled_from_json
 
 __all__ = [
+    "Coupled",
     "DeadZones",
+    "Linear",
     "MemoryCurve",
     "Operator",
     "Polynomial",
@@ -26,7 +29,11 @@ __all__ = [
     "Regressor",
     "Reversible",
     "Segment",
+    "Summed",
     "ThermalExpansion",
+    "TwoStage",
+    "TwoStageState",
+    "coupled_from_json",
     "operator_from_json",
     "reversible_from_json",
     "uniform_levels",

@@ -13,6 +13,16 @@ from bench.identification.identify import MODELS, Identification, Initial, Model
 from bench.identification.inspection import Coverage, check_data, measure_coverage
 from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
 from bench.identification.measures import Comparison, Errors, compare, measure_errors
+from bench.identification.two_stage import (
+    CoupledIdentification,
+    Series,
+    identify_linear,
+    identify_summed,
+    identify_two_stage,
+    measure_series,
+    predict_series,
+    voltage_steps,
+)
 from bench.identification.validation import CrossValidation, Trial, cross_validate
 
 __all__ = [
@@ -20,6 +30,7 @@ __all__ = [
     "Assessment",
     "Certificate",
     "Comparison",
+    "CoupledIdentification",
     "Coverage",
     "CrossValidation",
     "Errors",
@@ -28,6 +39,7 @@ __all__ = [
     "Initial",
     "ModelSpec",
     "Regressor",
+    "Series",
     "Trial",
     "assess",
     "check_data",
@@ -39,9 +51,15 @@ __all__ = [
     "fit",
     "fit_minimum_norm",
     "identify",
+    "identify_linear",
+    "identify_summed",
+    "identify_two_stage",
     "laboratory_time",
     "measure_coverage",
     "measure_errors",
+    "measure_series",
+    "predict_series",
     "ramps",
     "random_validation",
+    "voltage_steps",
 ]

@@ -1,0 +1,420 @@
+"""The complete inverse of the two-stage model: voltages and forces for lengths, forces and elastic loads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from bench.control.inverse import Inverse, Reach
+from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, _checks
+from bench.hysteresis.prandtl_ishlinskii import PlayState
+from bench.hysteresis.two_stage import Stage, TwoStage, TwoStageState
+
+# Part of an output range within which a target counts as met.
+_TOLERANCE = 1e-10
+# Part of the output scale that a search by bisection takes for rounding.
+_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True)
+class TwoStageInversion:
+    """What the model says will meet a target, and where that leads.
+
+    Parameters
+    ----------
+    voltage : float
+        Voltage to apply.
+    force, length : float
+        Force and length that the model then has.
+    reach : Reach
+        Whether the target is met, else that it was too high or too low; force and length then are the
+        closest that the voltage range and the range of the second stage allow.
+    imposed : Reach
+        The same for a length imposed beside a target force; `MET` where none was.
+    state : TwoStageState
+        State afterwards.
+    """
+
+    voltage: float
+    force: float
+    length: float
+    reach: Reach
+    imposed: Reach
+    state: TwoStageState
+
+
+class _Scalar(Protocol):
+    """The inverse of one stage."""
+
+    def invert(
+        self,
+        state: Any,  # noqa: ANN401 - each operator has its own
+        present: float,
+        target: float,
+        bounds: tuple[float, float] | None = None,
+    ) -> float:
+        """Return the input nearest to the present one that meets a target, or else comes closest.
+
+        The bounds replace the operating range; a saturated operator may leave them aside.
+        """
+        ...
+
+
+class _PreisachInverse:
+    """By walking over quadratic segments."""
+
+    def __init__(self, name: str, operator: Preisach) -> None:
+        self.inverse = Inverse(operator)
+        # With a density of either sign the end points of a move would not tell what the next stage saw.
+        if not self.inverse._monotone:
+            raise ValueError(f"{name}: expected an operator that rises with its input, got a falling part")
+        self.low, self.high = operator.input_range
+        self.range = operator.output_range()
+
+    def invert(
+        self,
+        state: MemoryCurve,
+        present: float,
+        target: float,
+        bounds: tuple[float, float] | None = None,  # noqa: ARG002
+    ) -> float:
+        wanted = min(max(target, self.range[0]), self.range[1])
+        inside = min(max(present, self.low), self.high)
+        found = self.inverse.invert(state.step(inside), wanted).setpoints[-1]
+        # Outside of the operating range nothing moves until the input is back.
+        return present if found == inside else found
+
+
+class _PlayInverse:
+    """By the inverse Prandtl-Ishlinskii operator."""
+
+    def __init__(self, operator: PrandtlIshlinskii) -> None:
+        self.operator, self.inverse = operator, operator.inverse()
+
+    def invert(
+        self, state: PlayState, present: float, target: float, bounds: tuple[float, float] | None = None
+    ) -> float:
+        low, high = _around(present, bounds or self.operator.input_range)
+        if target >= self.operator.step(state, high)[1]:
+            return high
+        if target <= self.operator.step(state, low)[1]:
+            return low
+        found = self.inverse.step(self.operator.inverse_state(state), target)[1]
+        return min(max(found, low), high)
+
+
+class _Bisection:
+    """By bisection, for whatever rises with its input, plateaus included."""
+
+    def __init__(self, name: str, operator: Stage) -> None:
+        self.operator = operator
+        if not isinstance(operator, PrandtlIshlinskii):
+            samples = operator.evaluate(np.linspace(*operator.input_range, 1001))
+            if (np.diff(samples) < -_ROUNDING * np.abs(samples).max()).any():
+                raise ValueError(f"{name}: expected an operator that rises with its input, got a falling part")
+
+    def invert(
+        self,
+        state: Any,  # noqa: ANN401 - each operator has its own
+        present: float,
+        target: float,
+        bounds: tuple[float, float] | None = None,
+    ) -> float:
+        low, high = _around(present, bounds or self.operator.input_range)
+        least, greatest = self.operator.step(state, low)[1], self.operator.step(state, high)[1]
+        tolerance = _ROUNDING * max(abs(least), abs(greatest))
+        wanted = min(max(target, least), greatest)
+        here = self.operator.step(state, present)[1]
+        if abs(wanted - here) <= tolerance:
+            return present
+        sign = 1.0 if wanted > here else -1.0
+        end = high if sign > 0.0 else low
+        return _first(lambda x: sign * (self.operator.step(state, x)[1] - wanted) >= -tolerance, present, end)
+
+
+def _scalar(name: str, operator: Stage) -> _Scalar:
+    if isinstance(operator, Preisach):
+        return _PreisachInverse(name, operator)
+    if isinstance(operator, PrandtlIshlinskii):
+        slopes = [m.slopes.min() for m in (operator.before, operator.after) if m is not None]
+        if min([*slopes, np.cumsum(operator.weights).min()]) > 0.0:
+            return _PlayInverse(operator)
+    return _Bisection(name, operator)
+
+
+def _around(present: float, bounds: tuple[float, float]) -> tuple[float, float]:
+    """Return the bounds, widened to hold the present input: staying must always be possible."""
+    return min(bounds[0], present), max(bounds[1], present)
+
+
+def _first(met: Callable[[float], bool], start: float, end: float) -> float:
+    """Return the number nearest to `start`, on the way to `end`, from which on something is met."""
+    before, after = start, end
+    while True:
+        middle = 0.5 * (before + after)
+        if middle in (before, after):
+            return after
+        if met(middle):
+            after = middle
+        else:
+            before = middle
+
+
+@dataclass(frozen=True, eq=False)
+class TwoStageInverse:
+    """The complete inverse of length = H2[force - H1[voltage]] (Zhang and Yip 2017, eq. 6).
+
+    The argument u = force - H1[voltage] of H2 decides the length, so each task takes one inverse of H2 and one of
+    H1, both from the present memory:
+
+    - length at a given force: u = H2⁻¹[length], voltage = H1⁻¹[force - u];
+    - force between fixed ends: u stays, voltage = H1⁻¹[force - u];
+    - length against an elastic load: as the first, with force = load(length);
+    - force at a given length and voltage: force = H1[voltage] + H2⁻¹[length].
+
+    Preisach stages are inverted exactly, segment by segment; Prandtl-Ishlinskii ones by their analytic
+    inverse; others, and plays with plateaus, by bisection to the last digit. On plateaus the answer
+    is the point nearest to the present input. Targets out of reach are clamped and flagged. A target counts
+    as met within 1e-10 of the output range.
+
+    Parameters
+    ----------
+    model : TwoStage
+        The model to invert; both stages must rise with their input.
+
+    Raises
+    ------
+    ValueError
+        If a stage falls somewhere.
+    """
+
+    model: TwoStage
+
+    def __post_init__(self) -> None:
+        _ = self._first, self._second
+
+    @cached_property
+    def _first(self) -> _Scalar:
+        return _scalar("first", self.model.first)
+
+    @cached_property
+    def _second(self) -> _Scalar:
+        return _scalar("second", self.model.second)
+
+    @cached_property
+    def _tolerances(self) -> tuple[float, float]:
+        """Within which a force and a length count as met."""
+        spans = [float(np.ptp(stage.output_range())) for stage in (self.model.first, self.model.second)]
+        forces = spans[0] + float(np.ptp(self.model.second.input_range))
+        return _TOLERANCE * forces, _TOLERANCE * spans[1]
+
+    def voltage_for_length(
+        self, state: TwoStageState, length: float, force: float | None = None
+    ) -> TwoStageInversion:
+        """Return the voltage that brings the length to a target under a known or measured force.
+
+        As in `TwoStage.step` the force moves first, then the voltage.
+
+        Parameters
+        ----------
+        state : TwoStageState
+            Present state.
+        length : float
+            Target, length units.
+        force : float or None
+            Force, force units; default the present one.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        target = _checks.number("length", length)
+        tension = state.force if force is None else _checks.number("force", force)
+        loaded, _ = self.model.step(state, state.voltage, tension)
+        low, high = (self._blocked(state, v) for v in self._voltages(state))
+        bounds = tension - high, tension - low
+        argument = self._second.invert(loaded.second, loaded.argument, target, bounds)
+        voltage = self._voltage(loaded, argument, tension)
+        after, reached = self.model.step(loaded, voltage, tension)
+        return self._result(after, self._length_flag(reached, target))
+
+    def voltage_for_force(self, state: TwoStageState, force: float, length: float | None = None) -> TwoStageInversion:
+        """Return the voltage that brings the force to a target between fixed ends (isometric).
+
+        The argument u goes straight to that of the length, and stays where it is if the length is held.
+
+        Parameters
+        ----------
+        state : TwoStageState
+            Present state.
+        force : float
+            Target, force units.
+        length : float or None
+            Length imposed from now on, length units; default the present one.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        target = _checks.number("force", force)
+        argument, imposed = state.argument, Reach.MET
+        if length is not None:
+            wanted = _checks.number("length", length)
+            argument = self._second.invert(state.second, state.argument, wanted)
+        voltage = self._first.invert(state.first, state.voltage, target - argument)
+        after, reached = self.model.move(state, voltage, argument)
+        if length is not None:
+            imposed = self._length_flag(reached, length)
+        return self._result(after, _flag(after.force, target, self._tolerances[0]), imposed)
+
+    def voltage_for_load(
+        self, state: TwoStageState, length: float, load: Callable[[float], float]
+    ) -> TwoStageInversion:
+        """Return the voltage that brings the length to a target against an elastic load.
+
+        Force and length change along the load's line, so that the argument u goes straight to its new value
+        (`together` in `TwoStage.step`). If the voltage does not suffice, force and length are those
+        where model and load meet at the end of the range.
+
+        Parameters
+        ----------
+        state : TwoStageState
+            Present state.
+        length : float
+            Target, length units.
+        load : callable
+            Force of the load at a length of the wire, constant or falling (a spring pulls more at a contracted
+            wire).
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        target = _checks.number("length", length)
+        argument = self._second.invert(state.second, state.argument, target)
+        _, reached = self.model.second.step(state.second, argument)
+        if self._length_flag(reached, target) is not Reach.MET:
+            # The voltage may take u further than the operating range of the second stage.
+            high, low = (self._equilibrium(state, self._blocked(state, v), load) for v in self._voltages(state))
+            argument = self._second.invert(state.second, state.argument, target, (low, high))
+            _, reached = self.model.second.step(state.second, argument)
+        wanted = _checks.number("load", load(reached)) - argument
+        voltage = self._first.invert(state.first, state.voltage, wanted)
+        blocked = self._blocked(state, voltage)
+        if abs(blocked - wanted) > self._tolerances[0]:
+            argument = self._equilibrium(state, blocked, load)
+        after, reached = self.model.move(state, voltage, argument)
+        return self._result(after, self._length_flag(reached, target))
+
+    def force_for_length(
+        self, state: TwoStageState, length: float, voltage: float | None = None
+    ) -> TwoStageInversion:
+        """Return the force at an imposed length and voltage: H1[voltage] + H2⁻¹[length].
+
+        The argument u goes straight to that of the length. A negative force means that a wire would be slack.
+
+        Parameters
+        ----------
+        state : TwoStageState
+            Present state.
+        length : float
+            Imposed length, length units.
+        voltage : float or None
+            Imposed voltage; default the present one. It is not clamped.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        target = _checks.number("length", length)
+        argument = self._second.invert(state.second, state.argument, target)
+        after, reached = self.model.move(state, state.voltage if voltage is None else voltage, argument)
+        return self._result(after, self._length_flag(reached, target))
+
+    def reachable_lengths(self, state: TwoStageState, force: float | None = None) -> tuple[float, float]:
+        """Return the least and greatest length that one move of the voltage reaches under a force.
+
+        Raises
+        ------
+        ValueError
+            If the force is not finite.
+        """
+        tension = state.force if force is None else _checks.number("force", force)
+        low, high = self._voltages(state)
+        return self.model.step(state, high, tension)[1], self.model.step(state, low, tension)[1]
+
+    def reachable_forces(self, state: TwoStageState, length: float | None = None) -> tuple[float, float]:
+        """Return the least and greatest force that one move of the voltage reaches at a fixed length.
+
+        Raises
+        ------
+        ValueError
+            If the length is not finite.
+        """
+        argument = state.argument
+        if length is not None:
+            argument = self._second.invert(state.second, argument, _checks.number("length", length))
+        low, high = self._voltages(state)
+        return self._blocked(state, low) + argument, self._blocked(state, high) + argument
+
+    def reachable_lengths_on(self, state: TwoStageState, load: Callable[[float], float]) -> tuple[float, float]:
+        """Return the least and greatest length that one move of the voltage reaches against an elastic load.
+
+        Raises
+        ------
+        ValueError
+            If the load is not finite.
+        """
+        ends = [self._equilibrium(state, self._blocked(state, v), load) for v in self._voltages(state)]
+        lengths = [self.model.second.step(state.second, u)[1] for u in ends]
+        return lengths[1], lengths[0]
+
+    def _voltages(self, state: TwoStageState) -> tuple[float, float]:
+        low, high = self.model.first.input_range
+        return min(low, state.voltage), max(high, state.voltage)
+
+    def _blocked(self, state: TwoStageState, voltage: float) -> float:
+        return self.model.first.step(state.first, voltage)[1]
+
+    def _voltage(self, state: TwoStageState, argument: float, force: float) -> float:
+        # Where u need not move, rounding must not move the voltage either.
+        if argument == state.argument:
+            return state.voltage
+        return self._first.invert(state.first, state.voltage, force - argument)
+
+    def _equilibrium(self, state: TwoStageState, blocked: float, load: Callable[[float], float]) -> float:
+        """Return u where blocked + u is the load's force at the length H2[u]."""
+
+        def excess(u: float) -> float:
+            force = _checks.number("load", load(self.model.second.step(state.second, u)[1]))
+            return blocked + u - force
+
+        low, high = _around(state.argument, self.model.second.input_range)
+        # A load that is constant or falling is met somewhere, be it where the second stage is saturated.
+        while excess(low) > 0.0:
+            low -= high - low
+        while excess(high) < 0.0:
+            high += high - low
+        return _first(lambda u: excess(u) >= 0.0, low, high)
+
+    def _length_flag(self, reached: float, target: float) -> Reach:
+        return _flag(reached, target, self._tolerances[1])
+
+    @staticmethod
+    def _result(after: TwoStageState, reach: Reach, imposed: Reach = Reach.MET) -> TwoStageInversion:
+        return TwoStageInversion(after.voltage, after.force, after.length, reach, imposed, after)
+
+
+def _flag(reached: float, target: float, tolerance: float) -> Reach:
+    if math.isclose(reached, target, rel_tol=0.0, abs_tol=tolerance):
+        return Reach.MET
+    return Reach.TOO_HIGH if target > reached else Reach.TOO_LOW

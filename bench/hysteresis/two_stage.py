@@ -1,0 +1,630 @@
+"""Hysteresis among voltage, force and length: one operator inside another, and two simpler models beside it.
+
+Source: Zhang and Yip, "Three-Dimensional Hysteresis Modeling of Robotic Artificial Muscles with Application to
+Shape Memory Alloy Actuators", Robotics: Science and Systems, 2017; here "Zhang and Yip 2017".
+
+All are quasi-static. "Voltage" is the paper's temperature surrogate, the constant voltage that would hold the
+present temperature (eq. 2). Force is the tension, length the elongation from the resting length, positive when
+elongated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.operator import Operator, operator_from_json
+from bench.hysteresis.polynomial import Polynomial
+from bench.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+
+S = TypeVar("S")
+Stage: TypeAlias = Operator[Any]
+
+
+class Coupled(Protocol[S]):
+    """A model from voltage and force to length, immutable apart from a state S that the caller carries along."""
+
+    @property
+    def voltage_unit(self) -> str:
+        """Unit of the voltage."""
+        ...
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force."""
+        ...
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of the length."""
+        ...
+
+    def initial_state(self) -> S:
+        """Return the state after a reset: heated to the high end of the voltage, cooled to its low end."""
+        ...
+
+    def step(self, state: S, voltage: float, force: float) -> tuple[S, float]:
+        """Return state and length after force and voltage moved monotonically to new values, force first."""
+        ...
+
+    def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> Floats:
+        """Return the lengths of a sequence, shape (N,), from `state` (default: the initial state)."""
+        ...
+
+    def advance(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> S:
+        """Return the state after a sequence."""
+        ...
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as a JSON object with a `type`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class TwoStageState:
+    """The memories of both stages and where they are now.
+
+    Parameters
+    ----------
+    voltage, force : float
+        Present inputs.
+    first, second : object
+        States of the two operators.
+    blocked : float
+        Output of the first stage, the force at resting length, force units.
+    argument : float
+        Input of the second stage, force - blocked.
+    length : float
+        Output of the second stage, length units.
+    """
+
+    voltage: float
+    force: float
+    first: Any
+    second: Any
+    blocked: float
+    argument: float
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class TwoStage:
+    """The two-stage model: length = H2[force - H1[voltage]] (Zhang and Yip 2017, eq. 6).
+
+    H1 is the force over the voltage at resting length (eqs. 3 and 5). Both should rise with their input
+    (nonnegative weights): then the length rises with the force and falls with the voltage, and a monotone move of
+    either is a monotone move of the argument u = force - H1[voltage], so that no more than the end points of a
+    move matters.
+
+    If force and voltage both change in one sample, the memory of H2 depends on the order. The convention is: u
+    moves with the force first, at the old voltage, and then with the voltage. With `together`, u goes straight to
+    its new value instead; that is right for a wire between fixed ends or against a spring, where the force is the
+    consequence of the voltage and u does not move out and back.
+
+    Parameters
+    ----------
+    first : Operator
+        H1, from voltage to force.
+    second : Operator
+        H2, from force to length.
+    pretension : float
+        Force during a reset, force units.
+
+    Raises
+    ------
+    ValueError
+        If the units of H1's output and H2's input differ or the pretension is not finite.
+    """
+
+    first: Stage
+    second: Stage
+    pretension: float = 0.0
+
+    def __post_init__(self) -> None:
+        _agree("second", self.second.input_unit, self.first.output_unit)
+        object.__setattr__(self, "pretension", _checks.number("pretension", self.pretension))
+
+    @property
+    def voltage_unit(self) -> str:
+        """Unit of the voltage."""
+        return self.first.input_unit
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force."""
+        return self.first.output_unit or self.second.input_unit
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of the length."""
+        return self.second.output_unit
+
+    def initial_state(self) -> TwoStageState:
+        """Return the state after a reset under the pretension: heated to the high end of the voltage, then cooled.
+
+        Heating takes u far down, so that H2 starts on its ascending branch. The stages start from their
+        own initial states.
+        """
+        low, high = self.first.input_range
+        hot, most = self.first.step(self.first.initial_state(), high)
+        cold, least = self.first.step(hot, low)
+        released, _ = self.second.step(self.second.initial_state(), self.pretension - most)
+        argument = self.pretension - least
+        second, length = self.second.step(released, argument)
+        return TwoStageState(low, self.pretension, cold, second, least, argument, length)
+
+    def step(
+        self, state: TwoStageState, voltage: float, force: float, *, together: bool = False
+    ) -> tuple[TwoStageState, float]:
+        """Return state and length after both inputs moved monotonically to new values.
+
+        Parameters
+        ----------
+        state : TwoStageState
+            State before.
+        voltage, force : float
+            New inputs.
+        together : bool
+            Whether u moves straight to its new value; otherwise with the force first.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        tension = _checks.number("force", force)
+        second = state.second
+        if not together and tension != state.force:
+            second, _ = self.second.step(second, tension - state.blocked)
+        first, blocked = self._driven(state, voltage)
+        return self._arrived(voltage, tension, first, second, blocked, tension - blocked)
+
+    def move(self, state: TwoStageState, voltage: float, argument: float) -> tuple[TwoStageState, float]:
+        """Return state and length after the voltage and the argument u moved to new values; the force follows.
+
+        With `argument` = `state.argument` the length is held and the force is H1[voltage] + u.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        u = _checks.number("argument", argument)
+        first, blocked = self._driven(state, voltage)
+        return self._arrived(voltage, u + blocked, first, state.second, blocked, u)
+
+    def _driven(self, state: TwoStageState, voltage: float) -> tuple[Any, float]:
+        if _checks.number("voltage", voltage) == state.voltage:
+            return state.first, state.blocked
+        return self.first.step(state.first, voltage)
+
+    def _arrived(
+        self,
+        voltage: float,
+        force: float,
+        first: Any,  # noqa: ANN401 - each operator has its own state
+        second: Any,  # noqa: ANN401
+        blocked: float,
+        argument: float,
+    ) -> tuple[TwoStageState, float]:
+        after, length = self.second.step(second, argument)
+        return TwoStageState(float(voltage), force, first, after, blocked, argument, length), length
+
+    def arguments(
+        self,
+        voltages: ArrayLike,
+        forces: ArrayLike,
+        state: TwoStageState | None = None,
+        *,
+        together: bool = False,
+    ) -> Floats:
+        """Return the inputs of H2, shape (2 N,): for each sample after the move of the force and of the voltage.
+
+        With `together` the two are the same.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        before = self.initial_state() if state is None else state
+        v, f = _pair(voltages, forces)
+        blocked = np.append(before.blocked, self.first.evaluate(v, before.first))
+        return _interleaved(blocked, f, together)
+
+    def evaluate(
+        self,
+        voltages: ArrayLike,
+        forces: ArrayLike,
+        state: TwoStageState | None = None,
+        *,
+        together: bool = False,
+    ) -> Floats:
+        """Return the lengths of a sequence.
+
+        Parameters
+        ----------
+        voltages, forces : array_like, shape (N,)
+            Inputs, between which each moves monotonically.
+        state : TwoStageState or None
+            State before the first sample; default that after a reset.
+        together : bool
+            As in `step`.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Lengths.
+
+        Raises
+        ------
+        ValueError
+            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
+        """
+        before = self.initial_state() if state is None else state
+        path = self.arguments(voltages, forces, before, together=together)
+        return self.second.evaluate(path, before.second)[1::2]
+
+    def advance(
+        self,
+        voltages: ArrayLike,
+        forces: ArrayLike,
+        state: TwoStageState | None = None,
+        *,
+        together: bool = False,
+    ) -> TwoStageState:
+        """Return the state after a sequence; arguments as in `evaluate`.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        before = self.initial_state() if state is None else state
+        v, f = _pair(voltages, forces)
+        blocked = np.append(before.blocked, self.first.evaluate(v, before.first))
+        path = _interleaved(blocked, f, together)
+        first = _advanced(self.first, before.first, v)
+        # The last step is taken singly: it gives the length.
+        second = _advanced(self.second, before.second, path[:-1])
+        return self._arrived(float(v[-1]), float(f[-1]), first, second, float(blocked[-1]), float(path[-1]))[0]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as a JSON object."""
+        return {
+            "type": "two-stage",
+            "first": self.first.to_json(),
+            "second": self.second.to_json(),
+            "pretension": self.pretension,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> TwoStage:
+        """Return the model that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        return cls(
+            operator_from_json(_checks.json_field(document, "first", "two-stage")),
+            operator_from_json(_checks.json_field(document, "second", "two-stage")),
+            document.get("pretension", 0.0),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SummedState:
+    """Present voltage and force, and the states of both operators."""
+
+    voltage: float
+    force: float
+    by_force: Any
+    by_voltage: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Summed:
+    """The model to compare with: length = H3[force] - H4[voltage] (Zhang and Yip 2017, eq. 8).
+
+    The loop over the voltage has the same shape at every force. The order of moves does not matter.
+
+    Parameters
+    ----------
+    by_force : Operator
+        H3, from force to length.
+    by_voltage : Operator
+        H4, from voltage to contraction, length units.
+    pretension : float
+        Force during a reset, force units.
+
+    Raises
+    ------
+    ValueError
+        If the units of the two outputs differ or the pretension is not finite.
+    """
+
+    by_force: Stage
+    by_voltage: Stage
+    pretension: float = 0.0
+
+    def __post_init__(self) -> None:
+        _agree("by_voltage", self.by_voltage.output_unit, self.by_force.output_unit)
+        object.__setattr__(self, "pretension", _checks.number("pretension", self.pretension))
+
+    @property
+    def voltage_unit(self) -> str:
+        """Unit of the voltage."""
+        return self.by_voltage.input_unit
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force."""
+        return self.by_force.input_unit
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of the length."""
+        return self.by_force.output_unit or self.by_voltage.output_unit
+
+    def initial_state(self) -> SummedState:
+        """Return the state after a reset under the pretension: heated to the high end of the voltage, then cooled."""
+        low, high = self.by_voltage.input_range
+        by_voltage = self.by_voltage.initial_state()
+        for voltage in (high, low):
+            by_voltage, _ = self.by_voltage.step(by_voltage, voltage)
+        by_force, _ = self.by_force.step(self.by_force.initial_state(), self.pretension)
+        return SummedState(low, self.pretension, by_force, by_voltage)
+
+    def step(self, state: SummedState, voltage: float, force: float) -> tuple[SummedState, float]:
+        """Return state and length after both inputs moved monotonically to new values.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        v, f = _checks.number("voltage", voltage), _checks.number("force", force)
+        by_force, elongation = self.by_force.step(state.by_force, f)
+        by_voltage, contraction = self.by_voltage.step(state.by_voltage, v)
+        return SummedState(v, f, by_force, by_voltage), elongation - contraction
+
+    def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: SummedState | None = None) -> Floats:
+        """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
+
+        Raises
+        ------
+        ValueError
+            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
+        """
+        before = self.initial_state() if state is None else state
+        v, f = _pair(voltages, forces)
+        return self.by_force.evaluate(f, before.by_force) - self.by_voltage.evaluate(v, before.by_voltage)
+
+    def advance(self, voltages: ArrayLike, forces: ArrayLike, state: SummedState | None = None) -> SummedState:
+        """Return the state after a sequence.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        before = self.initial_state() if state is None else state
+        v, f = _pair(voltages, forces)
+        return SummedState(
+            float(v[-1]),
+            float(f[-1]),
+            _advanced(self.by_force, before.by_force, f),
+            _advanced(self.by_voltage, before.by_voltage, v),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as a JSON object."""
+        return {
+            "type": "summed",
+            "by_force": self.by_force.to_json(),
+            "by_voltage": self.by_voltage.to_json(),
+            "pretension": self.pretension,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Summed:
+        """Return the model that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        return cls(
+            operator_from_json(_checks.json_field(document, "by_force", "summed")),
+            operator_from_json(_checks.json_field(document, "by_voltage", "summed")),
+            document.get("pretension", 0.0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The model to compare with: length = H5[force - slope * voltage - offset] (Zhang and Yip 2017, eq. 9).
+
+    It is the two-stage model with a straight line as first stage, see `two_stage`.
+
+    Parameters
+    ----------
+    slope : float
+        a, force units per voltage unit, >= 0.
+    offset : float
+        F0, force units.
+    operator : Operator
+        H5, from force to length.
+    input_range : tuple of float
+        Range of the voltage, for the reset.
+    pretension : float
+        Force during a reset, force units.
+    voltage_unit : str
+        Unit, for labels.
+
+    Raises
+    ------
+    ValueError
+        If the slope is negative, a number is not finite or the range does not increase.
+    """
+
+    slope: float
+    offset: float
+    operator: Stage
+    input_range: tuple[float, float]
+    pretension: float = 0.0
+    voltage_unit: str = ""
+    two_stage: TwoStage = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        slope, offset = _checks.number("slope", self.slope), _checks.number("offset", self.offset)
+        if slope < 0.0:
+            raise ValueError(f"slope: expected a number >= 0, got {slope}")
+        low, high = _checks.increasing("input_range", self.input_range).tolist()
+        line = Polynomial(
+            np.array([0.5 * slope * (high - low)]),
+            (low, high),
+            offset + 0.5 * slope * (low + high),
+            self.voltage_unit,
+            self.operator.input_unit,
+        )
+        object.__setattr__(self, "slope", slope)
+        object.__setattr__(self, "offset", offset)
+        object.__setattr__(self, "input_range", (low, high))
+        object.__setattr__(self, "two_stage", TwoStage(line, self.operator, self.pretension))
+        object.__setattr__(self, "pretension", self.two_stage.pretension)
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force."""
+        return self.operator.input_unit
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of the length."""
+        return self.operator.output_unit
+
+    def initial_state(self) -> TwoStageState:
+        """Return the state after a reset under the pretension."""
+        return self.two_stage.initial_state()
+
+    def step(self, state: TwoStageState, voltage: float, force: float) -> tuple[TwoStageState, float]:
+        """Return state and length after both inputs moved monotonically to new values, force first.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        return self.two_stage.step(state, voltage, force)
+
+    def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None) -> Floats:
+        """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
+
+        Raises
+        ------
+        ValueError
+            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
+        """
+        return self.two_stage.evaluate(voltages, forces, state)
+
+    def advance(self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None) -> TwoStageState:
+        """Return the state after a sequence.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        return self.two_stage.advance(voltages, forces, state)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as a JSON object."""
+        return {
+            "type": "linear",
+            "slope": self.slope,
+            "offset": self.offset,
+            "operator": self.operator.to_json(),
+            "input_range": list(self.input_range),
+            "pretension": self.pretension,
+            "voltage_unit": self.voltage_unit,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Linear:
+        """Return the model that `to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or wrong.
+        """
+        return cls(
+            _checks.json_field(document, "slope", "linear"),
+            _checks.json_field(document, "offset", "linear"),
+            operator_from_json(_checks.json_field(document, "operator", "linear")),
+            _checks.json_field(document, "input_range", "linear"),
+            document.get("pretension", 0.0),
+            document.get("voltage_unit", ""),
+        )
+
+
+def coupled_from_json(document: Mapping[str, Any]) -> TwoStage | Summed | Linear:
+    """Return the model among voltage, force and length that its `to_json` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the type is unknown or the object is not what that type expects.
+    """
+    kinds: dict[str, type[TwoStage] | type[Summed] | type[Linear]] = {
+        "two-stage": TwoStage,
+        "summed": Summed,
+        "linear": Linear,
+    }
+    kind = _checks.json_field(document, "type", "coupled model")
+    if kind not in kinds:
+        raise ValueError(f"coupled model: expected type {' or '.join(map(repr, kinds))}, got {kind!r}")
+    return kinds[kind].from_json(document)
+
+
+def _agree(name: str, unit: str, other: str) -> None:
+    """Refuse two units that are both known and differ."""
+    if unit and other and unit != other:
+        raise ValueError(f"{name}: expected the unit {other!r}, got {unit!r}")
+
+
+def _pair(voltages: ArrayLike, forces: ArrayLike) -> tuple[Floats, Floats]:
+    v, f = _checks.samples("voltages", voltages), _checks.samples("forces", forces)
+    if v.size != f.size:
+        raise ValueError(f"forces: expected {v.size} values, one for each voltage, got {f.size}")
+    return v, f
+
+
+def _interleaved(blocked: Floats, forces: Floats, together: bool) -> Floats:
+    """Return the inputs of the second stage from the blocked forces before and at each sample, shape (N + 1,)."""
+    path = np.empty(2 * forces.size)
+    path[1::2] = forces - blocked[1:]
+    path[0::2] = path[1::2] if together else forces - blocked[:-1]
+    return path
+
+
+def _advanced(stage: Stage, state: Any, inputs: Floats) -> Any:  # noqa: ANN401 - each operator has its own state
+    """Return an operator's state after a sequence, compiled where the operator can."""
+    if isinstance(state, MemoryCurve):
+        return state.advance(inputs) if inputs.size else state
+    if isinstance(stage, PrandtlIshlinskii):
+        return stage.advance(state, inputs) if inputs.size else state
+    for value in inputs.tolist():
+        state, _ = stage.step(state, value)
+    return state

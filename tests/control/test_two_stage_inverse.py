@@ -1,0 +1,369 @@
+"""The complete inverse of the two-stage model, over random memories, at its limits and on plateaus."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.control.inverse import Reach
+from bench.control.two_stage_inverse import TwoStageInverse
+from bench.hysteresis import (
+    DeadZones,
+    Linear,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    QuadraticTerm,
+    TwoStage,
+    uniform_levels,
+)
+
+
+def preisach(low, high, least, greatest, seed, order=20, zeros=0.85):
+    """A rising operator with as many zero densities as identification leaves, from `least` to `greatest`."""
+    rng = np.random.default_rng(seed)
+    levels = uniform_levels(low, high, order)
+    density = rng.random(order * (order + 1) // 2)
+    density[rng.random(density.size) < zeros] = 0.0
+    density *= 0.5 * (greatest - least) / (density @ Preisach(levels, density).cell_areas())
+    return Preisach(levels, density, 0.5 * (least + greatest))
+
+
+def plays(low, high, gain, seed, bias=0.0, first=0.4, after=None):
+    rng = np.random.default_rng(seed)
+    half, middle = 0.5 * (high - low), 0.5 * (high + low)
+    weights = np.append(first, rng.random(7)) * gain
+    return PrandtlIshlinskii(half * np.arange(8) / 8, weights, bias, middle, None, after, (low, high))
+
+
+FIRST = {
+    "preisach": lambda seed: preisach(0.0, 3.0, 0.3, 11.2, seed),
+    "plays": lambda seed: plays(0.0, 3.0, 1.5, seed, 5.0),
+    # Without a play of threshold 0 every reversal begins with a plateau.
+    "plateaus": lambda seed: plays(0.0, 3.0, 1.5, seed, 5.0, first=0.0),
+    "line": lambda seed: Polynomial([5.0], (0.0, 3.0), 5.0 + seed % 2),
+}
+SECOND = {
+    "preisach": lambda seed: preisach(-11.5, 11.5, -1.0, 5.0, seed + 1000),
+    "plays": lambda seed: plays(-11.5, 11.5, 0.1, seed + 1000),
+    "plateaus": lambda seed: plays(-11.5, 11.5, 0.1, seed + 1000, first=0.0),
+    "saturating": lambda seed: plays(-11.5, 11.5, 0.1, seed, after=DeadZones([-1.0, 1.0], [0.5, 1.0, 0.3])),
+}
+KINDS = [
+    ("preisach", "preisach"),
+    ("plays", "preisach"),
+    ("preisach", "plays"),
+    ("plays", "saturating"),
+    ("plateaus", "plateaus"),
+    ("line", "preisach"),
+]
+# The pair that identification gives is tried most.
+COUNTS = {kinds: 400 if kinds == KINDS[0] else 150 for kinds in KINDS}
+
+
+@cache
+def wire(seed=0, first="preisach", second="preisach"):
+    return TwoStage(FIRST[first](seed), SECOND[second](seed), 0.3)
+
+
+def random_state(rng, model):
+    count = rng.integers(1, 14)
+    return model.advance(rng.uniform(0.0, 3.0, count), rng.uniform(0.0, 11.0, count))
+
+
+def spring(slope, force):
+    return lambda length: force - slope * length
+
+
+@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+def test_random_states_at_a_known_force(kinds):
+    rng = np.random.default_rng(1)
+    met = 0
+    for n in range(COUNTS[kinds]):
+        if n % 40 == 0:
+            model = wire(n, *kinds)
+            inverse = TwoStageInverse(model)
+        state = random_state(rng, model)
+        force = state.force if n % 3 == 0 else rng.uniform(0.0, 11.0)
+        low, high = inverse.reachable_lengths(state, force)
+        target = rng.uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low)
+        found = inverse.voltage_for_length(state, target, force)
+        assert 0.0 <= found.voltage <= 3.0
+        # What it says is what the model does, with the force first.
+        after, length = model.step(state, found.voltage, force)
+        assert (found.state, found.length, found.force) == (after, length, force)
+        if low <= target <= high:
+            assert found.reach is Reach.MET
+            assert abs(length - target) <= 1e-9
+            met += 1
+        else:
+            assert found.reach is (Reach.TOO_HIGH if target > high else Reach.TOO_LOW)
+            assert length == pytest.approx(high if target > high else low, abs=1e-9)
+    assert met > COUNTS[kinds] // 2
+
+
+@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+def test_random_states_between_fixed_ends(kinds):
+    rng = np.random.default_rng(2)
+    met = 0
+    for n in range(COUNTS[kinds]):
+        if n % 40 == 0:
+            model = wire(n, *kinds)
+            inverse = TwoStageInverse(model)
+        state = random_state(rng, model)
+        length = None if n % 2 else model.step(state, rng.uniform(0.0, 3.0), rng.uniform(0.0, 11.0))[1]
+        low, high = inverse.reachable_forces(state, length)
+        target = rng.uniform(low - 0.5, high + 0.5)
+        found = inverse.voltage_for_force(state, target, length)
+        after = found.state
+        assert after.first == model.first.step(state.first, found.voltage)[0]
+        assert after.force - after.argument == pytest.approx(after.blocked, abs=1e-13)
+        if length is None:
+            # Held: the second stage sees nothing at all.
+            assert (after.argument, after.second, after.length) == (state.argument, state.second, state.length)
+        if found.imposed is Reach.MET:
+            assert found.length == pytest.approx(state.length if length is None else length, abs=1e-9)
+        if low <= target <= high:
+            assert found.reach is Reach.MET
+            assert abs(found.force - target) <= 1e-9
+            met += 1
+        else:
+            assert found.reach is (Reach.TOO_HIGH if target > high else Reach.TOO_LOW)
+            assert found.force == pytest.approx(high if target > high else low, abs=1e-9)
+    assert met > COUNTS[kinds] // 2
+
+
+@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+def test_random_states_against_a_spring(kinds):
+    rng = np.random.default_rng(3)
+    met = 0
+    for n in range(COUNTS[kinds]):
+        if n % 40 == 0:
+            model = wire(n, *kinds)
+            inverse = TwoStageInverse(model)
+        state = random_state(rng, model)
+        load = spring(rng.uniform(0.0, 1.0), rng.uniform(2.0, 8.0))
+        low, high = inverse.reachable_lengths_on(state, load)
+        target = rng.uniform(low - 0.2, high + 0.2)
+        found = inverse.voltage_for_load(state, target, load)
+        # Force and length lie on the load's line, met or not.
+        assert found.force == pytest.approx(load(found.length), abs=1e-8)
+        after, length = model.move(state, found.voltage, found.state.argument)
+        assert (after, length) == (found.state, found.length)
+        if low <= target <= high:
+            assert found.reach is Reach.MET
+            assert abs(length - target) <= 1e-9
+            met += 1
+        else:
+            assert found.reach is (Reach.TOO_HIGH if target > high else Reach.TOO_LOW)
+            assert length == pytest.approx(high if target > high else low, abs=1e-8)
+    assert met > COUNTS[kinds] // 2
+
+
+@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+def test_random_states_of_an_imposed_length(kinds):
+    rng = np.random.default_rng(4)
+    for n in range(COUNTS[kinds]):
+        if n % 40 == 0:
+            model = wire(n, *kinds)
+            inverse = TwoStageInverse(model)
+        state = random_state(rng, model)
+        voltage, force = rng.uniform(0.0, 3.0), rng.uniform(0.0, 11.0)
+        length = model.step(state, voltage, force, together=True)[1]
+        found = inverse.force_for_length(state, length, voltage)
+        assert found.reach is Reach.MET
+        assert found.voltage == voltage
+        assert abs(found.length - length) <= 1e-9
+        blocked = model.first.step(state.first, voltage)[1]
+        assert found.force == blocked + found.state.argument
+        # The force found and the force that made the length differ by no more than a plateau.
+        between = 0.5 * (found.force + force)
+        assert model.step(state, voltage, between, together=True)[1] == pytest.approx(length, abs=1e-9)
+
+
+@settings(max_examples=400)
+@given(st.integers(0, 100_000))
+def test_lengths_and_forces_are_monotone_in_the_voltage(seed):
+    rng = np.random.default_rng(seed)
+    model = wire(seed % 20, *KINDS[seed % len(KINDS)])
+    state = random_state(rng, model)
+    force = rng.uniform(0.0, 11.0)
+    voltages = np.sort(rng.uniform(0.0, 3.0, 12))
+    lengths = [model.step(state, v, force)[1] for v in voltages]
+    assert (np.diff(lengths) <= 1e-12).all()
+    forces = [model.move(state, v, state.argument)[0].force for v in voltages]
+    assert (np.diff(forces) >= -1e-12).all()
+    # So does the inverse.
+    inverse = TwoStageInverse(model)
+    low, high = inverse.reachable_lengths(state, force)
+    found = [inverse.voltage_for_length(state, x, force) for x in np.linspace(low, high, 8)]
+    assert (np.diff([f.voltage for f in found]) <= 1e-9).all()
+    assert all(f.reach is Reach.MET for f in found)
+
+
+def test_sequence_of_targets_keeps_the_memory():
+    rng = np.random.default_rng(6)
+    model = wire(4)
+    inverse = TwoStageInverse(model)
+    state = model.initial_state()
+    voltages, forces, lengths = [], [], []
+    for _ in range(200):
+        force = rng.choice([0.98, 2.94, 4.9, 8.82])
+        low, high = inverse.reachable_lengths(state, force)
+        target = rng.uniform(low, high)
+        found = inverse.voltage_for_length(state, target, force)
+        assert found.reach is Reach.MET
+        state = found.state
+        voltages.append(found.voltage)
+        forces.append(force)
+        lengths.append(target)
+    assert model.evaluate(voltages, forces) == pytest.approx(lengths, abs=1e-9)
+
+
+def flat(low, high, scale):
+    """Only relays with far apart thresholds count: in between nothing moves."""
+    density = np.zeros(10)
+    density[6] = scale
+    return Preisach(uniform_levels(low, high, 4), density, 5.0)
+
+
+def test_plateau_of_the_second_stage_answers_with_the_present_voltage():
+    model = TwoStage(preisach(0.0, 3.0, 0.3, 11.2, 0, zeros=0.0), flat(-12.0, 12.0, 0.1), 0.3)
+    inverse = TwoStageInverse(model)
+    state = model.advance([1.0, 1.4], [3.0, 3.0])
+    assert inverse.voltage_for_length(state, state.length).voltage == 1.4
+    assert inverse.voltage_for_length(state, state.length, 3.5).voltage == 1.4
+    found = inverse.force_for_length(state, state.length)
+    assert (found.force, found.voltage) == (pytest.approx(3.0), 1.4)
+    # Nothing switches between -6 and 6 N: at 3 N no voltage changes the length.
+    assert inverse.reachable_lengths(state) == (state.length, state.length)
+    assert inverse.voltage_for_length(state, state.length + 0.1).reach is Reach.TOO_HIGH
+    # Relays that a load has switched on go off below -6 N: there the plateau has its nearest end.
+    on = model.advance([0.0, 0.0], [11.0, 3.0], state)
+    found = inverse.voltage_for_length(on, on.length - 1e-6)
+    assert found.reach is Reach.MET
+    assert found.state.blocked == pytest.approx(9.0, abs=0.05)
+    assert inverse.voltage_for_length(found.state, found.length).voltage == found.voltage
+
+
+def test_plateau_of_the_first_stage_answers_with_its_nearest_end():
+    model = TwoStage(flat(0.0, 3.0, 4.0), plays(-11.5, 11.5, 0.1, 3), 0.3)
+    inverse = TwoStageInverse(model)
+    state = model.advance([0.5, 1.0], [4.0, 4.0])
+    assert inverse.voltage_for_length(state, state.length).voltage == 1.0
+    assert inverse.voltage_for_force(state, state.force).voltage == 1.0
+    # Relays switch on above 2.25 V only.
+    found = inverse.voltage_for_length(state, state.length - 1e-6)
+    assert found.reach is Reach.MET
+    assert found.voltage == pytest.approx(2.25, abs=0.01)
+    # Every relay is on at 3 V; on the way down none switches before 0.75 V.
+    hot = model.step(state, 3.0, 4.0)[0]
+    cooler = model.step(hot, 2.0, 4.0)[0]
+    assert inverse.voltage_for_length(cooler, hot.length).voltage == 2.0
+    assert inverse.voltage_for_length(cooler, hot.length - 1.0).voltage == 2.0
+
+
+def test_clamps_and_flags():
+    model = wire(5)
+    inverse = TwoStageInverse(model)
+    state = model.advance([1.0, 1.4], [3.0, 3.0])
+    low, high = inverse.reachable_lengths(state)
+    short, long = (inverse.voltage_for_length(state, x) for x in (-100.0, 100.0))
+    assert (short.reach, long.reach) == (Reach.TOO_LOW, Reach.TOO_HIGH)
+    assert (short.length, long.length) == (pytest.approx(low), pytest.approx(high))
+    least, greatest = inverse.reachable_forces(state)
+    weak, strong = (inverse.voltage_for_force(state, x) for x in (-100.0, 100.0))
+    assert (weak.reach, strong.reach) == (Reach.TOO_LOW, Reach.TOO_HIGH)
+    assert (weak.force, strong.force) == (pytest.approx(least), pytest.approx(greatest))
+    assert weak.imposed is Reach.MET
+    stretched = inverse.voltage_for_force(state, 5.0, 100.0)
+    assert stretched.imposed is Reach.TOO_HIGH
+    assert stretched.length == pytest.approx(model.second.output_range()[1])
+    assert inverse.force_for_length(state, -100.0).reach is Reach.TOO_LOW
+    # A constant load is a dead weight.
+    on = inverse.voltage_for_load(state, -100.0, lambda _: 3.0)
+    assert on.reach is Reach.TOO_LOW
+    assert on.voltage == pytest.approx(short.voltage)
+    assert on.length == pytest.approx(short.length)
+    assert inverse.reachable_lengths_on(state, lambda _: 3.0) == pytest.approx((low, high))
+
+
+def test_force_first_in_the_inverse_too():
+    model = wire(3)
+    inverse = TwoStageInverse(model)
+    state = model.advance([2.0, 1.0], [2.0, 2.0])
+    loaded = model.step(state, 1.0, 8.0)[0]
+    target = np.mean(inverse.reachable_lengths(state, 8.0))
+    found, again = inverse.voltage_for_length(state, target, 8.0), inverse.voltage_for_length(loaded, target)
+    assert found == again
+    # A dead weight that comes with the voltage takes u straight there: another memory.
+    straight = inverse.voltage_for_load(state, target, lambda _: 8.0)
+    assert straight.length == pytest.approx(target, abs=1e-9)
+    assert straight.state.second == state.second.step(straight.state.argument)
+
+
+def test_argument_beyond_the_plane():
+    model = wire(2)
+    inverse = TwoStageInverse(model)
+    state = model.advance([1.0, 0.0], [3.0, 20.0])
+    assert state.argument > 11.5
+    assert inverse.voltage_for_length(state, state.length).voltage == 0.0
+    assert inverse.force_for_length(state, state.length).force == pytest.approx(20.0)
+    lower = inverse.force_for_length(state, state.length - 0.5)
+    assert lower.reach is Reach.MET
+    assert lower.length == pytest.approx(state.length - 0.5, abs=1e-9)
+
+
+def test_linear_model_is_inverted_as_a_two_stage_model():
+    model = Linear(3.83, -2.95, preisach(-13.5, 13.5, -1.0, 5.0, 1), (0.0, 3.0), 0.3)
+    inverse = TwoStageInverse(model.two_stage)
+    state = model.advance([2.0, 1.0], [2.0, 4.0])
+    target = np.mean(inverse.reachable_lengths(state))
+    found = inverse.voltage_for_length(state, target)
+    assert model.step(state, found.voltage, 4.0)[1] == pytest.approx(target, abs=1e-9)
+
+
+def signed():
+    return Preisach(uniform_levels(0.0, 3.0, 2), [1.0, -0.5, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: TwoStageInverse(TwoStage(signed(), SECOND["preisach"](0))),
+            "first: expected an operator that rises",
+        ),
+        (
+            lambda: TwoStageInverse(
+                TwoStage(FIRST["line"](0), Preisach([0.0, 1.0], [1.0], reversible=QuadraticTerm(-9.0)))
+            ),
+            "second: expected an operator that rises",
+        ),
+        (
+            lambda: TwoStageInverse(TwoStage(Polynomial([0.0, 1.0], (0.0, 3.0)), SECOND["plays"](0))),
+            "first: expected an operator that rises",
+        ),
+        (lambda: ask("voltage_for_length", math.nan), "length: expected a finite"),
+        (lambda: ask("voltage_for_length", 1.0, math.inf), "force: expected a finite"),
+        (lambda: ask("voltage_for_force", math.nan), "force: expected a finite"),
+        (lambda: ask("voltage_for_force", 1.0, math.nan), "length: expected a finite"),
+        (lambda: ask("voltage_for_load", math.nan, lambda _: 1.0), "length: expected a finite"),
+        (lambda: ask("voltage_for_load", 1.0, lambda _: math.nan), "load: expected a finite"),
+        (lambda: ask("force_for_length", math.nan), "length: expected a finite"),
+        (lambda: ask("force_for_length", 1.0, math.nan), "voltage: expected a finite"),
+        (lambda: ask("reachable_lengths", math.nan), "force: expected a finite"),
+        (lambda: ask("reachable_forces", math.nan), "length: expected a finite"),
+    ],
+)
+def test_wrong_input_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def ask(task, *arguments):
+    model = wire()
+    return getattr(TwoStageInverse(model), task)(model.initial_state(), *arguments)
