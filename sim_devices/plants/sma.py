@@ -22,13 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.plants import _sma_kernels as kernels
-
-# A grid point counts as reached this early (s), so that rounding in the caller's clock, even one
-# that counts from 1970, does not decide on which side of a call a step falls.
-_GRID_TOLERANCE = 5e-7
-
-# Random numbers drawn at a time.
-_NOISE_BLOCK = 4096
+from sim_devices.plants.grid import GridPlant
 
 _MILLIMETRE = 1e-3
 _MEGAPASCAL = 1e6
@@ -290,7 +284,7 @@ def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
     )
 
 
-class SMAWire:
+class SMAWire(GridPlant):
     """Length and force of a shape-memory-alloy wire, advanced in time.
 
     Each grain follows, at temperature T and tensile stress s::
@@ -332,6 +326,7 @@ class SMAWire:
     """
 
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
+        super().__init__(parameters.step, rng)
         self._parameters = parameters
         self._coefficients = _coefficients(parameters)
         self._grains = grain_table(parameters)
@@ -340,10 +335,6 @@ class SMAWire:
         self._scratch = np.empty((2, parameters.grain_count))
         self._state = np.zeros(kernels.STATE_SIZE)
         self._command = np.zeros(kernels.COMMAND_SIZE)
-        self._pending = 0.0
-        (self._noise,) = rng.spawn(1)
-        self._normals = np.empty(0)
-        self._used = 0
         self._condition()
 
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
@@ -424,43 +415,17 @@ class SMAWire:
         self._command[kernels.CLAMPED] = 1.0
         self._command[kernels.PLACE] = length_metre / _MILLIMETRE
 
-    def advance(self, dt: float) -> None:
-        """Advance the plant in time.
-
-        Parameters
-        ----------
-        dt : float
-            Time to advance, s, at least 0. Any size: what does not fill a grid step is held for the
-            next call. A grid point less than half a microsecond ahead counts as reached.
-
-        Raises
-        ------
-        ValueError
-            If `dt` is negative or not finite.
-        """
-        if not 0.0 <= dt < math.inf:
-            raise ValueError(f"dt must be finite and not negative, not {dt} s")
-        step = self._parameters.step
-        pending = self._pending + dt
-        due = math.floor((pending + _GRID_TOLERANCE) / step)
-        self._pending = pending - due * step
-        while due > 0:
-            if self._used == self._normals.size:
-                self._normals = self._noise.standard_normal(_NOISE_BLOCK)
-                self._used = 0
-            count = min(due, self._normals.size - self._used)
-            kernels.advance_steps(
-                self._normals[self._used : self._used + count],
-                self._state,
-                self._command,
-                self._coefficients,
-                self._grains,
-                self._martensite,
-                self._oriented,
-                self._scratch,
-            )
-            self._used += count
-            due -= count
+    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+        kernels.advance_steps(
+            normals,
+            self._state,
+            self._command,
+            self._coefficients,
+            self._grains,
+            self._martensite,
+            self._oriented,
+            self._scratch,
+        )
 
     @property
     def temperature(self) -> float:

@@ -23,13 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
-
-# A grid point counts as reached this early (s), so that rounding in the caller's clock, even one
-# that counts from 1970, does not decide on which side of a call a step falls.
-_GRID_TOLERANCE = 5e-7
-
-# Rows of random numbers drawn at a time.
-_NOISE_BLOCK = 4096
+from sim_devices.plants.grid import GridPlant
 
 _POSITIVE = (
     "relay_count",
@@ -286,7 +280,7 @@ def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], ND
     return up[order], down[order]
 
 
-class VO2Cantilever:
+class VO2Cantilever(GridPlant):
     """Curvature of a VO2 microcantilever on a Peltier plate, advanced in time.
 
     The plate is either regulated (`regulate`: the closed second-order loop of a temperature
@@ -330,6 +324,7 @@ class VO2Cantilever:
     ) -> None:
         start = parameters.ambient_temperature if initial_temperature is None else initial_temperature
         _check_temperature("initial_temperature", start)
+        super().__init__(parameters.step, rng, (2,))
         self._parameters = parameters
         self._coefficients = _coefficients(parameters)
         self._up, down = relay_thresholds(parameters)
@@ -339,10 +334,6 @@ class VO2Cantilever:
         self._counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
         self._command = np.zeros(kernels.COMMAND_SIZE)
         self._state = np.zeros(kernels.STATE_SIZE)
-        self._pending = 0.0
-        (self._noise,) = rng.spawn(1)
-        self._normals = np.empty((0, 2))
-        self._used = 0
 
         state = self._state
         wander = float(self._noise.standard_normal())
@@ -417,44 +408,18 @@ class VO2Cantilever:
         self._command[kernels.CLOSED] = 0.0
         self._command[kernels.COMMAND] = 0.0
 
-    def advance(self, dt: float) -> None:
-        """Advance the plant in time.
-
-        Parameters
-        ----------
-        dt : float
-            Time to advance, s, at least 0. Any size: what does not fill a grid step is held for the
-            next call. A grid point less than half a microsecond ahead counts as reached.
-
-        Raises
-        ------
-        ValueError
-            If `dt` is negative or not finite.
-        """
-        if not 0.0 <= dt < math.inf:
-            raise ValueError(f"dt must be finite and not negative, not {dt} s")
-        step = self._parameters.step
-        pending = self._pending + dt
-        due = math.floor((pending + _GRID_TOLERANCE) / step)
-        self._pending = pending - due * step
-        while due > 0:
-            if self._used == self._normals.shape[0]:
-                self._normals = self._noise.standard_normal((_NOISE_BLOCK, 2))
-                self._used = 0
-            count = min(due, self._normals.shape[0] - self._used)
-            kernels.advance_steps(
-                self._normals[self._used : self._used + count],
-                self._state,
-                self._counters,
-                self._command,
-                self._coefficients,
-                self._up,
-                self._down,
-                self._down_relay,
-                self._on,
-            )
-            self._used += count
-            due -= count
+    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+        kernels.advance_steps(
+            normals,
+            self._state,
+            self._counters,
+            self._command,
+            self._coefficients,
+            self._up,
+            self._down,
+            self._down_relay,
+            self._on,
+        )
 
     @property
     def plate_temperature(self) -> float:
