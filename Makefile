@@ -12,7 +12,7 @@ demo: $(SETUP)
 	$(BIN)/bench reproduce vo2 --out recordings
 
 test: check
-	$(BIN)/python -m pytest --numprocesses auto --dist loadgroup
+	$(BIN)/python -m pytest --numprocesses auto
 
 check: $(SETUP)
 	$(BIN)/ruff check
