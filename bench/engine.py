@@ -34,12 +34,12 @@ from bench.protocol import (
     Dwell,
     Note,
     Phase,
+    Plan,
     ProtocolDefinition,
     ProtocolParameters,
     Reading,
     Step,
     UntilSteady,
-    plan,
 )
 from bench.rig import Rig
 from bench.safety import SAFE, InterlockWatch, make_safe
@@ -401,8 +401,8 @@ class Engine:
         return Outcome(status, reason, self._steps, finished - start, safe_state, error)
 
 
-def check_before_moving(rig: Rig, definition: ProtocolDefinition, parameters: ProtocolParameters) -> None:
-    """Run a protocol dry against a rig's needs and limits.
+def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan) -> None:
+    """Hold what a protocol will do, as its dry run says, against a rig's needs and limits.
 
     Raises
     ------
@@ -410,7 +410,6 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, parameters: Pr
         If the rig lacks something, or a set-point would leave a device's limits; nothing has moved.
     """
     rig.check_needs(definition.name, definition.needs)
-    expected = plan(definition, parameters)
     rig.check_needs(definition.name, sorted(expected.watched))
     if expected.watched:
         preload()

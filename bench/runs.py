@@ -111,7 +111,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
     expected = plan(run.protocol, run.parameters)
     with ExitStack() as stack:
         rig = stack.enter_context(Rig(rig_file, clock, run.seed))
-        check_before_moving(rig, run.protocol, run.parameters)
+        check_before_moving(rig, run.protocol, expected)
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = _metadata(run, rig, expected, folder.name)

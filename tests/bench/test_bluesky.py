@@ -6,6 +6,7 @@ from heater_protocols import stairs
 from bench.clock import VIRTUAL_EPOCH, VirtualClock
 from bench.engine import check_before_moving
 from bench.errors import DeviceError, LimitError
+from bench.protocol import plan
 from bench.rig import Rig, load_rig
 
 bluesky = pytest.importorskip("bluesky")
@@ -91,4 +92,4 @@ class TestFailures:
 
 def test_the_rig_of_a_scan_runs_protocols_too(rig):
     with pytest.raises(Exception, match="probe_temperature"):
-        check_before_moving(rig, stairs, stairs.parameters())
+        check_before_moving(rig, stairs, plan(stairs, stairs.parameters()))

@@ -267,11 +267,11 @@ class TestBeforeMoving:
             assert rig.devices["tec"].calls == []
 
     def test_right(self, rig):
-        check_before_moving(rig, stairs, Stairs())
+        check_before_moving(rig, stairs, plan(stairs, Stairs()))
 
     def test_setpoints_outside_of_the_limits(self, rig):
         with pytest.raises(ConfigurationError) as caught:
-            check_before_moving(rig, stairs, Stairs(count=30))
+            check_before_moving(rig, stairs, plan(stairs, Stairs(count=30)))
         assert "stairs would set tec to between 30 and 175 °C; rig heater allows 10 to 95 °C" in str(caught.value)
 
     def test_a_device_that_cannot_be_set(self, rig):
@@ -279,7 +279,7 @@ class TestBeforeMoving:
             yield Step({"probe": 30.0}, Dwell(1.0))
 
         with pytest.raises(ConfigurationError, match="wrong sets probe, which rig heater cannot set"):
-            check_before_moving(rig, define(wrong), Nothing())
+            check_before_moving(rig, define(wrong), plan(define(wrong), Nothing()))
 
     def test_needs(self, rig):
         @protocol(needs=("tec", "curvature", "servo"))
@@ -288,11 +288,11 @@ class TestBeforeMoving:
             yield Note("x")
 
         with pytest.raises(ConfigurationError, match="needs curvature, servo, which rig heater does not have"):
-            check_before_moving(rig, wanting, Nothing())
+            check_before_moving(rig, wanting, plan(wanting, Nothing()))
 
     def test_a_signal_that_is_not_there(self, rig):
         with pytest.raises(ConfigurationError, match="prob_temperature"):
-            check_before_moving(rig, settle, Settle(signal="prob_temperature"))
+            check_before_moving(rig, settle, plan(settle, Settle(signal="prob_temperature")))
 
 
 class TestFaults:
@@ -632,11 +632,19 @@ class TestControl:
 
     def test_limits_are_checked_before_anything_moves(self, rig_file):
         with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            check_before_moving(rig, control(Integrator(50.0)), Nothing())
+            check_before_moving(rig, control(Integrator(50.0)), plan(control(Integrator(50.0)), Nothing()))
             with pytest.raises(ConfigurationError, match="rig heater allows 10 to 95 °C"):
-                check_before_moving(rig, control(Integrator(50.0), limits=(15.0, 100.0)), Nothing())
+                check_before_moving(
+                    rig,
+                    control(Integrator(50.0), limits=(15.0, 100.0)),
+                    plan(control(Integrator(50.0), limits=(15.0, 100.0)), Nothing()),
+                )
             with pytest.raises(ConfigurationError, match="absent"):
-                check_before_moving(rig, control(Integrator(50.0), output="absent"), Nothing())
+                check_before_moving(
+                    rig,
+                    control(Integrator(50.0), output="absent"),
+                    plan(control(Integrator(50.0), output="absent"), Nothing()),
+                )
 
     @pytest.mark.parametrize(
         "keys", [{"limits": (2.0, 1.0)}, {"limits": (math.nan, 1.0)}, {"timeout": 0.0}, {"timeout": math.nan}]
