@@ -537,6 +537,65 @@ class Servo(Actuator):
         return Signal(f"{self.name}_setpoint", "rad", "angle set-point", 4)
 
 
+class LinearStage(Actuator):
+    """Holds a point at a position along a line, in m.
+
+    `set` completes when the stage stands at the goal; `stop` holds the present position. The safe state is
+    without force: the point can be moved by hand.
+
+    Signals: `NAME_position` m, `NAME_velocity` m/s, `NAME_load` 1 (share of the greatest force, as the stage
+    infers it).
+    """
+
+    @property
+    @abstractmethod
+    def force_enabled(self) -> bool:
+        """Whether the stage holds its position, as the device says now."""
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (
+            Signal(f"{self.name}_position", "m", "position", 6),
+            Signal(f"{self.name}_velocity", "m/s", "velocity", 5),
+            Signal(f"{self.name}_load", "1", "inferred load", 3),
+        )
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """The position asked for."""
+        return Signal(f"{self.name}_setpoint", "m", "position set-point", 6)
+
+
+class Switch(Actuator):
+    """Switches something on (1) or off (0), such as a fan; no other set-point is allowed.
+
+    The safe state is off.
+
+    Signal: `NAME_state` 1, what the device drives its output to.
+    """
+
+    @property
+    def limits(self) -> Limits:
+        """Off and on."""
+        return Limits(0.0, 1.0, "(0 is off, 1 is on)")
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        return (Signal(f"{self.name}_state", "1", "whether it is on", 0),)
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """Whether it shall be on."""
+        return Signal(f"{self.name}_setpoint", "1", "whether it shall be on", 0)
+
+    def check(self, value: float) -> None:
+        """Raise `LimitError` unless `value` is 0 or 1."""
+        if value not in (0.0, 1.0):
+            raise LimitError(self.name, f"set-point {value:g} is neither 0 (off) nor 1 (on)")
+
+
 ROLES: Mapping[str, type] = {
     "TEC amplifier": TECAmplifier,
     "voltage supply": VoltageSupply,
@@ -544,6 +603,8 @@ ROLES: Mapping[str, type] = {
     "position sensor": PositionSensor,
     "temperature sensor": TemperatureSensor,
     "servo": Servo,
+    "linear stage": LinearStage,
+    "switch": Switch,
 }
 """The roles by the names that messages use."""
 

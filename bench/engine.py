@@ -204,7 +204,7 @@ class Engine:
         return self._finish_step(started, step.label, step.setpoints, values)
 
     def _control(self, message: Control) -> Reading:
-        for name in (message.input, message.output):
+        for name in (message.input, message.output, *message.others):
             if name not in self._names:
                 raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
         actuator = self._actuator(message.actuator)
@@ -218,7 +218,7 @@ class Engine:
                 values = self._values(self._rig.measure)
                 now = self._clock.now()
                 ask = message.loop.begin if command is None else message.loop.update
-                command = ask(now, values[message.input], values[message.output])
+                command = ask(now, *(values[name] for name in (message.input, message.output, *message.others)))
                 trace = message.loop.trace
                 self._trace = dict(
                     zip(

@@ -135,6 +135,8 @@ class Control:
         Seconds after which the step has failed and the run ends in the safe state.
     label : str
         A few words for the record.
+    others : tuple of str
+        Further signals that the controller wants to see.
     """
 
     loop: Loop
@@ -144,6 +146,7 @@ class Control:
     limits: tuple[float, float]
     timeout: float
     label: str = ""
+    others: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         low, high = self.limits
@@ -428,7 +431,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
             elif isinstance(message, Control):
                 low, high = extremes.get(message.actuator, message.limits)
                 extremes[message.actuator] = (min(low, message.limits[0]), max(high, message.limits[1]))
-                watched |= {message.input, message.output}
+                watched |= {message.input, message.output, *message.others}
                 at_most += message.timeout
                 reading = Reading(steps, seconds, True, echo)
                 steps += 1

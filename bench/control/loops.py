@@ -12,12 +12,15 @@ _SHORTEST_WAIT = 1e-3  # s
 
 
 class Loop(Protocol):
-    """A controller at work: asked for a command at its beginning and after each reading, until it is done."""
+    """A controller at work: asked for a command at its beginning and after each reading, until it is done.
 
-    def begin(self, t: float, measured_input: float, output: float) -> Command:
-        """Take the first reading (s, input units, output units); say what to do."""
+    Beside input and output it is given whatever further signals its `Control` names, in that order.
+    """
 
-    def update(self, t: float, measured_input: float, output: float) -> Command:
+    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
+        """Take the first reading (s, input units, output units, others in theirs); say what to do."""
+
+    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Take the next reading, `wait` seconds after the last command; say what to do."""
 
     @property
@@ -40,11 +43,11 @@ class ReachTarget:
         self._controller = controller
         self._target = target
 
-    def begin(self, t: float, measured_input: float, output: float) -> Command:
+    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Aim at the target."""
         return self._controller.aim(self._target, t, measured_input, output)
 
-    def update(self, t: float, measured_input: float, output: float) -> Command:
+    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Go on towards it."""
         return self._controller.update(t, measured_input, output)
 
@@ -88,13 +91,13 @@ class FollowReference:
         self._setpoint = 0.0
         self._now = 0.0
 
-    def begin(self, t: float, measured_input: float, output: float) -> Command:
+    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Set the first set-point."""
         self._start = t
         self._sample = 0
         return self.update(t, measured_input, output)
 
-    def update(self, t: float, measured_input: float, output: float) -> Command:
+    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Set the next one, for the reference at the end of the period."""
         self._now = t - self._start
         if self._sample == self._samples:
