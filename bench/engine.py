@@ -35,6 +35,7 @@ from bench.protocol import (
     Note,
     Phase,
     Plan,
+    Prompt,
     ProtocolDefinition,
     ProtocolParameters,
     Reading,
@@ -48,6 +49,9 @@ TRACE_NAMES = tuple(signal.name for signal in TRACES)
 
 RESUME = "resume"
 ABORT = "abort"
+
+PROMPT = "prompt"
+"""Label of the reading that follows a prompt."""
 
 
 class Observer(Protocol):
@@ -110,8 +114,8 @@ class Engine:
     interrupts : Interrupts
         What the operator and the system ask for.
     ask : callable, optional
-        Asks the operator at a pause, and returns `resume` or `abort`. Without it a pause is an abort, as
-        nobody is there to answer.
+        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt is an
+        abort, as nobody is there to answer.
     """
 
     def __init__(
@@ -120,7 +124,7 @@ class Engine:
         journal: Journal,
         observers: Iterable[Observer],
         interrupts: Interrupts,
-        ask: Callable[[], str] | None = None,
+        ask: Callable[[str], str] | None = None,
     ) -> None:
         self._rig = rig
         self._clock = rig.clock
@@ -176,6 +180,9 @@ class Engine:
                 elif isinstance(message, Control):
                     self._pause_if_asked()
                     reading = self._control(message)
+                elif isinstance(message, Prompt):
+                    self._pause_if_asked()
+                    reading = self._prompt(message)
                 elif isinstance(message, Phase):
                     self._phase = message.name
                     self._event("INFO", "phase", message.name)
@@ -184,7 +191,7 @@ class Engine:
                 else:
                     raise ConfigurationError(
                         f"protocol {definition.name} yielded {message!r}; "
-                        "expected a Step, a Control, a Phase or a Note"
+                        "expected a Step, a Control, a Prompt, a Phase or a Note"
                     )
         finally:
             # What a protocol does or raises while it is closed must not hide why the run ends.
@@ -249,6 +256,30 @@ class Engine:
                 self._hold_until(end, asked)
         finally:
             self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
+
+    def _prompt(self, message: Prompt) -> Reading:
+        self._event("INFO", "prompt", message.text)
+        started = self._clock.now()
+        if self._rig.laboratory is not None:
+            self._rig.laboratory.operate(message.task, message.value)
+        elif self._ask is None:
+            raise AbortError(f"nobody is there to do it: {message.text}")
+        elif self._await_answer(self._ask, f"{message.text}; then") != RESUME:
+            raise AbortError("ended by the operator at a prompt")
+        self._settle(message.settle, self._clock.now())
+        values = self._values(self._rig.measure)
+        self._watch.check(self._clock.now(), values)
+        # Kept in any case: it shows what was wrong.
+        reading = self._finish_step(started, PROMPT, {}, values)
+        value = reading[message.signal]
+        if not message.low <= value <= message.high:
+            unit = next(signal.unit for signal in self._rig.signals if signal.name == message.signal)
+            raise DeviceError(
+                message.signal,
+                f"reads {value:.4g} {unit} after the prompt to {message.text[:1].lower()}{message.text[1:]}; "
+                f"expected {message.low:g} to {message.high:g} {unit}. Was it done?",
+            )
+        return reading
 
     def _finish_step(
         self, started: float, label: str, setpoints: Mapping[str, float], values: Mapping[str, float]
@@ -346,8 +377,16 @@ class Engine:
         if self._ask is None:
             raise AbortError("ended by Ctrl-C; nobody is there to be asked whether to resume")
         self._event("WARN", "pause", "paused before the next step, at the operator's wish")
+        answer = self._await_answer(self._ask, "paused:")
+        self._interrupts.pause_requested = False
+        if answer != RESUME:
+            raise AbortError("ended by the operator at a pause")
+        self._event("INFO", "resume", "resumed")
+
+    def _await_answer(self, ask: Callable[[str], str], question: str) -> str:
+        """Have the operator asked, with telemetry and interlocks going on; return the answer."""
         answer: list[str] = []
-        asking = threading.Thread(target=_put, args=(answer, self._ask), name="ask-operator", daemon=True)
+        asking = threading.Thread(target=lambda: answer.append(ask(question)), name="ask-operator", daemon=True)
         asking.start()
         while asking.is_alive():
             if self._clock.runs_by_itself:
@@ -357,10 +396,7 @@ class Engine:
             else:
                 asking.join(0.1)
                 self._raise_if_aborted()
-        self._interrupts.pause_requested = False
-        if not answer or answer[0] != RESUME:
-            raise AbortError("ended by the operator at a pause")
-        self._event("INFO", "resume", "resumed")
+        return answer[0] if answer else ABORT
 
     def _event(self, level: str, kind: str, text: str) -> None:
         event = Event(self._clock.now(), level, kind, text)
@@ -424,7 +460,3 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan
                 f"protocol {definition.name} would set {device} to between {low:g} and {high:g} {limits.unit}; "
                 f"rig {rig.file.name} allows {limits}"
             )
-
-
-def _put(answer: list[str], ask: Callable[[], str]) -> None:
-    answer.append(ask())

@@ -158,6 +158,41 @@ class Control:
 
 
 @dataclass(frozen=True)
+class Prompt:
+    """Ask the operator to do something by hand, let the rig settle, and see by a reading that it was done.
+
+    An emulated laboratory does it by itself, from `task` and `value`.
+
+    Attributes
+    ----------
+    text : str
+        What to do, as an imperative sentence without a full stop.
+    task : str
+        The same for an emulated laboratory, such as `load`.
+    value : float
+        What the task is about, such as the load in N.
+    settle : Dwell or UntilSteady
+        How to wait between the operator's answer and the reading.
+    signal : str
+        Signal that tells whether it was done.
+    low, high : float
+        Where the signal then has to be, in its unit; if it is not, the run ends in the safe state.
+    """
+
+    text: str
+    task: str
+    value: float
+    settle: Settle
+    signal: str
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"Prompt: expected low < high, got low={self.low}, high={self.high}")
+
+
+@dataclass(frozen=True)
 class Phase:
     """A part of the protocol begins; shown live and kept in the record."""
 
@@ -171,7 +206,7 @@ class Note:
     text: str
 
 
-Message = Step | Control | Phase | Note
+Message = Step | Control | Prompt | Phase | Note
 
 
 @dataclass(frozen=True)
@@ -382,7 +417,9 @@ class Plan:
     extremes : mapping of str to (float, float)
         Smallest and largest set-point by device.
     watched : frozenset of str
-        Signals that have to become steady or are controlled.
+        Signals that have to become steady, are controlled or looked at.
+    prompts : int
+        How often the operator is asked to do something by hand.
     """
 
     steps: int
@@ -390,6 +427,7 @@ class Plan:
     at_most: float
     extremes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     watched: frozenset[str] = frozenset()
+    prompts: int = 0
 
 
 def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan:
@@ -402,7 +440,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
     ConfigurationError
         If the protocol does not end within a million steps, its parameters do not fit together, or it fails.
     """
-    steps, others, seconds, at_most = 0, 0, 0.0, 0.0
+    steps, prompts, others, seconds, at_most = 0, 0, 0, 0.0, 0.0
     watched: set[str] = set()
     extremes: dict[str, tuple[float, float]] = {}
     echo = _Echo()
@@ -438,6 +476,17 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 if steps > _LONGEST_PLAN:
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
+            elif isinstance(message, Prompt):
+                watched.add(message.signal)
+                if isinstance(message.settle, UntilSteady):
+                    watched.add(message.settle.signal)
+                shortest, longest = _durations(message.settle)
+                seconds, at_most = seconds + shortest, at_most + longest
+                reading = Reading(steps, seconds, True, echo)
+                steps, prompts = steps + 1, prompts + 1
+                if steps > _LONGEST_PLAN:
+                    raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
+                message = messages.send(reading)
             elif isinstance(message, Phase | Note):
                 others += 1
                 if others > _LONGEST_PLAN:
@@ -445,10 +494,11 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 message = next(messages)
             else:
                 raise ConfigurationError(
-                    f"protocol {definition.name} yielded {message!r}; expected a Step, a Control, a Phase or a Note"
+                    f"protocol {definition.name} yielded {message!r}; "
+                    "expected a Step, a Control, a Prompt, a Phase or a Note"
                 )
     except StopIteration:
-        return Plan(steps, seconds, at_most, extremes, frozenset(watched))
+        return Plan(steps, seconds, at_most, extremes, frozenset(watched), prompts)
     except BenchError:
         raise
     except ValueError as error:

@@ -120,6 +120,9 @@ class Laboratory(Protocol):
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by its name in `emulated://NAME`."""
 
+    def operate(self, task: str, value: float) -> None:
+        """Do by hand what a protocol's prompt asks for; raise ConfigurationError for a task that it cannot do."""
+
     def close(self) -> None:
         """Switch everything off."""
 
@@ -230,6 +233,7 @@ class Rig:
         self.file = file
         self.clock = clock
         self.devices: dict[str, Device] = {}
+        self.laboratory: Laboratory | None = None
         with ExitStack() as stack:
             ports: Mapping[str, str] = {}
             if file.laboratory is not None:

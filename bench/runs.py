@@ -12,6 +12,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,9 +110,15 @@ def carry_out(run: Run, console: Console) -> RunResult:
     if run.clock != "wall" and any(not _is_emulated(entry.settings) for entry in rig_file.devices):
         raise ConfigurationError(f"rig {rig_file.name} has real devices, which know only the wall clock")
     expected = plan(run.protocol, run.parameters)
+    operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     with ExitStack() as stack:
         rig = stack.enter_context(Rig(rig_file, clock, run.seed))
         check_before_moving(rig, run.protocol, expected)
+        if expected.prompts and not (rig_file.emulated or operator_is_there):
+            raise ConfigurationError(
+                f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
+                "run it in a terminal, where somebody can answer"
+            )
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = _metadata(run, rig, expected, folder.name)
@@ -131,7 +138,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
         observers.append(stack.enter_context(progress))
         interrupts = stack.enter_context(Interrupts(_say_at_once))
-        ask = (lambda: ask_operator(console)) if sys.stdin is not None and sys.stdin.isatty() else None
+        ask = partial(ask_operator, console) if operator_is_there else None
         outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, run.parameters)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)

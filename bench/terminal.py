@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -94,7 +95,7 @@ class ProgressDisplay:
         """Show the phase beside the bar, and print what the operator should know."""
         if event.kind == "phase":
             self._progress.update(self._task, phase=event.text)
-        elif event.level != "INFO" or event.kind in ("note", "resume"):
+        elif event.level != "INFO" or event.kind in ("note", "prompt", "resume"):
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
                 f"{_duration(event.t):>10}  {event.kind}: {event.text}", style=style, highlight=False, markup=False
@@ -105,9 +106,9 @@ class ProgressDisplay:
         return "  ".join([f"t {_duration(t)}", *parts])
 
 
-def ask_operator(console: Console) -> str:
-    """Ask at a pause what to do; return `resume` or `abort`."""
-    console.print("paused: [bold]r[/] resumes, [bold]a[/] ends the run in the safe state (then Enter)")
+def ask_operator(console: Console, question: str) -> str:
+    """Ask at a pause or a prompt how to go on; return `resume` or `abort`."""
+    console.print(f"{escape(question)} [bold]r[/] resumes, [bold]a[/] ends the run in the safe state (then Enter)")
     for line in sys.stdin:
         answer = line.strip().lower()
         if answer in ("r", RESUME):

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
+from bench.errors import ConfigurationError
 from bench.rig import LaboratorySettings
 from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import EmulatedT7, NormalisedPSD
@@ -78,6 +79,16 @@ class VO2Laboratory:
             self._t7_server.close()
             raise
         return {"tec": port, "psd": self._t7_server.address}
+
+    def operate(self, task: str, value: float) -> None:  # noqa: ARG002 - nothing is done by hand here
+        """Refuse: nothing is to be done by hand.
+
+        Raises
+        ------
+        ConfigurationError
+            Always.
+        """
+        raise ConfigurationError(f"the VO2 laboratory cannot carry out {task!r}; nothing is done by hand there")
 
     def close(self) -> None:
         """Switch the instruments off."""

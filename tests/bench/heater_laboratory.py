@@ -21,7 +21,7 @@ from bench.devices import (
     TECMode,
     TemperatureSensor,
 )
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.rig import LaboratorySettings
 
 RIG = """
@@ -90,6 +90,12 @@ class HeaterLaboratory:
         _plates["plate"] = self.plate
         type(self).opened += 1
         return {"heater": "plate", "thermometer": "plate", "spot": "plate"}
+
+    def operate(self, task: str, value: float) -> None:
+        if task != "turn":
+            raise ConfigurationError(f"the heater laboratory cannot carry out {task!r}")
+        self.plate.now()
+        self.plate.target = value
 
     def close(self) -> None:
         _plates.pop("plate", None)

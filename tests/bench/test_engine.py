@@ -25,6 +25,7 @@ from bench.protocol import (
     Dwell,
     Note,
     Phase,
+    Prompt,
     ProtocolParameters,
     Step,
     UntilSteady,
@@ -401,7 +402,7 @@ class TestFaults:
         b = bench()
         outcome = b.run(define(go))
         assert isinstance(outcome.error, ConfigurationError)
-        assert "expected a Step, a Control, a Phase or a Note" in outcome.reason
+        assert "expected a Step, a Control, a Prompt, a Phase or a Note" in outcome.reason
         b.assert_safe()
 
     def test_a_protocol_that_goes_on_when_it_is_closed(self, bench):
@@ -664,6 +665,104 @@ class TestControl:
             plan(define(endless), Nothing())
 
 
+def prompt(task="turn", value=33.0):
+    def go(parameters):
+        yield Step({"tec": 30.0}, Dwell(2.0))
+        reading = yield Prompt("Turn the plate to 33 °C", task, value, Dwell(20.0), "probe_temperature", 32.5, 33.5)
+        assert reading["probe_temperature"] == pytest.approx(33.0, abs=0.1)
+
+    return define(go)
+
+
+class TestPrompt:
+    def test_an_emulated_laboratory_does_it_by_itself(self, bench):
+        b = bench()
+        outcome = b.run(prompt())
+        assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("completed", 2, 22.0)
+        assert [event.text for event in b.watcher.events if event.kind == "prompt"] == ["Turn the plate to 33 °C"]
+        assert b.watcher.steps[-1].label == "prompt"
+
+    def test_what_was_not_done_ends_the_run_and_is_recorded(self, bench):
+        b = bench()
+        outcome = b.run(prompt(value=30.0))
+        assert (outcome.status, outcome.steps) == ("failed", 2)
+        assert isinstance(outcome.error, DeviceError)
+        assert outcome.reason == (
+            "probe_temperature: reads 30 °C after the prompt to turn the plate to 33 °C; "
+            "expected 32.5 to 33.5 °C. Was it done?"
+        )
+        b.assert_safe()
+        with b.record() as run:
+            assert run.steps()["probe_temperature"][-1] == pytest.approx(30.0, abs=0.1)
+
+    def test_a_task_that_the_laboratory_cannot_do(self, bench):
+        b = bench()
+        outcome = b.run(prompt(task="dance"))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert "'dance'" in outcome.reason
+        b.assert_safe()
+
+    def by_hand(self, b):
+        """The rig without a laboratory that answers, as a real one is."""
+        laboratory, b.rig.laboratory = b.rig.laboratory, None
+        return laboratory
+
+    def test_an_operator_is_asked_with_telemetry_going_on(self, bench):
+        questions = []
+
+        def ask(question):
+            questions.append(question)
+            laboratory.operate("turn", 33.0)
+            return RESUME
+
+        b = bench(ask=ask)
+        laboratory = self.by_hand(b)
+        assert b.run(prompt()).status == "completed"
+        assert questions == ["Turn the plate to 33 °C; then"]
+
+    def test_an_operator_may_end_the_run(self, bench):
+        b = bench(ask=lambda _: ABORT)
+        self.by_hand(b)
+        outcome = b.run(prompt())
+        assert (outcome.status, outcome.reason) == ("aborted", "ended by the operator at a prompt")
+        b.assert_safe()
+
+    def test_nobody_there(self, bench):
+        b = bench()
+        self.by_hand(b)
+        outcome = b.run(prompt())
+        assert (outcome.status, outcome.reason) == ("aborted", "nobody is there to do it: Turn the plate to 33 °C")
+        b.assert_safe()
+
+    def test_the_dry_run_counts_them(self):
+        expected = plan(prompt_without_reading, Nothing())
+        assert (expected.prompts, expected.steps, expected.seconds, expected.at_most) == (1, 1, 5.0, 60.0)
+        assert expected.watched == {"probe_temperature", "tec_temperature"}
+
+    def test_an_unknown_signal_is_found_before_anything_moves(self, rig_file):
+        def go(parameters):
+            yield Prompt("Do it", "turn", 1.0, Dwell(1.0), "no_such", 0.0, 1.0)
+
+        definition = define(go)
+        with (
+            Rig(load_rig(rig_file()), VirtualClock(), 1) as rig,
+            pytest.raises(ConfigurationError, match="no_such"),
+        ):
+            check_before_moving(rig, definition, plan(definition, Nothing()))
+
+    def test_an_empty_range(self):
+        with pytest.raises(ValueError, match="low < high"):
+            Prompt("Do it", "turn", 1.0, Dwell(1.0), "probe_temperature", 2.0, 2.0)
+
+
+def go_and_ask(parameters):
+    settle = UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=60.0, minimum=5.0)
+    yield Prompt("Do it", "turn", 1.0, settle, "probe_temperature", 0.0, 1.0)
+
+
+prompt_without_reading = define(go_and_ask)
+
+
 class TestInterrupted:
     def request(self, **flags):
         """A protocol that sets flags of the interrupts in its second step."""
@@ -680,7 +779,7 @@ class TestInterrupted:
     def test_pause_and_resume(self, bench):
         asked = []
 
-        def ask():
+        def ask(question):
             asked.append(threading.current_thread() is not threading.main_thread())
             return RESUME
 
@@ -695,7 +794,7 @@ class TestInterrupted:
 
     @pytest.mark.parametrize("answer", [ABORT, "", "whatever"])
     def test_pause_and_abort(self, bench, answer):
-        self.b = b = bench(ask=lambda: answer)
+        self.b = b = bench(ask=lambda _: answer)
         outcome = b.run(self.request(pause_requested=True))
         assert (outcome.status, outcome.steps) == ("aborted", 1)
         assert isinstance(outcome.error, AbortError)
@@ -742,7 +841,7 @@ class TestInterrupted:
     def test_abort_at_a_pause(self, bench):
         answered = threading.Event()
 
-        def ask():
+        def ask(question):
             self.b.interrupts.abort_reason = "Ctrl-C, twice"
             answered.wait(60.0)
             return RESUME
@@ -768,7 +867,7 @@ class TestInterrupted:
     def test_interlocks_do_not_pause(self, bench):
         done = threading.Event()
 
-        def ask():
+        def ask(question):
             self.b.probe.plate.temperature = 500.0
             done.wait(60.0)
             return RESUME
@@ -788,7 +887,7 @@ class TestInterrupted:
                 if len(_.ticks) >= 12:
                     enough.set()
 
-        def ask():
+        def ask(question):
             enough.wait(60.0)
             return RESUME
 

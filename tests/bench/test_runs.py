@@ -235,9 +235,9 @@ class TestQuestion:
     )
     def test_answers(self, console, monkeypatch, typed, answer):
         monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-        assert ask_operator(console) == answer
+        assert ask_operator(console, "paused:") == answer
 
     def test_asks_until_it_understands(self, console, monkeypatch):
         monkeypatch.setattr("sys.stdin", io.StringIO("what\n\n r \n"))
-        assert ask_operator(console) == "resume"
+        assert ask_operator(console, "paused:") == "resume"
         assert console.file.getvalue().count("please answer") == 2
