@@ -1,5 +1,8 @@
 """Driver of the Dynamixel MX-28 servo with Protocol 2.0 firmware (39 and newer), on a serial bus.
 
+`DynamixelMX28` holds an angle; `DynamixelDrum` is the same servo with a drum on its shaft, and holds the end of
+the wire that it winds at a position.
+
 Sources: ROBOTIS e-Manual, Protocol 2.0 (packets, CRC, error numbers) and MX-28(2.0) (control table, units,
 hardware errors, bus watchdog).
 
@@ -18,7 +21,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
@@ -27,7 +30,7 @@ import serial
 from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
-from bench.devices import DriverSettings, Identity, Limits, Servo, Status
+from bench.devices import DriverSettings, Identity, Limits, LinearStage, Servo, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 
 MODEL_NUMBER = 30
@@ -129,7 +132,7 @@ _UNKNOWN_ERROR = ("unknown to this driver", "look it up in the manual of the ser
 
 
 class ServoSettings(DriverSettings):
-    """What a rig file says of a Dynamixel MX-28."""
+    """What a rig file says of any Dynamixel MX-28, whatever it moves."""
 
     port: str = Field(
         min_length=1, description="line, as pyserial opens it: /dev/ttyUSB0, socket://host:port, emulated://servo"
@@ -147,14 +150,12 @@ class ServoSettings(DriverSettings):
         le=508e-6,
         description="pause of the servo before it answers, s: 0 to 508e-6, steps of 2e-6",
     )
-    position_limits: tuple[float, float] = Field(
-        description="lowest and highest angle set-point, rad; both within ±1048575 counts of the servo"
-    )
     zero_counts: int = Field(
-        default=0, ge=-HIGHEST_GOAL, le=HIGHEST_GOAL, description="position of the angle zero, counts of 2π/4096"
+        default=0, ge=-HIGHEST_GOAL, le=HIGHEST_GOAL, description="where the set-point zero is, counts of 2π/4096"
     )
     direction: Literal[1, -1] = Field(
-        default=1, description="1 if angles grow with the counts (counter-clockwise at the horn), -1 if against them"
+        default=1,
+        description="1 if set-points grow with the counts (counter-clockwise at the horn), -1 if against them",
     )
     profile_velocity: float = Field(
         default=1.0,
@@ -195,16 +196,64 @@ class ServoSettings(DriverSettings):
             raise ValueError("expected 0.02 to 2.54 s, or 0 for no watchdog")
         return value
 
+    def _check_limits(self, key: str, limits: tuple[float, float], radius: float, unit: str) -> None:
+        """Raise `ValueError` unless limits, in a unit of which `radius` are 1 rad, are within the servo's range."""
+        low, high = (limit / radius for limit in limits)
+        if not low < high:
+            raise ValueError(f"{key}: expected the lower limit first")
+        ends = sorted(self.direction * (goal - self.zero_counts) * _COUNT for goal in (-HIGHEST_GOAL, HIGHEST_GOAL))
+        if low < ends[0] or high > ends[1]:
+            raise ValueError(
+                f"{key}: {Limits(*limits, unit)} is beyond the range of the servo, which with these zero_counts and "
+                f"direction is {Limits(ends[0] * radius, ends[1] * radius, unit)}"
+            )
+
+
+class AngleSettings(ServoSettings):
+    """What a rig file says of a Dynamixel MX-28 that holds an angle."""
+
+    position_limits: tuple[float, float] = Field(
+        description="lowest and highest angle set-point, rad; both within ±1048575 counts of the servo"
+    )
+
     @model_validator(mode="after")
     def _check_position_limits(self) -> Self:
-        low, high = self.position_limits
-        if not low < high:
-            raise ValueError("position_limits: expected the lower limit first")
-        for limit in (low, high):
-            if abs(self.zero_counts + limit / _COUNT) > HIGHEST_GOAL:
-                highest = (HIGHEST_GOAL - abs(self.zero_counts)) * _COUNT
-                raise ValueError(f"position_limits: {limit:g} rad is beyond the ±{highest:g} rad around zero_counts")
+        self._check_limits("position_limits", self.position_limits, 1.0, "rad")
         return self
+
+
+class DrumSettings(ServoSettings):
+    """What a rig file says of a Dynamixel MX-28 that winds a wire on a drum.
+
+    Profile and tolerance are those of the shaft, in rad; times `drum_radius` they are those of the stage.
+    """
+
+    drum_radius: float = Field(
+        gt=0.0,
+        le=1.0,
+        description="distance from the axis to the middle of the wire, which lies in one layer, m: above 0, up to 1; "
+        "the stage resolves 2π/4096 rad · drum_radius",
+    )
+    stage_limits: tuple[float, float] = Field(
+        description="lowest and highest position set-point, m; both within ±1048575 counts of the servo, each "
+        "2π/4096 rad · drum_radius"
+    )
+
+    @model_validator(mode="after")
+    def _check_stage_limits(self) -> Self:
+        self._check_limits("stage_limits", self.stage_limits, self.drum_radius, "m")
+        return self
+
+    @property
+    def servo(self) -> AngleSettings:
+        """What that means for the servo on whose shaft the drum is; angle = position / `drum_radius`."""
+        shared = self.model_dump(include=set(ServoSettings.model_fields))
+        low, high = self.stage_limits
+        return AngleSettings(**shared, position_limits=(low / self.drum_radius, high / self.drum_radius))
+
+
+def _angle_text(radians: float) -> str:
+    return f"{radians:.4g} rad"
 
 
 class DynamixelMX28(Servo):
@@ -231,20 +280,25 @@ class DynamixelMX28(Servo):
     ----------
     name : str
         Name in the rig.
-    settings : ServoSettings
+    settings : AngleSettings
         What the rig file says.
     clock : Clock
         The clock of the run.
     line : _Line
         The open line to the servo.
+    text : callable
+        Tells an angle (rad) in messages, in the unit of whoever reads them.
     """
 
-    Settings: ClassVar[type[ServoSettings]] = ServoSettings
+    Settings: ClassVar[type[AngleSettings]] = AngleSettings
 
-    def __init__(self, name: str, settings: ServoSettings, clock: Clock, line: _Line) -> None:
+    def __init__(
+        self, name: str, settings: AngleSettings, clock: Clock, line: _Line, text: Callable[[float], str]
+    ) -> None:
         super().__init__(name, clock)
         self._settings = settings
         self._line = line
+        self._text = text
         self._setpoint = math.nan
         self._goal = 0
         self._armed = False
@@ -252,7 +306,7 @@ class DynamixelMX28(Servo):
         self._identity = self._identify()
 
     @classmethod
-    def connect(cls, name: str, settings: ServoSettings, clock: Clock) -> DynamixelMX28:
+    def connect(cls, name: str, settings: AngleSettings, clock: Clock) -> DynamixelMX28:
         """Open the line, check that a healthy MX-28 answers, and configure it; the torque is off then.
 
         A bus watchdog that has expired, as after a host that died, is cleared.
@@ -261,7 +315,7 @@ class DynamixelMX28(Servo):
         ----------
         name : str
             Name in the rig.
-        settings : ServoSettings
+        settings : AngleSettings
             What the rig file says.
         clock : Clock
             The clock of the run.
@@ -278,7 +332,7 @@ class DynamixelMX28(Servo):
         return cls._open(name, settings, clock, reboot=False)
 
     @classmethod
-    def recover(cls, name: str, settings: ServoSettings, clock: Clock) -> DynamixelMX28:
+    def recover(cls, name: str, settings: AngleSettings, clock: Clock) -> DynamixelMX28:
         """Connect to a servo with a hardware error: open the line, reboot the servo, and configure it.
 
         Use it once the cause of the error is found; the number of turns is lost. Parameters and errors are
@@ -287,10 +341,18 @@ class DynamixelMX28(Servo):
         return cls._open(name, settings, clock, reboot=True)
 
     @classmethod
-    def _open(cls, name: str, settings: ServoSettings, clock: Clock, *, reboot: bool) -> DynamixelMX28:
+    def _open(
+        cls,
+        name: str,
+        settings: AngleSettings,
+        clock: Clock,
+        *,
+        reboot: bool,
+        text: Callable[[float], str] = _angle_text,
+    ) -> DynamixelMX28:
         line = _Line(name, settings, clock)
         try:
-            device = cls(name, settings, clock, line)
+            device = cls(name, settings, clock, line, text)
             if reboot:
                 device.reboot()
             else:
@@ -509,7 +571,7 @@ class DynamixelMX28(Servo):
             if error.code == _RANGE_ERROR and self._read(_WATCHDOG) == _WATCHDOG_EXPIRED:
                 self._expired = True
                 raise self._watchdog_error() from None
-            raise self._refusal(f"{counts} as its {_GOAL.title}", error) from None
+            raise self._refusal(f"{self._told(counts)} ({counts} counts) as its {_GOAL.title}", error) from None
         self._goal = counts
         if self._line.alert:
             raise self._fault()
@@ -538,6 +600,9 @@ class DynamixelMX28(Servo):
     def _radians(self, counts: int) -> float:
         settings = self._settings
         return settings.direction * (counts - settings.zero_counts) * _COUNT
+
+    def _told(self, counts: int) -> str:
+        return self._text(self._radians(counts))
 
     def _feedback(self) -> tuple[int, int, int, int, int]:
         """Return load, velocity, position, voltage and temperature in the servo's units; raise what is wrong."""
@@ -570,23 +635,21 @@ class DynamixelMX28(Servo):
         self._check()
         moving, load, _, position = _ARRIVAL.unpack(data)
         if goal != self._goal:
-            raise DeviceError(self.name, f"{self._radians(goal):.4g} rad was replaced by another goal on the way")
+            raise DeviceError(self.name, f"{self._told(goal)} was replaced by another goal on the way")
         if moving:
             standstill.since = math.inf
             return False
         if abs(position - goal) * _COUNT <= self._settings.tolerance:
             return True
         if not self._read(_TORQUE):
-            raise DeviceError(
-                self.name, f"the torque was switched off before it reached {self._radians(goal):.4g} rad"
-            )
+            raise DeviceError(self.name, f"the torque was switched off before it reached {self._told(goal)}")
         now = self._clock.now()
         standstill.since = min(standstill.since, now)
         if now - standstill.since >= _STANDSTILL:
             raise DeviceError(
                 self.name,
-                f"stands at {self._radians(position):.4g} rad instead of {self._radians(goal):.4g} rad, under a load "
-                f"of {abs(load) / 10:.0f} %: take away what blocks it, lower the load, or allow a larger tolerance",
+                f"stands at {self._told(position)} instead of {self._told(goal)}, under a load of "
+                f"{abs(load) / 10:.0f} %: take away what blocks it, lower the load, or allow a larger tolerance",
             )
         return False
 
@@ -599,7 +662,7 @@ class DynamixelMX28(Servo):
         return DeviceError(
             self.name,
             f"hardware error 0x{bits:02X} ({texts}; {volts:.1f} V, {celsius} °C): {advice}; "
-            "then clear it by a power cycle, by reboot or by DynamixelMX28.recover",
+            "then clear it by a power cycle, or by reboot or recover of its driver",
         )
 
     def _watchdog_error(self) -> DeviceError:
@@ -649,6 +712,165 @@ class DynamixelMX28(Servo):
 
     def _refusal(self, what: str, error: _RefusedError) -> DeviceError:
         return DeviceError(self.name, f"refused {what}: {error}")
+
+
+class DynamixelDrum(LinearStage):
+    """A Dynamixel MX-28 with a drum on its shaft: the end of the wire that it winds is the stage.
+
+    The position is the angle times `drum_radius`, with the sign and the zero that `direction` and `zero_counts`
+    give to the angle. The stage resolves 2π/4096 rad · `drum_radius`, which is 15 µm on a drum of 10 mm.
+
+    Everything else is as `DynamixelMX28` has it: bus, watchdog, hardware errors, and that a power cycle or a
+    reboot loses the number of turns. The position is then off by whole circumferences of the drum, so check
+    `zero_counts` before the next set-point.
+
+    Made by `connect`, which checks and configures the servo and leaves it without force.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    settings : DrumSettings
+        What the rig file says.
+    clock : Clock
+        The clock of the run.
+    servo : DynamixelMX28
+        The servo, with the same name and the limits of `settings.servo`.
+    """
+
+    Settings: ClassVar[type[DrumSettings]] = DrumSettings
+
+    def __init__(self, name: str, settings: DrumSettings, clock: Clock, servo: DynamixelMX28) -> None:
+        super().__init__(name, clock)
+        self._radius = settings.drum_radius
+        self._limits = Limits(*settings.stage_limits, "m")
+        self._servo = servo
+        self._asked = math.nan
+
+    @classmethod
+    def connect(cls, name: str, settings: DrumSettings, clock: Clock) -> DynamixelDrum:
+        """Open the line, check that a healthy MX-28 answers, and configure it; it is without force then.
+
+        Parameters
+        ----------
+        name : str
+            Name in the rig.
+        settings : DrumSettings
+            What the rig file says.
+        clock : Clock
+            The clock of the run.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened, nothing answers, or what answers is no MX-28 with firmware 39 or newer.
+        DeviceError
+            If the servo reports a hardware error; `recover` reboots it.
+        ConfigurationError
+            If the servo does not allow a value of the settings; nothing was written to its EEPROM then.
+        """
+        return cls._open(name, settings, clock, reboot=False)
+
+    @classmethod
+    def recover(cls, name: str, settings: DrumSettings, clock: Clock) -> DynamixelDrum:
+        """Connect to a servo with a hardware error: open the line, reboot the servo, and configure it.
+
+        Use it once the cause of the error is found; the number of turns is lost. Parameters and errors are
+        those of `connect`.
+        """
+        return cls._open(name, settings, clock, reboot=True)
+
+    @classmethod
+    def _open(cls, name: str, settings: DrumSettings, clock: Clock, *, reboot: bool) -> DynamixelDrum:
+        radius = settings.drum_radius
+        servo = DynamixelMX28._open(
+            name, settings.servo, clock, reboot=reboot, text=lambda radians: f"{radians * radius:.6g} m"
+        )
+        return cls(name, settings, clock, servo)
+
+    @property
+    def identity(self) -> Identity:
+        """Get maker, model, id on the bus (there is no serial number) and firmware of the servo."""
+        return self._servo.identity
+
+    @property
+    def limits(self) -> Limits:
+        """Get the allowed set-points: the settings' `stage_limits`, m."""
+        return self._limits
+
+    @property
+    def setpoint(self) -> float:
+        """Get the position that was last sent, m; nan before the first."""
+        angle = self._servo.setpoint
+        # What was asked for, as it was, and not as rounding leaves it, perhaps beyond a limit.
+        return self._asked if angle == self._asked / self._radius else angle * self._radius
+
+    def set(self, value: float) -> Status:
+        """Move to a position; switches the force on if it is off.
+
+        Parameters
+        ----------
+        value : float
+            Position in m within `stage_limits`; the stage resolves 2π/4096 rad · `drum_radius`.
+
+        Returns
+        -------
+        Status
+            Complete when the shaft stands within `tolerance` of the angle. Fails if it stands elsewhere for
+            1 s, if a later set-point or `stop` replaces this one, or if the torque goes off.
+
+        Raises
+        ------
+        LimitError
+            If the value is outside of `limits`; nothing is sent.
+        DeviceError
+            If the servo has a hardware error or an expired watchdog, or refuses.
+        """
+        self.check(value)
+        status = self._servo.set(value / self._radius)
+        self._asked = value
+        return status
+
+    @property
+    def force_enabled(self) -> bool:
+        """Get whether the servo holds its position, as it says now."""
+        return self._servo.torque_enabled
+
+    def measure(self) -> dict[str, float]:
+        """Measure position (m), velocity (m/s) and inferred load (1), in one round trip.
+
+        Raises
+        ------
+        DeviceError
+            If the servo has a hardware error or an expired watchdog, or does not answer.
+        """
+        angle, angular_velocity, load = self._servo.measure().values()
+        values = (angle * self._radius, angular_velocity * self._radius, load)
+        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+
+    def stop(self, success: bool = True) -> None:
+        """Take the present position as the goal and hold it; does nothing while the force is off."""
+        self._servo.stop(success)
+
+    def safe(self) -> None:
+        """Switch the force off and see that it is off; errors and last resort are those of the servo."""
+        self._servo.safe()
+
+    def reboot(self) -> None:
+        """Restart the servo and configure it again: clears a hardware error whose cause is gone.
+
+        The force is off then and the number of turns is lost: the position is off by whole circumferences.
+
+        Raises
+        ------
+        DeviceError
+            If the servo does not come back within 5 s, or comes back with an error.
+        """
+        self._servo.reboot()
+
+    def close(self) -> None:
+        """Release the line. A force that is on stays on; the servo's watchdog stops a motion."""
+        self._servo.close()
 
 
 class _RefusedError(Exception):

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from drivers import dynamixel
-from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelMX28
+from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28
 from sim_devices.protocol_emulated import register, unregister
 
 PORT = "emulated://scripted-servo"
@@ -270,6 +270,7 @@ def test_servo_that_never_answered(script, clock):
         {"position_limits": (2.0, 1.0)},
         {"position_limits": (0.0, 1700.0)},
         {"position_limits": (0.0, 1000.0), "zero_counts": 500_000},
+        {"position_limits": (-1000.0, 0.0), "zero_counts": 500_000, "direction": -1},
         {"position_limits": (math.nan, 1.0)},
         {"zero_counts": 1_048_576},
         {"direction": 0},
@@ -297,6 +298,7 @@ def test_settings_say_what_they_are():
     assert (settings.watchdog, settings.direction, settings.baudrate) == (2.5, 1, 57600)
     assert make_settings(watchdog=0).watchdog == 0.0
     assert make_settings(direction=-1).direction == -1
+    assert make_settings(direction=-1, zero_counts=500_000, position_limits=(0.0, 1000.0)).zero_counts == 500_000
 
 
 # Measuring.
@@ -328,7 +330,7 @@ def test_every_hardware_error_is_told_with_advice(script, servo, bit):
         servo.measure()
     assert str(caught.value) == (
         f"servo: hardware error 0x{1 << bit:02X} ({text}; 12.1 V, 31 °C): {advice}; "
-        "then clear it by a power cycle, by reboot or by DynamixelMX28.recover"
+        "then clear it by a power cycle, or by reboot or recover of its driver"
     )
 
 
@@ -349,7 +351,7 @@ def test_every_refusal_is_told(script, servo, code):
         return
     with pytest.raises(DeviceError) as caught:
         servo.set(1.0)
-    assert str(caught.value) == f"servo: refused 1000 as its goal position: {STATUS_ERRORS[code]}"
+    assert str(caught.value) == f"servo: refused 1.534 rad (1000 counts) as its goal position: {STATUS_ERRORS[code]}"
 
 
 @pytest.mark.parametrize(("key", "text"), [((2, 126), "feedback"), ((2, 64), "torque enable")])
@@ -515,7 +517,9 @@ def test_expired_watchdog_is_told_until_it_is_cleared(script, servo, clock):
 def test_goal_that_an_expired_watchdog_refuses(script, servo):
     servo.set(2.0)
     script.refusals[3, 116] = 4
-    with pytest.raises(DeviceError, match="refused 652 as its goal position: the value is out of range"):
+    with pytest.raises(
+        DeviceError, match=r"refused 1 rad \(652 counts\) as its goal position: the value is out of range"
+    ):
         servo.set(1.0)
     script.values[98] = 255
     with pytest.raises(DeviceError, match="bus watchdog"):
@@ -616,6 +620,194 @@ def test_closing_leaves_the_servo_alone(script, servo):
     assert len(script.received) == before
     with pytest.raises(DeviceConnectionError):
         servo.measure()
+
+
+# The drum.
+
+
+RADIUS = 0.012
+
+
+def make_drum_settings(**changes):
+    keys = {"port": PORT, "drum_radius": RADIUS, "stage_limits": (-0.036, 0.036)}
+    return DynamixelDrum.Settings(**keys | changes)
+
+
+def connect_drum(clock, **changes):
+    drum = DynamixelDrum.connect("stage", make_drum_settings(**changes), clock)
+    assert math.isnan(drum.setpoint)
+    return drum
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("zero_counts", [0, 1200, -70_000])
+@pytest.mark.parametrize("metres", [0.0, 0.012, -0.0213, 0.036, -0.036])
+def test_metres_to_counts_and_back(script, clock, direction, zero_counts, metres):
+    drum = connect_drum(clock, direction=direction, zero_counts=zero_counts)
+    drum.set(metres)
+    counts = script.values[116]
+    assert counts == zero_counts + direction * round(metres / RADIUS * 4096 / (2 * math.pi))
+    assert drum.setpoint == metres
+    script.values |= {126: 100, 128: -42, 132: counts}
+    assert drum.measure() == pytest.approx(
+        {
+            "stage_position": metres,
+            "stage_velocity": -direction * 42 * 0.229 * 2 * math.pi / 60 * RADIUS,
+            "stage_load": direction * 0.1,
+        },
+        abs=0.5 * COUNT * RADIUS,
+    )
+
+
+@given(
+    st.floats(1e-6, 1.0),
+    st.floats(-1.0, 1.0),
+    st.integers(-400_000, 400_000),
+    st.sampled_from([1, -1]),
+    st.floats(0.0, 1.0),
+)
+def test_every_position_within_the_limits_arrives_as_it_was_asked_for(radius, low, zero_counts, direction, share):
+    limits = (low * 900 * radius, (low * 900 + 1.0) * radius)
+    script, clock = Script(), VirtualClock()
+    register("drum-servo", script, clock)
+    try:
+        settings = make_drum_settings(
+            port="emulated://drum-servo",
+            drum_radius=radius,
+            stage_limits=limits,
+            zero_counts=zero_counts,
+            direction=direction,
+        )
+        drum = DynamixelDrum.connect("stage", settings, clock)
+        for value in (*limits, min(limits[0] + share * (limits[1] - limits[0]), limits[1])):
+            drum.set(value)
+            assert drum.setpoint == value
+            script.values[132] = script.values[116]
+            assert abs(drum.measure()["stage_position"] - value) <= (0.5 * COUNT + 1e-9) * radius
+    finally:
+        unregister("drum-servo")
+
+
+@pytest.mark.parametrize("way", ["measure", "glance"])
+def test_drum_is_read_in_one_transaction(script, clock, way):
+    drum = connect_drum(clock)
+    drum.set(0.01)
+    script.received.clear()
+    getattr(drum, way)()
+    assert script.received == [packet(1, 0x02, bytes.fromhex("7E001500"))]
+
+
+def test_limits_of_the_drum_are_those_of_the_settings(script, clock):
+    drum = connect_drum(clock)
+    assert (drum.limits.low, drum.limits.high, drum.limits.unit) == (-0.036, 0.036, "m")
+    script.received.clear()
+    for value in (-0.0361, 0.0361, math.nan, math.inf):
+        with pytest.raises(LimitError, match=r"stage: set-point .* m is outside of -0\.036 to 0\.036 m"):
+            drum.set(value)
+    assert script.received == []
+    assert math.isnan(drum.setpoint)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"stage_limits": (0.0, 20.0)}, r"0 to 20 m is beyond the range .* -19\.30\d* to 19\.30\d* m"),
+        ({"stage_limits": (0.0, 12.0), "zero_counts": 500_000}, r"0 to 12 m is beyond .* -28\.5\d* to 10\.09\d* m"),
+        (
+            {"stage_limits": (-12.0, 0.0), "zero_counts": 500_000, "direction": -1},
+            r"-12 to 0 m is beyond .* -10\.09\d* to 28\.5\d* m",
+        ),
+        ({"stage_limits": (0.0, 1.0), "drum_radius": 1e-4}, r"0 to 1 m is beyond .* to 0\.1608\d* m"),
+        ({"stage_limits": (0.02, 0.01)}, "expected the lower limit first"),
+        ({"stage_limits": (0.01, 0.01)}, "expected the lower limit first"),
+    ],
+)
+def test_stage_limits_that_the_servo_does_not_reach(changes, text):
+    with pytest.raises(ValidationError, match=f"stage_limits: {text}"):
+        make_drum_settings(**changes)
+
+
+def test_stage_limits_on_the_side_where_the_servo_reaches_far():
+    assert make_drum_settings(stage_limits=(-12.0, 0.0), zero_counts=500_000).stage_limits == (-12.0, 0.0)
+    settings = make_drum_settings(stage_limits=(0.0, 12.0), zero_counts=500_000, direction=-1)
+    assert settings.servo.position_limits == (0.0, 12.0 / RADIUS)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"drum_radius": 0.0},
+        {"drum_radius": -0.01},
+        {"drum_radius": 1.1},
+        {"drum_radius": math.nan},
+        {"stage_limits": (0.0, math.inf)},
+        {"position_limits": (-1.0, 1.0)},
+        {"id": 253},
+        {"watchdog": 0.01},
+    ],
+)
+def test_settings_of_a_drum_that_make_no_sense(changes):
+    with pytest.raises(ValidationError):
+        make_drum_settings(**changes)
+
+
+def test_settings_of_a_drum_reach_the_servo():
+    changes = {"id": 7, "baudrate": 1_000_000, "direction": -1, "zero_counts": 5, "watchdog": 1.0, "tolerance": 0.02}
+    assert make_drum_settings(**changes).servo == make_settings(
+        position_limits=(-0.036 / 0.012, 0.036 / 0.012), **changes
+    )
+    for name, field in DynamixelDrum.Settings.model_fields.items():
+        assert field.description, name
+
+
+def test_messages_of_the_drum_speak_metres(script, clock):
+    drum = connect_drum(clock)
+    status = drum.set(0.024)
+    script.values |= {132: 1200, 126: -350}
+    with pytest.raises(
+        DeviceError, match=r"stage: stands at 0\.0220893 m instead of 0\.0240037 m, under a load of 35 %"
+    ):
+        status.wait()
+    first = drum.set(0.024)
+    drum.set(0.012)
+    with pytest.raises(DeviceError, match=r"stage: 0\.0240037 m was replaced by another goal"):
+        first.wait()
+    script.refusals[3, 116] = 6
+    with pytest.raises(DeviceError, match=r"stage: refused 0\.0240037 m \(1304 counts\) as its goal position"):
+        drum.set(0.024)
+    assert drum.setpoint == 0.012
+    del script.refusals[3, 116]
+    status = drum.set(0.024)
+    script.values[64] = 0
+    with pytest.raises(DeviceError, match=r"stage: the torque was switched off before it reached 0\.0240037 m"):
+        status.wait()
+
+
+def test_stop_of_the_drum_takes_where_it_stands(script, clock):
+    drum = connect_drum(clock, direction=-1)
+    drum.stop()
+    assert math.isnan(drum.setpoint)
+    drum.set(0.03)
+    script.values[132] = -1100
+    drum.stop()
+    assert script.values[116] == -1100
+    assert drum.setpoint == pytest.approx(1100 * COUNT * RADIUS)
+
+
+def test_drum_with_an_error_is_refused_and_recovered_on_request(script, clock):
+    script.values[70] = 0x20
+    with pytest.raises(DeviceError, match=r"stage: .*overload.*recover"):
+        connect_drum(clock)
+    drum = DynamixelDrum.recover("stage", make_drum_settings(), clock)
+    drum.set(0.01)
+    assert drum.force_enabled
+    script.values[70] = 0x20
+    drum.reboot()
+    assert math.isnan(drum.setpoint)
+    assert not drum.force_enabled
+    drum.close()
+    with pytest.raises(DeviceConnectionError, match="stage: "):
+        drum.measure()
 
 
 # A line that is not good.

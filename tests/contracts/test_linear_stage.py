@@ -1,0 +1,353 @@
+"""What the role of a linear stage promises, of the emulated drum itself and of the driver over the wire."""
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from bench.clock import VirtualClock
+from bench.devices import LinearStage, role_of
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from drivers.dynamixel import DynamixelDrum
+from sim_devices.instruments.dynamixel import (
+    COUNT,
+    VELOCITY_UNIT,
+    EmulatedDrum,
+    EmulatedMX28,
+    HardwareError,
+)
+from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire.dynamixel2 import Dynamixel2Server
+from sim_devices.world import World
+
+WATCHDOG = 2.5
+RADIUS = 0.012
+RESOLUTION = COUNT * RADIUS
+VELOCITY = 42 * VELOCITY_UNIT * RADIUS
+ZERO = 2048
+TURN = 2.0 * math.pi * RADIUS
+
+
+class Wall:
+    """Nothing hangs on the shaft until it turns to an angle below `stop`, where it is blocked."""
+
+    stop = -math.inf
+
+    def torque(self, angle):
+        return 1e4 * max(self.stop - angle, 0.0)
+
+    def advance(self, dt):
+        pass
+
+
+@dataclass
+class Bench:
+    """One stage under test and what is behind it; its position grows against the counts, from half a turn."""
+
+    clock: VirtualClock
+    device: LinearStage
+    servo: EmulatedMX28
+    plant: Wall
+    drum: EmulatedDrum
+    connect: Callable[..., LinearStage] | None = None
+    requests: list = field(default_factory=list)
+
+    def where(self):
+        """Return where the wire's end is at the clock's present time, m, without asking the device."""
+        self.servo.world.advance()
+        return (math.pi - self.servo.position) * RADIUS
+
+
+class RecordingServer:
+    def __init__(self, server, requests):
+        self.server = server
+        self.requests = requests
+
+    def receive(self, data):
+        self.requests.append(data)
+        return self.server.receive(data)
+
+
+names = (f"contract-stage-{number}" for number in itertools.count())
+
+
+@pytest.fixture(params=["emulated", "driver"])
+def bench(request):
+    clock, plant = VirtualClock(), Wall()
+    servo = EmulatedMX28("stage", World(plant, clock), plant)
+    drum = EmulatedDrum(servo, RADIUS, zero_counts=ZERO, direction=-1)
+    if request.param == "emulated":
+        for address, value in ((11, 4), (108, 10), (112, 42), (98, 125)):
+            servo.write_item(address, value)
+        yield Bench(clock, drum, servo, plant, drum)
+        return
+    requests = []
+    name = next(names)
+    port = register(name, RecordingServer(Dynamixel2Server([servo]), requests), clock)
+
+    def connect(kind=DynamixelDrum.connect):
+        settings = DynamixelDrum.Settings(
+            port=port,
+            drum_radius=RADIUS,
+            stage_limits=(-0.2, 0.2),
+            zero_counts=ZERO,
+            direction=-1,
+            profile_velocity=1.0072,
+            profile_acceleration=3.746,
+            watchdog=WATCHDOG,
+        )
+        return kind("stage", settings, clock)
+
+    bench = Bench(clock, connect(), servo, plant, drum, connect, requests)
+    yield bench
+    bench.device.close()
+    unregister(name)
+
+
+over_the_wire = pytest.mark.parametrize("bench", ["driver"], indirect=True)
+
+
+def test_initial_state(bench):
+    assert role_of(type(bench.device)) == "linear stage"
+    assert str(bench.device.identity) == "ROBOTIS MX-28, serial number id 1, firmware 45"
+    assert bench.device.name == "stage"
+    assert bench.device.parent is None
+    bench.clock.sleep(2.0)
+    assert not bench.device.force_enabled
+    assert math.isnan(bench.device.setpoint)
+    assert bench.device.measure() == {"stage_position": 0.0, "stage_velocity": 0.0, "stage_load": 0.0}
+    assert bench.where() == 0.0
+
+
+def test_signals_readings_and_units_agree(bench):
+    device = bench.device
+    expected = [("stage_position", "m"), ("stage_velocity", "m/s"), ("stage_load", "1")]
+    assert [(signal.name, signal.unit) for signal in device.signals] == expected
+    names = [signal.name for signal in device.signals]
+    readings, keys = device.read(), device.describe()
+    assert list(device.measure()) == list(device.glance()) == list(readings) == list(keys) == names
+    for signal in device.signals:
+        assert keys[signal.name]["units"] == signal.unit
+        assert keys[signal.name]["source"] == f"MX-28:id 1:{signal.name}"
+        assert readings[signal.name]["timestamp"] == pytest.approx(bench.clock.timestamp(), abs=0.1)
+    assert device.setpoint_signal.unit == device.limits.unit == "m"
+
+
+def test_bluesky_finds_its_protocols(bench):
+    from bluesky.protocols import Movable, Readable, Stoppable
+
+    assert isinstance(bench.device, Readable)
+    assert isinstance(bench.device, Movable)
+    assert isinstance(bench.device, Stoppable)
+
+
+@pytest.mark.parametrize("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
+def test_arrives_and_holds(bench, goal):
+    status = bench.device.set(goal)
+    assert not status.update()
+    assert bench.device.force_enabled
+    assert bench.device.setpoint == goal
+    bench.clock.sleep(0.6)
+    assert bench.device.measure()["stage_velocity"] == pytest.approx(
+        math.copysign(VELOCITY, goal), abs=VELOCITY_UNIT * RADIUS
+    )
+    status.wait()
+    assert status.success
+    for _ in range(3):
+        bench.clock.sleep(2.0)
+        values = bench.device.glance()
+        assert values["stage_position"] == pytest.approx(goal, abs=0.51 * RESOLUTION)
+        assert values["stage_velocity"] == 0.0
+    assert bench.where() == pytest.approx(goal, abs=0.51 * RESOLUTION)
+    assert bench.drum.position == pytest.approx(bench.where(), abs=1e-12)
+
+
+def test_plant_sees_where_the_wire_is_going(bench):
+    bench.device.set(0.05)
+    bench.clock.sleep(1.0)
+    before, ahead = bench.where(), bench.drum.position_after(1.0)
+    assert ahead == pytest.approx(before + VELOCITY, abs=1e-6)
+    bench.clock.sleep(1.0)
+    assert bench.where() == pytest.approx(ahead, abs=1e-6)
+
+
+def test_beyond_the_limits_nothing_is_sent(bench):
+    requests, goal = len(bench.requests), bench.servo.read_item(116)
+    low, high = bench.device.limits.low, bench.device.limits.high
+    for value in (low - 1e-5, high + 1e-5, math.nan, math.inf, -math.inf):
+        with pytest.raises(LimitError, match=r"^stage: set-point .* m is outside of .* m$"):
+            bench.device.set(value)
+        with pytest.raises(LimitError):
+            bench.device.check(value)
+    assert len(bench.requests) == requests
+    assert bench.servo.read_item(116) == goal
+    assert math.isnan(bench.device.setpoint)
+    assert not bench.device.force_enabled
+
+
+def test_limits_themselves_are_allowed(bench):
+    for value in (bench.device.limits.low, bench.device.limits.high):
+        bench.device.check(value)
+        bench.device.set(value)
+        assert bench.device.setpoint == value
+        bench.device.stop()
+
+
+def test_stop_holds_the_position_of_the_moment(bench):
+    bench.device.stop()
+    assert not bench.device.force_enabled
+    status = bench.device.set(0.1)
+    bench.clock.sleep(2.0)
+    bench.device.stop()
+    held = bench.device.setpoint
+    assert VELOCITY < held < 2.1 * VELOCITY
+    for _ in range(3):
+        bench.clock.sleep(1.0)
+        assert bench.device.measure()["stage_position"] == pytest.approx(held, abs=0.02 * RADIUS)
+    assert bench.device.force_enabled
+    with pytest.raises(DeviceError, match=r"stage: .*replaced"):
+        status.wait()
+
+
+def never_moved(bench):
+    pass
+
+
+def moves(bench):
+    bench.device.set(0.1)
+    bench.clock.sleep(1.0)
+
+
+def stands(bench):
+    bench.device.set(0.01).wait()
+
+
+def watchdog_expired(bench):
+    bench.device.set(0.1)
+    bench.clock.sleep(60.0)
+
+
+def error_with_force_on(bench):
+    bench.device.set(0.1)
+    bench.servo.trip(HardwareError.MOTOR_ENCODER)
+
+
+def error_with_force_off(bench):
+    bench.device.set(0.1)
+    bench.servo.trip(HardwareError.OVERLOAD)
+
+
+@pytest.mark.parametrize(
+    "state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off]
+)
+def test_safe_from_any_state_and_again_changes_nothing(bench, state):
+    state(bench)
+    bench.device.safe()
+    assert not bench.device.force_enabled
+    where = bench.where()
+    bench.device.safe()
+    bench.clock.sleep(10.0)
+    assert bench.where() == where
+    assert not bench.device.force_enabled
+
+
+def test_safe_of_a_device_that_does_not_answer_raises(bench):
+    status = bench.device.set(0.1)
+    bench.servo.unplug()
+    with pytest.raises(DeviceError, match="stage: "):
+        bench.device.safe()
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(0.0), status.wait):
+        with pytest.raises(DeviceConnectionError, match="stage: "):
+            call()
+
+
+def test_every_call_tells_of_a_hardware_error(bench):
+    status = bench.device.set(0.1)
+    bench.servo.trip(HardwareError.OVERHEATING)
+    device = bench.device
+    for call in (device.measure, device.glance, device.read, lambda: device.set(0.0), status.wait):
+        with pytest.raises(DeviceError, match=r"^stage: hardware error 0x04 \(overheating") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    assert status.done
+    assert not status.success
+
+
+def test_silence_of_the_host_stops_the_stage(bench):
+    status = bench.device.set(0.15)
+    bench.device.glance()
+    bench.clock.sleep(3600.0)
+    assert bench.where() == pytest.approx(VELOCITY * WATCHDOG, abs=0.3 * RADIUS)
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(0.0), status.wait):
+        with pytest.raises(DeviceError, match=r"stage: .*bus watchdog"):
+            call()
+    assert bench.device.force_enabled
+    bench.device.safe()
+    bench.device.measure()
+    bench.device.set(0.01).wait()
+
+
+def test_drum_that_is_blocked_ends_in_an_overload(bench):
+    bench.plant.stop = math.pi - 1.0
+    status = bench.device.set(0.05)
+    with pytest.raises(DeviceError, match=r"stage: .*overload"):
+        status.wait()
+    assert bench.where() == pytest.approx(RADIUS, abs=0.01 * RADIUS)
+    assert not bench.device.force_enabled
+
+
+# What only a wire can do.
+
+
+@over_the_wire
+def test_a_reading_is_one_transaction(bench):
+    bench.device.set(0.01).wait()
+    for call in (bench.device.measure, bench.device.glance):
+        bench.requests.clear()
+        call()
+        assert len(bench.requests) == 1
+
+
+@over_the_wire
+def test_error_is_cleared_by_a_reboot_and_by_recover(bench):
+    bench.servo.trip(HardwareError.OVERLOAD)
+    bench.device.reboot()
+    bench.device.set(0.01).wait()
+    bench.servo.trip(HardwareError.OVERLOAD)
+    bench.device.close()
+    with pytest.raises(DeviceError, match=r"stage: .*overload.*recover"):
+        bench.connect()
+    device = bench.connect(DynamixelDrum.recover)
+    device.set(-0.01).wait()
+    assert bench.where() == pytest.approx(-0.01, abs=RESOLUTION)
+    device.close()
+
+
+@over_the_wire
+def test_shaft_that_was_turned_a_whole_turn_is_off_by_a_circumference_after_a_reboot(bench):
+    bench.device.set(TURN).wait()
+    bench.device.reboot()
+    assert bench.device.measure()["stage_position"] == pytest.approx(0.0, abs=RESOLUTION)
+    assert bench.drum.position == pytest.approx(TURN, abs=RESOLUTION)
+
+
+@pytest.mark.parametrize(("radius", "direction"), [(0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (0.01, 0)])
+def test_drum_that_makes_no_sense(radius, direction):
+    plant = Wall()
+    servo = EmulatedMX28("stage", World(plant, VirtualClock()))
+    with pytest.raises(ValueError, match="expected"):
+        EmulatedDrum(servo, radius, direction=direction)
+
+
+@pytest.mark.parametrize("radius", [0.001, 0.007, 0.012, 0.033, 0.1])
+@pytest.mark.parametrize("zero_counts", [0, 1, 1000, -12345])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_rounding_keeps_no_limit_of_the_drum_from_being_reached(radius, zero_counts, direction):
+    servo = EmulatedMX28("stage", World(Wall(), VirtualClock()))
+    drum = EmulatedDrum(servo, radius, zero_counts=zero_counts, direction=direction)
+    for value in (drum.limits.low, drum.limits.high):
+        drum.set(value)
+        assert drum.setpoint == value
+    assert servo.read_item(116) == (4095 if direction > 0 else 0)
