@@ -1,6 +1,6 @@
-"""Model files: an identified operator as versioned JSON, with its units, where it comes from, and its memory.
+"""Model files: an identified model as versioned JSON, with its units and where it comes from.
 
-Version 1 is an object with these keys:
+The file of an operator, version 1, is an object with these keys:
 
 `format`, `version`
     `bench-model` and 1.
@@ -14,6 +14,9 @@ Version 1 is an object with these keys:
     operator, the list of play states of a Prandtl-Ishlinskii one; null for one without memory.
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
+
+The file of a model among voltage, force and length has the format `bench-coupled-model`, and `model` in place of
+`operator` and `memory`.
 """
 
 from __future__ import annotations
@@ -27,9 +30,19 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Operator, PrandtlIshlinskii, operator_from_json
+from bench.hysteresis import (
+    Linear,
+    MemoryCurve,
+    Operator,
+    PrandtlIshlinskii,
+    Summed,
+    TwoStage,
+    coupled_from_json,
+    operator_from_json,
+)
 
 FORMAT = "bench-model"
+COUPLED_FORMAT = "bench-coupled-model"
 VERSION = 1
 
 
@@ -77,55 +90,131 @@ class ModelFile:
         DataError
             If it cannot be written.
         """
-        try:
-            path.write_text(json.dumps(self.to_json(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise DataError(f"model file {path} cannot be written: {error}") from None
+        _write(path, self.to_json())
+
+
+@dataclass(frozen=True)
+class CoupledFile:
+    """The content of the file of a model among voltage, force and length.
+
+    Attributes
+    ----------
+    name : str
+        Under which name it was identified.
+    model : TwoStage, Summed or Linear
+        The model itself.
+    provenance : mapping
+        Where it comes from.
+    """
+
+    name: str
+    model: TwoStage | Summed | Linear
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the file's content."""
+        return {
+            "format": COUPLED_FORMAT,
+            "version": VERSION,
+            "name": self.name,
+            "model": self.model.to_json(),
+            "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the file.
+
+        Raises
+        ------
+        DataError
+            If it cannot be written.
+        """
+        _write(path, self.to_json())
 
 
 def load_model(path: Path) -> ModelFile:
-    """Read a model file.
+    """Read the file of an operator.
 
     Raises
     ------
     DataError
         If there is none, it is damaged, or its version is unknown.
     """
+    return parse_model(_read(path), str(path))
+
+
+def load_coupled_model(path: Path) -> CoupledFile:
+    """Read the file of a model among voltage, force and length; see `load_model`."""
+    return parse_coupled_model(_read(path), str(path))
+
+
+def parse_coupled_model(content: object, source: str) -> CoupledFile:
+    """Make such a model of the content of its file; see `parse_model`."""
+    document = _checked(content, source, COUPLED_FORMAT)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return CoupledFile(
+            name=str(document["name"]),
+            model=coupled_from_json(document["model"]),
+            provenance=dict(document["provenance"]),
+        )
+    except KeyError as error:
+        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise DataError(f"model file {source} is damaged: {error}") from None
+
+
+def is_coupled_model(content: object) -> bool:
+    """Return whether the content of a model file is that of a model among voltage, force and length."""
+    return isinstance(content, dict) and content.get("format") == COUPLED_FORMAT
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    try:
+        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"model file {path} cannot be written: {error}") from None
+
+
+def _read(path: Path) -> object:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
     # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
     except (ValueError, RecursionError) as error:
         raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
-    return parse_model(content, str(path))
+
+
+def _checked(content: object, source: str, expected: str) -> dict[str, Any]:
+    if not isinstance(content, dict) or content.get("format") != expected:
+        raise DataError(f"{source} is not a model file: its `format` is not {expected!r}")
+    if content.get("version") != VERSION:
+        raise DataError(
+            f"model file {source} has version {content.get('version')!r}; this bench reads version {VERSION}"
+        )
+    return content
 
 
 def parse_model(content: object, source: str) -> ModelFile:
-    """Make a model of the content of a model file.
+    """Make a model of the content of the file of an operator.
 
     Raises
     ------
     DataError
         If it is not one, is damaged, or its version is unknown; names `source`.
     """
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")
-    if content.get("version") != VERSION:
-        raise DataError(
-            f"model file {source} has version {content.get('version')!r}; this bench reads version {VERSION}"
-        )
+    document = _checked(content, source, FORMAT)
     try:
-        memory = content["memory"]
-        operator = operator_from_json(content["operator"])
+        memory = document["memory"]
+        operator = operator_from_json(document["operator"])
         for key in ("input_unit", "output_unit"):
             if not isinstance(getattr(operator, key), str):
                 raise TypeError(f"operator: expected a text for {key}, got {getattr(operator, key)!r}")
         return ModelFile(
-            name=str(content["name"]),
+            name=str(document["name"]),
             operator=operator,
             memory=_parse_memory(memory, operator),
-            provenance=dict(content["provenance"]),
+            provenance=dict(document["provenance"]),
         )
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None

@@ -1,14 +1,20 @@
-"""LabJack T7 over Modbus TCP, as a position sensor behind a position-sensitive detector.
+"""LabJack T7 over Modbus TCP: a position sensor on its analog inputs, and a switch on a digital line.
+
+Several devices may stand for one instrument, each with a connection of its own; they are set up one after the
+other.
 
 Sources: `ljm_constants.json` (repository labjack/ljm_constants) for the register map; LabJack, Direct Modbus TCP,
 Protocol Details, for the byte order; LabJack T-series datasheet 14.1.7 for averaging in the instrument, 14.3.0
-for the analog inputs.
+for the analog inputs, 13.0 for the digital lines, 23.0 for the watchdog.
 
 Assumptions: error details 2371, 2372 and 2374 belong to the names that stand between the known 2370, 2373 and
 2375 in the error table; the instrument reads back the settings that were written; one request that spans the
 averages of two inputs carries out both bursts, one after the other. The datasheet gives the
 highest scan rate of each resolution index in appendix A-1: a rate beyond it makes the instrument refuse the
-burst, and the error says so.
+burst, and the error says so. A linear magnet sensor such as the SPS-L035-LATS gives 10 to 90 % of its supply of
+5 V over its stroke of 35 mm, and stays at 10 or 90 % when the magnet is beyond the end. The settings of
+the watchdog outlast a restart of the instrument, as their names (..._DEFAULT) suggest, and reading the register of
+a single digital line makes it an input, as the map says that it configures the direction too.
 """
 
 from __future__ import annotations
@@ -18,6 +24,8 @@ import math
 import re
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -26,7 +34,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
 from bench.clock import Clock
-from bench.devices import DriverSettings, Identity, PositionSensor
+from bench.devices import DriverSettings, Identity, PositionSensor, Status, Switch
 from bench.errors import DeviceConnectionError, DeviceError
 
 # Everything that pymodbus logs as an error is raised here with the name of the device.
@@ -34,6 +42,7 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 DEFAULT_PORT = 502
 CHANNELS = 14
+LINES = 23
 
 _UNIT = 1  # LabJack takes any
 _SINGLE_ENDED = 199
@@ -43,6 +52,11 @@ _MOST_SAMPLES = 16384
 _MISSED_SAMPLE = -9999.0  # what a stream puts in place of a sample that it had to leave out
 _RAIL = 0.999  # share of the nominal range from which on a reading counts as over-range
 _USABLE = 0.95  # share of a detector's length that limits may use
+_READOUTS = {"voltage": 1, "currents": 2, "ratiometric": 2}  # inputs that each takes
+_SUPPLY = (4.5, 5.5)  # V, of a ratiometric sensor
+_OUTPUT = (0.1, 0.9)  # share of the supply that its output takes over the stroke
+_END = 5e-4  # share of the stroke next to its ends that may be the magnet beyond them; half a step of the sensor
+_ALL_LINES = (1 << LINES) - 1
 
 _TEST_WORDS = (0x0011, 0x2233)
 _TEST_FLOAT = -9999.0
@@ -50,6 +64,9 @@ _PRODUCT = 7.0
 _PRODUCTS = {4.0: "a LabJack T4", 8.0: "a LabJack T8", 200.0: "a LabJack Digit"}
 
 _AIN = 0
+_DIO = 2000
+_DIO_STATE = 2800
+_DIO_DIRECTION = 2850
 _STREAM_SETTLING_US = 4008
 _STREAM_RESOLUTION_INDEX = 4010
 _EF_READ_AVERAGE = 7000
@@ -68,6 +85,11 @@ _TEST_FLOAT32 = 55124
 _PRODUCT_ID = 60000
 _FIRMWARE = 60004
 _SERIAL = 60028
+_WATCHDOG_ENABLE = 61600
+_WATCHDOG_TIMEOUT_S = 61604
+_WATCHDOG_STRICT = 61610
+_WATCHDOG_DIO = 61630  # enable, state, direction, inhibit
+_WATCHDOG_DAC_ENABLE = (61640, 61650)
 
 _EXCEPTIONS = {
     1: "illegal function",
@@ -93,20 +115,31 @@ _DETAILS = {
 _HOST = re.compile(r"(?:tcp://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::(?P<port>[0-9]{1,5}))?/?")
 
 
-class T7Settings(DriverSettings):
-    """What a rig file says of a T7 that reads a position-sensitive detector."""
+class T7ConnectionSettings(DriverSettings):
+    """Where a T7 is; every device on one extends it."""
 
     port: str = Field(
         description="address as tcp://HOST:PORT, such as tcp://192.168.1.207:502; HOST alone means port 502"
     )
     timeout: float = Field(default=1.0, ge=0.05, le=60.0, description="longest wait for a reply in s, 0.05 to 60")
-    readout: Literal["voltage", "currents"] = Field(
-        default="voltage",
-        description="voltage: one normalised voltage; currents: two amplified photocurrents",
-    )
+
+    @field_validator("port")
+    @classmethod
+    def _check_port(cls, value: str) -> str:
+        if value.startswith("emulated://"):
+            return value  # the rig puts the loopback address of its emulated laboratory in place of it
+        match = _HOST.fullmatch(value.strip())
+        number = int(match["port"] or DEFAULT_PORT) if match else 0
+        if match is None or not 1 <= number <= 65535:
+            raise ValueError(f"expected tcp://HOST:PORT with port 1 to 65535, got {value!r}")
+        return f"tcp://{match['host']}:{number}"
+
+
+class T7InputSettings(T7ConnectionSettings):
+    """How analog inputs are read; every sensor on a T7 extends it."""
+
     channels: tuple[Annotated[int, Field(ge=0, lt=CHANNELS)], ...] = Field(
-        default=(0,),
-        description="analog inputs, 0 to 13: one for a voltage; those of current 1 and current 2 for currents",
+        default=(0,), description="analog inputs, 0 to 13; neighbours in ascending order are read at once"
     )
     range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
     resolution_index: int = Field(
@@ -123,6 +156,36 @@ class T7Settings(DriverSettings):
     )
     sample_rate: float = Field(
         default=1000.0, gt=0.0, le=100_000.0, description="conversions in a second in Hz, above 0 to 100000"
+    )
+
+    @field_validator("range")
+    @classmethod
+    def _check_range(cls, value: float) -> float:
+        if value not in (10.0, 1.0, 0.1, 0.01):
+            raise ValueError(f"allowed are 10, 1, 0.1 and 0.01 V, got {value:g}")
+        return value
+
+    @model_validator(mode="after")
+    def _check_burst(self) -> Self:
+        if len(set(self.channels)) != len(self.channels):
+            raise ValueError(f"channels: expected different ones, got {list(self.channels)}")
+        duration = self.samples / self.sample_rate
+        if self.samples > 1 and duration > _LONGEST_BURST:
+            raise ValueError(
+                f"samples / sample_rate: a T7 averages over at most {_LONGEST_BURST:g} s, got {duration:g} s"
+            )
+        if len(self.channels) * duration >= self.timeout:
+            raise ValueError(f"timeout: a measurement alone takes {len(self.channels) * duration:g} s")
+        return self
+
+
+class T7Settings(T7InputSettings):
+    """What a rig file says of a T7 that reads a position."""
+
+    readout: Literal["voltage", "currents", "ratiometric"] = Field(
+        default="voltage",
+        description="voltage: one normalised voltage; currents: two amplified photocurrents, 1 and 2; ratiometric: "
+        "output and supply of a sensor whose output is a share of its supply",
     )
     volts_per_metre: float = Field(
         default=1e5, description="voltage readout: sensitivity in V/m, not 0; 1e5 is 0.1 V/µm"
@@ -146,27 +209,21 @@ class T7Settings(DriverSettings):
         le=20.0,
         description="currents readout: sum of both voltages in V below which the light is lost, above 0 to 20",
     )
+    stroke: float = Field(
+        default=0.035,
+        gt=0.0,
+        le=1.0,
+        description="ratiometric readout: stroke of the sensor in m, above 0 to 1; 0.035 for an SPS-L035-LATS",
+    )
+    zero_position: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="ratiometric readout: where on the stroke the position reads zero in m, 0 to the stroke",
+    )
     position_limits: tuple[float, float] = Field(
         default=(-90e-6, 90e-6), description="calibrated range in m, low and high; a reading beyond is an error"
     )
-
-    @field_validator("port")
-    @classmethod
-    def _check_port(cls, value: str) -> str:
-        if value.startswith("emulated://"):
-            return value  # the rig puts the loopback address of its emulated laboratory in place of it
-        match = _HOST.fullmatch(value.strip())
-        number = int(match["port"] or DEFAULT_PORT) if match else 0
-        if match is None or not 1 <= number <= 65535:
-            raise ValueError(f"expected tcp://HOST:PORT with port 1 to 65535, got {value!r}")
-        return f"tcp://{match['host']}:{number}"
-
-    @field_validator("range")
-    @classmethod
-    def _check_range(cls, value: float) -> float:
-        if value not in (10.0, 1.0, 0.1, 0.01):
-            raise ValueError(f"allowed are 10, 1, 0.1 and 0.01 V, got {value:g}")
-        return value
 
     @field_validator("volts_per_metre", "metres_per_metre")
     @classmethod
@@ -176,9 +233,9 @@ class T7Settings(DriverSettings):
         return value
 
     @model_validator(mode="after")
-    def _check_together(self) -> Self:
-        expected = 1 if self.readout == "voltage" else 2
-        if len(set(self.channels)) != expected or len(self.channels) != expected:
+    def _check_readout(self) -> Self:
+        expected = _READOUTS[self.readout]
+        if len(self.channels) != expected:
             raise ValueError(
                 f"channels: readout {self.readout!r} needs {expected} different, got {list(self.channels)}"
             )
@@ -193,14 +250,37 @@ class T7Settings(DriverSettings):
                     f"position_limits: the detector reaches ±{reach:.4g} m (95 % of its half length over the "
                     f"magnification), got {low:g} and {high:g} m"
                 )
-        duration = self.samples / self.sample_rate
-        if self.samples > 1 and duration > _LONGEST_BURST:
-            raise ValueError(
-                f"samples / sample_rate: a T7 averages over at most {_LONGEST_BURST:g} s, got {duration:g} s"
-            )
-        if len(self.channels) * duration >= self.timeout:
-            raise ValueError(f"timeout: a measurement alone takes {len(self.channels) * duration:g} s")
+        if self.readout == "ratiometric":
+            self._check_stroke()
         return self
+
+    def _check_stroke(self) -> None:
+        if self.range != 10.0:
+            raise ValueError(f"range: a supply of 5 V needs 10 V, got {self.range:g} V")
+        if self.zero_position > self.stroke:
+            raise ValueError(f"zero_position: {self.zero_position:g} m is beyond the stroke of {self.stroke:g} m")
+        low, high = self.position_limits
+        first, last = -self.zero_position, self.stroke - self.zero_position
+        rounding = 1e-9
+        if low < first - rounding or high > last + rounding:
+            raise ValueError(
+                f"position_limits: the stroke of the sensor is {first:g} to {last:g} m, got {low:g} and {high:g} m"
+            )
+
+
+class T7SwitchSettings(T7ConnectionSettings):
+    """What a rig file says of a T7 that switches something by a digital line."""
+
+    line: int = Field(
+        ge=0, lt=LINES, description="digital line, 0 to 22: FIO0-7 are 0-7, EIO0-7 8-15, CIO0-3 16-19, MIO0-2 20-22"
+    )
+    active_high: bool = Field(default=True, description="whether a high level is on; false where a low one is")
+    watchdog: int = Field(
+        default=5,
+        ge=1,
+        le=3600,
+        description="silence of all hosts in s after which the instrument switches the line off, 1 to 3600",
+    )
 
 
 class LabJackT7:
@@ -272,8 +352,12 @@ class LabJackT7:
 
     def read_u32(self, address: int) -> int:
         """Get a UINT32 value."""
-        high, low = self.read_words(address, 2)
-        return high << 16 | low
+        return self.read_u32s(address, 1)[0]
+
+    def read_u32s(self, address: int, count: int) -> list[int]:
+        """Get `count` UINT32 values from `address` on."""
+        words = self.read_words(address, 2 * count)
+        return list(struct.unpack(f">{count}I", struct.pack(f">{2 * count}H", *words)))
 
     def read_u16(self, address: int) -> int:
         """Get a UINT16 value."""
@@ -288,10 +372,15 @@ class LabJackT7:
 
     def set_u32(self, register: str, address: int, value: int) -> None:
         """Set a UINT32 value and read it back; `register` is its name for messages."""
-        self.write_words(address, (value >> 16, value & 0xFFFF))
-        actual = self.read_u32(address)
-        if actual != value:
-            raise self._not_taken(register, value, actual)
+        self.set_u32s((register,), address, (value,))
+
+    def set_u32s(self, registers: Sequence[str], address: int, values: Sequence[int]) -> None:
+        """Set UINT32 values from `address` on and read them back; `registers` are their names for messages."""
+        words = struct.unpack(f">{2 * len(values)}H", struct.pack(f">{len(values)}I", *values))
+        self.write_words(address, words)
+        for register, value, actual in zip(registers, values, self.read_u32s(address, len(values)), strict=True):
+            if actual != value:
+                raise self._not_taken(register, value, actual)
 
     def set_u16(self, register: str, address: int, value: int) -> None:
         """Set a UINT16 value and read it back; `register` is its name for messages."""
@@ -385,16 +474,290 @@ class _Voltage(NamedTuple):
     minimum: float
 
 
-class T7PositionSensor(PositionSensor):
-    """A position-sensitive detector on one or two analog inputs of a LabJack T7.
-
-    `measure` has the instrument average a burst of `samples` conversions (datasheet 14.1.7) and looks at the
-    extremes of the burst too, as clipped conversions would shift the mean. It takes three requests, or three
-    for each current if the inputs are not neighbours in ascending order. The two currents are averaged one
-    after the other, and the position is the ratio of the means. `glance` takes one conversion.
+class AnalogInputs:
+    """The analog inputs of a T7 that one sensor reads.
 
     The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one
-    instrument.
+    instrument: sensors on the same one are given the same `resolution_index` and `settling_us`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device, for messages.
+    instrument : LabJackT7
+        The connection.
+    settings : T7InputSettings
+        Which inputs, and how they are read.
+    """
+
+    def __init__(self, name: str, instrument: LabJackT7, settings: T7InputSettings) -> None:
+        self._name = name
+        self._instrument = instrument
+        self._settings = settings
+
+    def set_up(self) -> None:
+        """Write the settings to the instrument.
+
+        Raises
+        ------
+        DeviceError
+            If the instrument does not take one.
+        """
+        settings, instrument = self._settings, self._instrument
+        instrument.set_u32("STREAM_RESOLUTION_INDEX", _STREAM_RESOLUTION_INDEX, settings.resolution_index)
+        instrument.set_f32("STREAM_SETTLING_US", _STREAM_SETTLING_US, settings.settling_us)
+        for channel in settings.channels:
+            ain, two = f"AIN{channel}", 2 * channel
+            instrument.set_f32(f"{ain}_RANGE", _RANGE + two, settings.range)
+            instrument.set_u16(f"{ain}_NEGATIVE_CH", _NEGATIVE_CH + channel, _SINGLE_ENDED)
+            instrument.set_u16(f"{ain}_RESOLUTION_INDEX", _RESOLUTION_INDEX + channel, settings.resolution_index)
+            instrument.set_f32(f"{ain}_SETTLING_US", _SETTLING_US + two, settings.settling_us)
+            # Off first, so that nothing of an earlier set-up stays.
+            instrument.set_u32(f"{ain}_EF_INDEX", _EF_INDEX + two, 0)
+            if settings.samples > 1:
+                instrument.set_u32(f"{ain}_EF_INDEX", _EF_INDEX + two, _AVERAGE_MIN_MAX)
+                instrument.set_u32(f"{ain}_EF_CONFIG_A", _EF_SAMPLES + two, settings.samples)
+                instrument.set_f32(f"{ain}_EF_CONFIG_D", _EF_SCAN_RATE + two, settings.sample_rate)
+
+    def average(self) -> list[float]:
+        """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other.
+
+        Takes three requests, or three for each input if they are not neighbours in ascending order.
+
+        Raises
+        ------
+        DeviceError
+            If a conversion is not valid or over the range, as clipped conversions would shift the mean.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        if self._settings.samples == 1:
+            return self.convert()
+        means = self._read(_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
+        maxima = self._read(_EF_READ_MAXIMUM)
+        minima = self._read(_EF_READ_MINIMUM)
+        return self._checked([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
+
+    def convert(self) -> list[float]:
+        """Get one conversion of each input in V; raises what `average` does.
+
+        Takes one request, or one for each input if they are not neighbours in ascending order.
+        """
+        return self._checked([_Voltage(volts, volts, volts) for volts in self._read(_AIN)])
+
+    def _read(self, register: int) -> list[float]:
+        """Get the FLOAT32 at `register` of every input, in one request where they are neighbours."""
+        channels = self._settings.channels
+        if channels == tuple(range(channels[0], channels[0] + len(channels))):
+            return self._instrument.read_f32(register + 2 * channels[0], len(channels))
+        return [self._instrument.read_f32(register + 2 * channel)[0] for channel in channels]
+
+    def _checked(self, voltages: Sequence[_Voltage]) -> list[float]:
+        for channel, voltage in zip(self._settings.channels, voltages, strict=True):
+            if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
+                raise DeviceError(
+                    self._name,
+                    f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
+                )
+            limit = self._settings.range
+            extreme = max(voltage, key=abs)
+            if abs(extreme) >= _RAIL * limit:
+                raise DeviceError(
+                    self._name,
+                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; choose a larger "
+                    "`range`, or bring what is measured back into it",
+                )
+        return [voltage.mean for voltage in voltages]
+
+
+@dataclass(frozen=True)
+class _Watchdog:
+    """The settings of the watchdog that concern digital lines."""
+
+    enabled: int
+    seconds: int
+    strict: int
+    dio_enabled: int
+    state: int
+    direction: int
+    inhibit: int
+
+    @property
+    def lines(self) -> int:
+        """The lines that it drives when it runs out, one bit each."""
+        return ~self.inhibit & _ALL_LINES if self.enabled and self.dio_enabled else 0
+
+
+class DigitalOutput:
+    """One digital line of a T7, which the watchdog of the instrument can switch off.
+
+    The level is read by DIO_STATE, as reading the register of a single line would make it an input.
+
+    The instrument has one watchdog with one time. Any communication of any host feeds it, over whichever
+    connection. When it runs out it drives the lines that are under it, and goes on. It must be switched off for a
+    change of its settings, which takes some milliseconds. The settings are kept in the memory of the
+    instrument for good, so they are written only if they differ.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device, for messages.
+    instrument : LabJackT7
+        The connection.
+    line : int
+        Number of the line, 0 to 22.
+    active_high : bool
+        Whether a high level is on.
+    """
+
+    def __init__(self, name: str, instrument: LabJackT7, line: int, *, active_high: bool) -> None:
+        self._name = name
+        self._instrument = instrument
+        self._line = line
+        self._bit = 1 << line
+        self._active_high = active_high
+
+    def __str__(self) -> str:
+        """Return the name of the line."""
+        return f"DIO{self._line}"
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the level of the line is the one that is on, as the instrument says now."""
+        return bool(self._instrument.read_u32(_DIO_STATE) & self._bit) == self._active_high
+
+    def switch(self, on: bool) -> None:
+        """Make the line an output with the level for on or off.
+
+        Raises
+        ------
+        DeviceError
+            If the instrument refuses, or if the line does not read back so.
+        """
+        self._instrument.write_words(_DIO + self._line, (int(on == self._active_high),))
+        self.check_output()
+        if self.is_on != on:
+            raise DeviceError(
+                self._name,
+                f"{self} is {'off' if on else 'on'} right after it was switched {'on' if on else 'off'}; check the "
+                "wiring for a short circuit, and that no other program uses the line",
+            )
+
+    def check_output(self) -> None:
+        """Raise `DeviceError` if the line is not an output."""
+        if not self._instrument.read_u32(_DIO_DIRECTION) & self._bit:
+            raise DeviceError(
+                self._name,
+                f"{self} is an input and drives nothing; is another program using the line, or has the instrument "
+                "restarted?",
+            )
+
+    @property
+    def watchdog(self) -> int:
+        """The time of the watchdog in s, as the instrument says now."""
+        return self._instrument.read_u32(_WATCHDOG_TIMEOUT_S)
+
+    def guard(self, seconds: int) -> None:
+        """Have the watchdog switch the line off after `seconds` without communication.
+
+        Whatever else is under the watchdog stays so, and then the shorter one of its present time and `seconds`
+        holds. What a watchdog that is switched off was once set to drive is not taken over.
+
+        Raises
+        ------
+        DeviceError
+            If the watchdog is in strict mode, which another program feeds, or if the instrument refuses.
+        """
+        present = self._watchdog()
+        if present.enabled and present.strict:
+            raise DeviceError(
+                self._name,
+                "the watchdog of the instrument is in strict mode, so another program is using it; end that "
+                "program and write 0 to WATCHDOG_ENABLE_DEFAULT",
+            )
+        if self._others(present):
+            seconds = min(seconds, present.seconds)
+        off = 0 if self._active_high else self._bit
+        wanted = _Watchdog(
+            enabled=1,
+            seconds=seconds,
+            strict=0,
+            dio_enabled=1,
+            state=present.state & ~self._bit | off,
+            direction=present.direction | self._bit,
+            inhibit=~(present.lines | self._bit) & _ALL_LINES,
+        )
+        self._change(present, wanted)
+
+    def unguard(self) -> None:
+        """Take the line out of the watchdog's hands, and switch the watchdog off if nothing else is under it.
+
+        Raises
+        ------
+        DeviceError
+            If the instrument refuses.
+        """
+        present = self._watchdog()
+        if not present.lines & self._bit:
+            return
+        lines = present.lines & ~self._bit
+        self._change(
+            present,
+            replace(
+                present,
+                enabled=int(self._others(present)),
+                dio_enabled=int(bool(lines)),
+                inhibit=~lines & _ALL_LINES,
+            ),
+        )
+
+    def _others(self, watchdog: _Watchdog) -> bool:
+        """Return whether something else than this line is under the watchdog."""
+        if watchdog.lines & ~self._bit:
+            return True
+        return bool(watchdog.enabled) and any(self._instrument.read_u32(dac) for dac in _WATCHDOG_DAC_ENABLE)
+
+    def _watchdog(self) -> _Watchdog:
+        read = self._instrument.read_u32
+        return _Watchdog(
+            read(_WATCHDOG_ENABLE),
+            read(_WATCHDOG_TIMEOUT_S),
+            read(_WATCHDOG_STRICT),
+            *self._instrument.read_u32s(_WATCHDOG_DIO, 4),
+        )
+
+    def _change(self, present: _Watchdog, wanted: _Watchdog) -> None:
+        if wanted == present:
+            return
+        instrument = self._instrument
+        instrument.set_u32("WATCHDOG_ENABLE_DEFAULT", _WATCHDOG_ENABLE, 0)
+        try:
+            instrument.set_u32("WATCHDOG_TIMEOUT_S_DEFAULT", _WATCHDOG_TIMEOUT_S, wanted.seconds)
+            instrument.set_u32("WATCHDOG_STRICT_ENABLE_DEFAULT", _WATCHDOG_STRICT, wanted.strict)
+            instrument.set_u32s(
+                [f"WATCHDOG_DIO_{what}_DEFAULT" for what in ("ENABLE", "STATE", "DIRECTION", "INHIBIT")],
+                _WATCHDOG_DIO,
+                (wanted.dio_enabled, wanted.state, wanted.direction, wanted.inhibit),
+            )
+        except BaseException:
+            # Other outputs may depend on it, whatever is refused here.
+            with suppress(DeviceError):
+                instrument.set_u32("WATCHDOG_ENABLE_DEFAULT", _WATCHDOG_ENABLE, present.enabled)
+            raise
+        if wanted.enabled:
+            instrument.set_u32("WATCHDOG_ENABLE_DEFAULT", _WATCHDOG_ENABLE, 1)
+
+
+class T7PositionSensor(PositionSensor):
+    """A position sensor on one or two analog inputs of a LabJack T7: a detector of light, or a linear sensor.
+
+    `measure` has the instrument average a burst of `samples` conversions (datasheet 14.1.7) and looks at the
+    extremes of the burst too. Two inputs are averaged one after the other, and the position comes from the ratio
+    of the means. `glance` takes one conversion. With two inputs that are neighbours in ascending order these take
+    three requests and one.
+
+    A ratiometric sensor whose magnet is beyond the end of its stroke reads as if it were at the end, so readings
+    within 0.05 % of the stroke from its ends are errors.
 
     Parameters
     ----------
@@ -418,6 +781,7 @@ class T7PositionSensor(PositionSensor):
         super().__init__(name, clock)
         self._settings = settings
         self._instrument = instrument
+        self._inputs = AnalogInputs(name, instrument, settings)
         self._identity = identity
 
     @classmethod
@@ -434,7 +798,7 @@ class T7PositionSensor(PositionSensor):
         instrument = LabJackT7(name, settings.port, settings.timeout)
         try:
             sensor = cls(name, clock, settings, instrument, instrument.identify())
-            sensor._set_up()
+            sensor._inputs.set_up()
         except BaseException:
             instrument.close()
             raise
@@ -451,20 +815,16 @@ class T7PositionSensor(PositionSensor):
         Raises
         ------
         DeviceError
-            If an input is over its range, the light is lost, or the position is outside of its calibration.
+            If an input is over its range, the light is lost, the sensor has no supply or its output is not what
+            it gives over its stroke, or the position is outside of its calibration.
         DeviceConnectionError
             If the instrument does not answer.
         """
-        if self._settings.samples == 1:
-            return self.glance()
-        means = self._read(_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
-        maxima = self._read(_EF_READ_MAXIMUM)
-        minima = self._read(_EF_READ_MINIMUM)
-        return self._position([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
+        return self._position(self._inputs.average())
 
     def glance(self) -> dict[str, float]:
         """Measure the position in m by one conversion; raises what `measure` does."""
-        return self._position([_Voltage(volts, volts, volts) for volts in self._read(_AIN)])
+        return self._position(self._inputs.convert())
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
@@ -473,47 +833,14 @@ class T7PositionSensor(PositionSensor):
         """Release the connection."""
         self._instrument.close()
 
-    def _set_up(self) -> None:
-        settings, instrument = self._settings, self._instrument
-        instrument.set_u32("STREAM_RESOLUTION_INDEX", _STREAM_RESOLUTION_INDEX, settings.resolution_index)
-        instrument.set_f32("STREAM_SETTLING_US", _STREAM_SETTLING_US, settings.settling_us)
-        for channel in settings.channels:
-            ain, two = f"AIN{channel}", 2 * channel
-            instrument.set_f32(f"{ain}_RANGE", _RANGE + two, settings.range)
-            instrument.set_u16(f"{ain}_NEGATIVE_CH", _NEGATIVE_CH + channel, _SINGLE_ENDED)
-            instrument.set_u16(f"{ain}_RESOLUTION_INDEX", _RESOLUTION_INDEX + channel, settings.resolution_index)
-            instrument.set_f32(f"{ain}_SETTLING_US", _SETTLING_US + two, settings.settling_us)
-            # Off first, so that nothing of an earlier set-up stays.
-            instrument.set_u32(f"{ain}_EF_INDEX", _EF_INDEX + two, 0)
-            if settings.samples > 1:
-                instrument.set_u32(f"{ain}_EF_INDEX", _EF_INDEX + two, _AVERAGE_MIN_MAX)
-                instrument.set_u32(f"{ain}_EF_CONFIG_A", _EF_SAMPLES + two, settings.samples)
-                instrument.set_f32(f"{ain}_EF_CONFIG_D", _EF_SCAN_RATE + two, settings.sample_rate)
-
-    def _read(self, register: int) -> list[float]:
-        """Get the FLOAT32 at `register` of every input, in one request where they are neighbours."""
-        channels = self._settings.channels
-        if channels == tuple(range(channels[0], channels[0] + len(channels))):
-            return self._instrument.read_f32(register + 2 * channels[0], len(channels))
-        return [self._instrument.read_f32(register + 2 * channel)[0] for channel in channels]
-
-    def _position(self, voltages: Sequence[_Voltage]) -> dict[str, float]:
+    def _position(self, volts: Sequence[float]) -> dict[str, float]:
         settings = self._settings
-        for channel, voltage in zip(settings.channels, voltages, strict=True):
-            self._check_range(channel, voltage)
         if settings.readout == "voltage":
-            position = (voltages[0].mean - settings.zero_volts) / settings.volts_per_metre
+            position = (volts[0] - settings.zero_volts) / settings.volts_per_metre
+        elif settings.readout == "currents":
+            position = self._from_currents(*volts)
         else:
-            first, second = (voltage.mean for voltage in voltages)
-            total = first + second
-            if total < settings.minimum_sum_volts:
-                raise DeviceError(
-                    self.name,
-                    f"light lost: both currents together give {total:.3g} V, "
-                    f"less than {settings.minimum_sum_volts:g} V; check the laser and the spot on the detector",
-                )
-            spot = settings.psd_length / 2 * (second - first) / total
-            position = spot / settings.metres_per_metre
+            position = self._from_ratio(*volts)
         low, high = settings.position_limits
         if not low <= position <= high:
             raise DeviceError(
@@ -523,17 +850,162 @@ class T7PositionSensor(PositionSensor):
             )
         return {f"{self.name}_position": position}
 
-    def _check_range(self, channel: int, voltage: _Voltage) -> None:
-        if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
+    def _from_currents(self, first: float, second: float) -> float:
+        settings = self._settings
+        total = first + second
+        if total < settings.minimum_sum_volts:
             raise DeviceError(
                 self.name,
-                f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
+                f"light lost: both currents together give {total:.3g} V, "
+                f"less than {settings.minimum_sum_volts:g} V; check the laser and the spot on the detector",
             )
-        limit = self._settings.range
-        extreme = max(voltage, key=abs)
-        if abs(extreme) >= _RAIL * limit:
+        return settings.psd_length / 2 * (second - first) / total / settings.metres_per_metre
+
+    def _from_ratio(self, output: float, supply: float) -> float:
+        settings = self._settings
+        output_channel, supply_channel = settings.channels
+        if not _SUPPLY[0] <= supply <= _SUPPLY[1]:
             raise DeviceError(
                 self.name,
-                f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; choose a larger "
-                "`range`, or bring the spot back onto the detector",
+                f"supply voltage of the sensor is {supply:.3g} V at AIN{supply_channel}, expected {_SUPPLY[0]:g} to "
+                f"{_SUPPLY[1]:g} V; the supply has failed or is not connected",
             )
+        low, high = _OUTPUT
+        share = (output / supply - low) / (high - low)
+        if not _END <= share <= 1 - _END:
+            raise DeviceError(
+                self.name,
+                f"output of the sensor at AIN{output_channel} is {100 * output / supply:.4g} % of its supply, "
+                f"expected {100 * low:g} to {100 * high:g} %; the magnet is at or beyond the end of the stroke, or "
+                "a wire is broken",
+            )
+        return settings.stroke * share - settings.zero_position
+
+
+class T7Switch(Switch):
+    """A digital line of a LabJack T7 that switches something on and off.
+
+    The watchdog of the instrument switches the line off when no host has talked to the instrument for its time.
+    The time is the `watchdog` of the settings, or a shorter one that another output of the same instrument asked
+    for (see `DigitalOutput`): whoever keeps the line on asks for readings more often.
+
+    Until `connect`, and after a restart of the instrument, the line is an input that is pulled up weakly: what an
+    active high line switches needs a pull-down to be off then.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    clock : Clock
+        The clock of the run.
+    instrument : LabJackT7
+        The connection; `connect` makes it.
+    identity : Identity
+        What the instrument said of itself.
+    output : DigitalOutput
+        The line.
+    """
+
+    Settings: ClassVar[type[T7SwitchSettings]] = T7SwitchSettings
+
+    def __init__(
+        self, name: str, clock: Clock, instrument: LabJackT7, identity: Identity, output: DigitalOutput
+    ) -> None:
+        super().__init__(name, clock)
+        self._instrument = instrument
+        self._identity = identity
+        self._output = output
+        self._setpoint = math.nan
+
+    @classmethod
+    def connect(cls, name: str, settings: T7SwitchSettings, clock: Clock) -> T7Switch:
+        """Open the connection, check that a T7 answers, switch the line off and put it under the watchdog.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If nobody answers, or another device, or with swapped words.
+        DeviceError
+            If the instrument does not take a setting, or the line does not go off.
+        """
+        instrument = LabJackT7(name, settings.port, settings.timeout)
+        try:
+            identity = instrument.identify()
+            output = DigitalOutput(name, instrument, settings.line, active_high=settings.active_high)
+            switch = cls(name, clock, instrument, identity, output)
+            output.switch(False)
+            output.guard(settings.watchdog)
+        except BaseException:
+            instrument.close()
+            raise
+        return switch
+
+    @property
+    def identity(self) -> Identity:
+        """Get the identity that the instrument gave on connecting."""
+        return self._identity
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent, 0 or 1; 0 after the safe state and the watchdog, nan at first."""
+        return self._setpoint
+
+    def set(self, value: float) -> Status:
+        """Switch on (1) or off (0), and see that the line is.
+
+        Raises
+        ------
+        LimitError
+            If `value` is neither 0 nor 1; nothing is sent.
+        DeviceError
+            If the instrument refuses, or if the line does not read back so.
+        """
+        self.check(value)
+        self._setpoint = float(value)
+        self._output.switch(value == 1.0)
+        return Status.completed(self.name, self._clock)
+
+    def measure(self) -> dict[str, float]:
+        """Read back whether the line is on, and see that it is driven.
+
+        Raises
+        ------
+        DeviceError
+            Once, if the line went off by itself; if it is no output any more.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        self._output.check_output()
+        return self.glance()
+
+    def glance(self) -> dict[str, float]:
+        """Read back whether the line is on, in one request; raises what `measure` does but for the output."""
+        on = self._output.is_on
+        if self._setpoint == 1.0 and not on:
+            self._setpoint = 0.0
+            raise DeviceError(
+                self.name,
+                f"{self._output} is off although it was switched on: the watchdog of the instrument has run out, as "
+                f"nobody talked to it for {self._output.watchdog} s, or another program switched the line; ask for "
+                "readings more often or lengthen `watchdog`, then switch it on again",
+            )
+        return {f"{self.name}_state": float(on)}
+
+    def safe(self) -> None:
+        """Switch off and see that the line is off.
+
+        Raises
+        ------
+        DeviceError
+            If that could not be confirmed; a line that cannot be reached is left to the watchdog.
+        """
+        self._setpoint = 0.0
+        self._output.switch(False)
+
+    def close(self) -> None:
+        """Release the connection; a line that is on is left to the watchdog."""
+        # An instrument that cannot be reached any more keeps its watchdog, which is as well.
+        with suppress(DeviceError):
+            if not self._output.is_on:
+                self._output.unguard()
+        self._instrument.close()

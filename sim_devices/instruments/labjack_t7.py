@@ -17,6 +17,8 @@ Assumptions, where these say nothing:
 - After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
   nothing as long as nobody communicates, so they are done once.
 - A single conversion takes no laboratory time; a burst takes what its scan rate says.
+- Reading the register of a single digital line makes it an input, as the map says that it configures the
+  direction too; an input that nothing drives is pulled high, as all lines are after power-up.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from typing import Literal
 
 import numpy as np
 
-from bench.devices import Identity, PositionSensor
+from bench.devices import Identity, PositionSensor, Status, Switch
 from bench.errors import DeviceError
 from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
@@ -215,8 +217,7 @@ class EmulatedT7:
 
     def dio_level(self, number: int) -> bool:
         """Return the level of a digital line, 0 to 22; a line that is not an output is pulled high."""
-        bit = 1 << number
-        return bool(self._dio_state & bit) or not self._dio_direction & bit
+        return bool(self._levels() >> number & 1)
 
     @property
     def watchdog_expired(self) -> bool:
@@ -443,7 +444,7 @@ class EmulatedT7:
             raise RegisterError(DEVICE_FAILURE, f"AIN{channel}_EF_CONFIG_D: the scan rate is above 0 Hz")
         self._inputs[channel].scan_rate = value
 
-    # The outputs.
+    # The outputs, and the digital lines.
 
     def _set_dac(self, number: int, value: float) -> None:
         self._dacs[number] = min(max(value, 0.0), _DAC_TOP)
@@ -451,11 +452,18 @@ class EmulatedT7:
     def _set_tdac(self, number: int, value: float) -> None:
         self._tdacs[number] = min(max(value, -_TDAC_TOP), _TDAC_TOP)
 
+    def _read_dio(self, number: int) -> float:
+        self._dio_direction &= ~(1 << number)
+        return self.dio_level(number)
+
     def _set_dio(self, number: int, value: float) -> None:
         # Writing a line also makes it an output, as ljm_constants.json says of FIO0.
         bit = 1 << number
         self._dio_direction |= bit
         self._dio_state = self._dio_state | bit if value else self._dio_state & ~bit
+
+    def _levels(self) -> int:
+        return self._dio_state & self._dio_direction | ~self._dio_direction & _all_dio()
 
     def _set_dio_bank(self, attribute: str, value: float) -> None:
         affected = _all_dio() if attribute == "_dio_inhibit" else ~self._dio_inhibit & _all_dio()
@@ -488,9 +496,9 @@ class EmulatedT7:
         for number in range(_TDACS):
             self._add(30000 + 2 * number, "F32", None, partial(self._set_tdac, number))
         for number in range(_DIOS):
-            level = partial(self.dio_level, number)
-            self._add(2000 + number, "U16", level, partial(self._set_dio, number))
-        for address, attribute in ((2800, "_dio_state"), (2850, "_dio_direction"), (2900, "_dio_inhibit")):
+            self._add(2000 + number, "U16", partial(self._read_dio, number), partial(self._set_dio, number))
+        self._add(2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state"))
+        for address, attribute in ((2850, "_dio_direction"), (2900, "_dio_inhibit")):
             self._add(
                 address,
                 "U32",
@@ -556,10 +564,11 @@ class EmulatedPositionSensor(PositionSensor):
         Name in the rig.
     instrument : EmulatedT7
         The instrument; its inputs are set up here.
-    readout : {"voltage", "currents"}
-        One normalised voltage, or two amplified photocurrents.
+    readout : {"voltage", "currents", "ratiometric"}
+        One normalised voltage, two amplified photocurrents, or an output that is a share of its supply.
     channels : sequence of int
-        Inputs, 0 to 13: one for a voltage, those of the currents 1 and 2 for currents.
+        Inputs, 0 to 13: one for a voltage, those of the currents 1 and 2 for currents, those of output and supply
+        for a ratiometric sensor.
     range_volts : float
         Input range in V: 10, 1, 0.1 or 0.01.
     resolution_index : int
@@ -573,6 +582,8 @@ class EmulatedPositionSensor(PositionSensor):
     psd_length, metres_per_metre, minimum_sum_volts : float
         Length of the detector in m, movement of the spot per deflection, and the sum of both voltages in V
         below which the light counts as lost.
+    stroke, zero_position : float
+        Stroke of a ratiometric sensor, and where on it the position reads zero, in m.
     position_limits : tuple of float
         Calibrated range in m.
 
@@ -587,7 +598,7 @@ class EmulatedPositionSensor(PositionSensor):
         name: str,
         instrument: EmulatedT7,
         *,
-        readout: Literal["voltage", "currents"] = "voltage",
+        readout: Literal["voltage", "currents", "ratiometric"] = "voltage",
         channels: Sequence[int] = (0,),
         range_volts: float = 10.0,
         resolution_index: int = 4,
@@ -598,6 +609,8 @@ class EmulatedPositionSensor(PositionSensor):
         psd_length: float = 0.037,
         metres_per_metre: float = 185.0,
         minimum_sum_volts: float = 0.5,
+        stroke: float = 0.035,
+        zero_position: float = 0.0,
         position_limits: tuple[float, float] = (-90e-6, 90e-6),
     ) -> None:
         super().__init__(name, instrument.world.clock)
@@ -612,6 +625,8 @@ class EmulatedPositionSensor(PositionSensor):
         self._zero_volts = zero_volts
         self._metres_per_ratio = psd_length / 2 / metres_per_metre
         self._minimum_sum = minimum_sum_volts
+        self._stroke = stroke
+        self._zero_position = zero_position
         self._limits = position_limits
         instrument.write_value(4010, resolution_index)
         for channel in self._channels:
@@ -652,6 +667,8 @@ class EmulatedPositionSensor(PositionSensor):
                 raise DeviceError(self.name, f"AIN{channel} is over its range of ±{self._range:g} V")
         if self._readout == "voltage":
             position = (bursts[0].average - self._zero_volts) / self._volts_per_metre
+        elif self._readout == "ratiometric":
+            position = self._along_the_stroke(*(burst.average for burst in bursts))
         else:
             first, second = (burst.average for burst in bursts)
             if first + second < self._minimum_sum:
@@ -661,6 +678,102 @@ class EmulatedPositionSensor(PositionSensor):
         if not low <= position <= high:
             raise DeviceError(self.name, f"position {position:g} m is outside of {low:g} to {high:g} m")
         return {f"{self.name}_position": position}
+
+    def _along_the_stroke(self, output: float, supply: float) -> float:
+        if not 4.5 <= supply <= 5.5:
+            raise DeviceError(self.name, f"supply voltage of the sensor is {supply:.3g} V")
+        # At 10 and 90 % of the supply the magnet may be anywhere beyond the end.
+        share = (output / supply - 0.1) / 0.8
+        if not 0.0005 <= share <= 0.9995:
+            raise DeviceError(self.name, f"output of the sensor is {output / supply:.4g} of its supply")
+        return self._stroke * share - self._zero_position
+
+
+class EmulatedSwitch(Switch):
+    """The role of a switch, played by a digital line of an emulated T7 that is called directly, without a wire.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    instrument : EmulatedT7
+        The instrument; its line is switched off and put under its watchdog here.
+    line : int
+        Number of the line, 0 to 22.
+    active_high : bool
+        Whether a high level is on.
+    watchdog : int
+        Silence in s after which the instrument switches the line off, 1 or more; a shorter time that is set
+        already for something else stays.
+
+    Raises
+    ------
+    RegisterError
+        If the instrument refuses a setting.
+    """
+
+    def __init__(
+        self, name: str, instrument: EmulatedT7, *, line: int, active_high: bool = True, watchdog: int = 5
+    ) -> None:
+        super().__init__(name, instrument.world.clock)
+        self._instrument = instrument
+        self._line = line
+        self._active_high = active_high
+        self._setpoint = math.nan
+        self._drive(False)
+        self._guard(watchdog)
+
+    @property
+    def identity(self) -> Identity:
+        """Identity of the instrument."""
+        return Identity("LabJack", "T7", str(self._instrument.serial_number), f"{self._instrument.firmware:.4f}")
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent, 0 or 1; 0 after the safe state and the watchdog, nan at first."""
+        return self._setpoint
+
+    def set(self, value: float) -> Status:
+        """Switch on (1) or off (0)."""
+        self.check(value)
+        self._setpoint = float(value)
+        self._drive(value == 1.0)
+        return Status.completed(self.name, self._clock)
+
+    def measure(self) -> dict[str, float]:
+        """Read back whether the line is on."""
+        level = int(self._instrument.read_value(2800)) >> self._line & 1
+        on = bool(level) == self._active_high
+        if self._setpoint == 1.0 and not on:
+            self._setpoint = 0.0
+            raise DeviceError(self.name, f"DIO{self._line} is off although it was switched on: the watchdog ran out")
+        return {f"{self.name}_state": float(on)}
+
+    def safe(self) -> None:
+        """Switch off."""
+        self._setpoint = 0.0
+        self._drive(False)
+
+    def close(self) -> None:
+        """Do nothing: there is no line of communication, and the digital line is left to the watchdog."""
+
+    def _drive(self, on: bool) -> None:
+        self._instrument.write_value(2000 + self._line, on == self._active_high)
+
+    def _guard(self, seconds: int) -> None:
+        read, write = self._instrument.read_value, self._instrument.write_value
+        bit = 1 << self._line
+        inhibit = int(read(61636)) if read(61600) and read(61630) else _all_dio()
+        if ~inhibit & ~bit & _all_dio() or (read(61600) and (read(61640) or read(61650))):
+            seconds = min(seconds, int(read(61604)))
+        state, direction = int(read(61632)), int(read(61634))
+        write(61600, 0)
+        write(61604, seconds)
+        write(61630, 1)
+        write(61632, state & ~bit if self._active_high else state | bit)
+        write(61634, direction | bit)
+        write(61636, inhibit & ~bit)
+        write(61600, 1)
 
 
 class NormalisedPSD:
@@ -765,3 +878,59 @@ class TwoCurrentPSD:
         share = (1 + side * ratio) / 2 if abs(ratio) <= 1 else 0.0
         volts = self.light * self._sum * share + self._noise * self._rng.standard_normal()
         return float(min(max(volts, 0.0), self.SATURATION))
+
+
+class RatiometricSensor:
+    """A linear magnet sensor, of the kind of the SPS-L035-LATS, whose output is a share of its supply.
+
+    Assumption: the output goes from 10 to 90 % of a supply of 5 V over the stroke, and stays at its end for a
+    magnet that is beyond it.
+
+    Parameters
+    ----------
+    position : callable
+        The position of the magnet in m, counted from the start of the stroke, from the plant.
+    stroke : float
+        Stroke in m.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the position, in m.
+    supply_error : float
+        How far the supply of one instance is from 5 V, in V rms; drawn once.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the supply.
+
+    Attributes
+    ----------
+    supply_volts : float
+        Voltage of the supply in V; for faults and drift.
+    """
+
+    def __init__(
+        self,
+        position: Callable[[], float],
+        stroke: float = 0.035,
+        noise: float = 0.01e-3,
+        resolution: float = 0.04e-3,
+        supply_error: float = 20e-3,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self.supply_volts = 5.0 + supply_error * rng.standard_normal()
+        self._position = position
+        self._stroke = stroke
+        self._noise = noise
+        self._resolution = resolution
+        self._rng = rng
+
+    def output(self) -> float:
+        """Return the output voltage in V at this instant."""
+        noisy = self._position() + self._noise * self._rng.standard_normal()
+        step = round(noisy / self._resolution) * self._resolution
+        share = min(max(step / self._stroke, 0.0), 1.0)
+        return self.supply_volts * (0.1 + 0.8 * share)
+
+    def supply(self) -> float:
+        """Return the voltage in V of the supply at this instant."""
+        return self.supply_volts

@@ -8,8 +8,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
-from bench.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
+from bench.hysteresis import (
+    Linear,
+    MemoryCurve,
+    Polynomial,
+    Preisach,
+    QuadraticTerm,
+    Summed,
+    ThermalExpansion,
+    TwoStage,
+    uniform_levels,
+)
+from bench.model_file import (
+    COUPLED_FORMAT,
+    FORMAT,
+    VERSION,
+    CoupledFile,
+    ModelFile,
+    is_coupled_model,
+    load_coupled_model,
+    load_model,
+    parse_coupled_model,
+    parse_model,
+)
 
 LEVELS = uniform_levels(30.0, 70.0, 4)
 INPUTS = np.array([21.0, 84.0, 40.0, 60.0, 55.0])
@@ -211,3 +232,63 @@ def test_any_mutation_is_a_usable_model_or_a_data_error(name, data):
     json.dumps(file.to_json())
     assert isinstance(file.operator.input_unit, str)
     assert isinstance(file.operator.output_unit, str)
+
+
+def stage(low, high, units):
+    return Preisach(uniform_levels(low, high, 4), np.linspace(0.1, 1.0, 10), 0.5, None, None, *units)
+
+
+FIRST, SECOND = stage(0.0, 3.0, ("V", "N")), stage(-12.0, 12.0, ("N", "m"))
+COUPLED = {
+    "two-stage": TwoStage(FIRST, SECOND, 0.3),
+    "summed": Summed(SECOND, stage(0.0, 3.0, ("V", "m")), 0.3),
+    "linear": Linear(3.8, -2.9, SECOND, (0.0, 3.0), 0.3, "V"),
+}
+
+
+class TestCoupled:
+    @pytest.mark.parametrize("name", list(COUPLED))
+    def test_round_trip(self, tmp_path, name):
+        path = tmp_path / "model.json"
+        CoupledFile(name, COUPLED[name], {"source": "runs"}).save(path)
+        loaded = load_coupled_model(path)
+        assert loaded.name == name
+        assert loaded.provenance["source"] == "runs"
+        assert type(loaded.model) is type(COUPLED[name])
+        voltages, forces = np.array([0.0, 2.5, 1.0, 3.0]), np.array([1.0, 1.0, 4.0, 0.5])
+        np.testing.assert_array_equal(
+            loaded.model.evaluate(voltages, forces), COUPLED[name].evaluate(voltages, forces)
+        )
+        assert loaded.to_json() == json.loads(path.read_text(encoding="utf-8"))
+        assert is_coupled_model(loaded.to_json())
+
+    def test_neither_kind_passes_for_the_other(self):
+        coupled = CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
+        assert not is_coupled_model(content())
+        with pytest.raises(DataError, match=f"its `format` is not '{FORMAT}'"):
+            parse_model(coupled, "m.json")
+        with pytest.raises(DataError, match=f"its `format` is not '{COUPLED_FORMAT}'"):
+            parse_coupled_model(content(), "m.json")
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"model": None},
+            {"model": {}},
+            {"model": {"type": "three-stage"}},
+            {"model": {"type": "two-stage", "first": 5}},
+            {"name": None, "provenance": 7},
+            {"version": 9},
+        ],
+    )
+    def test_damaged(self, change):
+        document = {**CoupledFile("two-stage", COUPLED["two-stage"]).to_json(), **change}
+        with pytest.raises(DataError, match=r"m\.json"):
+            parse_coupled_model(document, "m.json")
+
+    @pytest.mark.parametrize("key", ["name", "model", "provenance"])
+    def test_a_missing_key(self, key):
+        document = CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
+        del document[key]
+        with pytest.raises(DataError, match=f"key '{key}' is missing"):
+            parse_coupled_model(document, "m.json")

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from sim_devices.instruments.labjack_t7 import (
     EmulatedPositionSensor,
     EmulatedT7,
     NormalisedPSD,
+    RatiometricSensor,
     TwoCurrentPSD,
 )
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
@@ -39,6 +40,41 @@ class Laboratory:
     stage: Stage
     clock: VirtualClock
     spoil: Callable[[], None]
+    transducer: NormalisedPSD | TwoCurrentPSD | RatiometricSensor
+
+
+@dataclass(frozen=True)
+class Case:
+    """A readout, where its positions are, and how well it knows them."""
+
+    channels: tuple[int, ...]
+    positions: tuple[float, ...]
+    outside: float
+    measured_within: float
+    glanced_within: float
+    settings: dict[str, object] = field(default_factory=dict)
+
+
+DETECTOR = {
+    "positions": (-85e-6, -1e-6, 0.0, 12.5e-6, 85e-6),
+    "outside": 95e-6,
+    "measured_within": 0.15e-6,
+    "glanced_within": 0.45e-6,
+}
+ZERO = 0.0175
+CASES = {
+    "voltage": Case((0,), **DETECTOR),
+    "currents": Case((2, 3), **DETECTOR),
+    # Steps of 40 µm under a noise of 10 µm: half a step and 4 sigma, and what is left of it in a mean of ten.
+    "ratiometric": Case(
+        (4, 5),
+        positions=(-14.98e-3, -1e-3, 0.0, 4.013e-3, 14.98e-3),
+        outside=16e-3,
+        measured_within=20e-6,
+        glanced_within=60e-6,
+        settings={"zero_position": ZERO, "position_limits": (-15e-3, 15e-3)},
+    ),
+}
 
 
 def laboratory(kind: str, readout: str, stack: ExitStack, seed: int = 1) -> Laboratory:
@@ -46,29 +82,35 @@ def laboratory(kind: str, readout: str, stack: ExitStack, seed: int = 1) -> Labo
     world = World(stage, clock)
     streams = np.random.default_rng(seed).spawn(2)
     if readout == "voltage":
-        psd = NormalisedPSD(lambda: stage.position, rng=streams[0])
-        inputs = {0: psd}
-        channels = (0,)
+        transducer = NormalisedPSD(lambda: stage.position, rng=streams[0])
+        inputs = {0: transducer}
 
         def spoil() -> None:
             stage.position = 1.0
-    else:
-        two = TwoCurrentPSD(lambda: stage.position, rng=streams[0])
-        inputs = {2: two.first, 3: two.second}
-        channels = (2, 3)
+    elif readout == "ratiometric":
+        transducer = RatiometricSensor(lambda: stage.position + ZERO, rng=streams[0])
+        inputs = {4: transducer.output, 5: transducer.supply}
 
         def spoil() -> None:
-            two.light = 0.01
+            transducer.supply_volts = 0.3
+    else:
+        transducer = TwoCurrentPSD(lambda: stage.position, rng=streams[0])
+        inputs = {2: transducer.first, 3: transducer.second}
+
+        def spoil() -> None:
+            transducer.light = 0.01
 
     instrument = EmulatedT7(world, inputs, rng=streams[1])
+    case = CASES[readout]
+    said = {"readout": readout, "channels": case.channels} | case.settings
     if kind == "emulated":
-        sensor: PositionSensor = EmulatedPositionSensor("tip", instrument, readout=readout, channels=channels)
+        sensor: PositionSensor = EmulatedPositionSensor("tip", instrument, **said)
     else:
         server = stack.enter_context(ModbusTcpServer(instrument))
-        settings = T7PositionSensor.Settings(port=server.address, readout=readout, channels=channels)
+        settings = T7PositionSensor.Settings(port=server.address, **said)
         sensor = T7PositionSensor.connect("tip", settings, clock)
     stack.callback(sensor.close)
-    return Laboratory(sensor, stage, clock, spoil)
+    return Laboratory(sensor, stage, clock, spoil, transducer)
 
 
 @pytest.fixture(params=["emulated", "wire"])
@@ -76,9 +118,14 @@ def kind(request) -> str:
     return request.param
 
 
-@pytest.fixture(params=["voltage", "currents"])
+@pytest.fixture(params=CASES)
 def readout(request) -> str:
     return request.param
+
+
+@pytest.fixture
+def case(readout) -> Case:
+    return CASES[readout]
 
 
 @pytest.fixture
@@ -108,11 +155,11 @@ def test_signals_are_what_measure_and_glance_deliver(lab):
     assert list(lab.sensor.glance()) == names
 
 
-@pytest.mark.parametrize("position", [-85e-6, -1e-6, 0.0, 12.5e-6, 85e-6])
-def test_measures_the_position(lab, position):
-    lab.stage.position = position
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(position, abs=0.15e-6)
-    assert lab.sensor.glance()["tip_position"] == pytest.approx(position, abs=0.45e-6)
+@pytest.mark.parametrize("index", range(5))
+def test_measures_the_position(lab, case, index):
+    position = lab.stage.position = case.positions[index]
+    assert lab.sensor.measure()["tip_position"] == pytest.approx(position, abs=case.measured_within)
+    assert lab.sensor.glance()["tip_position"] == pytest.approx(position, abs=case.glanced_within)
 
 
 def test_read_and_describe_conform_to_bluesky(lab):
@@ -132,26 +179,27 @@ def test_a_spoilt_signal_is_an_error_and_not_a_number(lab):
             take()
 
 
-def test_outside_of_the_calibration_is_an_error(lab):
-    lab.stage.position = 95e-6
-    with pytest.raises(DeviceError, match="tip: position 9"):
+@pytest.mark.parametrize("side", [-1, 1])
+def test_outside_of_the_calibration_is_an_error(lab, case, side):
+    lab.stage.position = side * case.outside
+    with pytest.raises(DeviceError, match=rf"tip: position {'-' if side < 0 else ''}\d\S* m is outside of"):
         lab.sensor.measure()
 
 
-def test_recovers_by_itself(lab):
+def test_recovers_by_itself(lab, case):
     lab.stage.position = 1.0
     with pytest.raises(DeviceError):
         lab.sensor.measure()
-    lab.stage.position = 1e-6
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(1e-6, abs=0.15e-6)
+    lab.stage.position = case.positions[3]
+    assert lab.sensor.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
 
 
-def test_safe_and_stop_change_nothing(lab):
-    lab.stage.position = 20e-6
+def test_safe_and_stop_change_nothing(lab, case):
+    lab.stage.position = case.positions[3]
     for _ in range(2):
         lab.sensor.safe()
         lab.sensor.stop()
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(20e-6, abs=0.15e-6)
+    assert lab.sensor.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
 
 
 def test_a_measurement_takes_the_time_of_its_conversions(lab, readout):
@@ -176,8 +224,8 @@ def test_one_seed_gives_one_record(kind, readout):
         with ExitStack() as stack:
             lab = laboratory(kind, readout, stack, seed)
             values = []
-            for step in range(5):
-                lab.stage.position = step * 10e-6
+            for position in CASES[readout].positions:
+                lab.stage.position = position
                 values += [lab.sensor.measure()["tip_position"], lab.sensor.glance()["tip_position"]]
             return values
 
@@ -189,7 +237,7 @@ def test_the_wire_changes_no_more_than_the_rounding_of_a_float(readout):
     def record(kind: str) -> list[float]:
         with ExitStack() as stack:
             lab = laboratory(kind, readout, stack)
-            lab.stage.position = 33e-6
+            lab.stage.position = CASES[readout].positions[-1]
             return [lab.sensor.measure()["tip_position"] for _ in range(5)]
 
     np.testing.assert_allclose(record("wire"), record("emulated"), rtol=1e-6)
@@ -204,3 +252,33 @@ def test_noise_of_a_measurement_is_that_of_the_mean(kind):
     assert np.std(means) == pytest.approx(50e-9 / math.sqrt(10), rel=0.12)
     assert np.std(single) == pytest.approx(50e-9, rel=0.12)
     assert abs(np.mean(means)) < 4 * 50e-9 / math.sqrt(5000)
+
+
+def test_supply_of_a_ratiometric_sensor_does_not_matter_within_its_range(kind):
+    with ExitStack() as stack:
+        lab = laboratory(kind, "ratiometric", stack)
+        lab.stage.position = 5e-3
+        for volts in (4.55, 5.0, 5.45):
+            lab.transducer.supply_volts = volts
+            means = [lab.sensor.measure()["tip_position"] for _ in range(20)]
+            assert np.mean(means) == pytest.approx(5e-3, abs=8e-6)
+
+
+@pytest.mark.parametrize("volts", [0.0, 4.45, 5.55, 9.0])
+def test_a_failed_supply_is_named(kind, volts):
+    with ExitStack() as stack:
+        lab = laboratory(kind, "ratiometric", stack)
+        lab.transducer.supply_volts = volts
+        for take in (lab.sensor.measure, lab.sensor.glance):
+            with pytest.raises(DeviceError, match=r"tip: supply voltage of the sensor is \S+ V"):
+                take()
+
+
+@pytest.mark.parametrize("position", [-1.0, -ZERO - 1e-3, 0.035 - ZERO + 1e-3, 1.0])
+def test_a_magnet_beyond_the_stroke_is_never_a_position(kind, position):
+    with ExitStack() as stack:
+        lab = laboratory(kind, "ratiometric", stack)
+        lab.stage.position = position
+        for take in (lab.sensor.measure, lab.sensor.glance) * 20:
+            with pytest.raises(DeviceError, match="tip: output of the sensor"):
+                take()

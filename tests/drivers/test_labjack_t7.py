@@ -11,13 +11,18 @@ import pytest
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
+from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.labjack_t7 import LabJackT7, T7PositionSensor
+from drivers.labjack_t7 import DigitalOutput, LabJackT7, T7PositionSensor, T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
+SwitchSettings = T7Switch.Settings
+
+ALL_LINES = 0x7FFFFF
+RATIOMETRIC = {"readout": "ratiometric", "channels": (2, 3), "position_limits": (0.0, 0.035)}
 
 
 class Still:
@@ -35,12 +40,23 @@ class Bench:
         inputs: dict[int, Callable[[], float]] = {channel: lambda c=channel: self.volts[c] for channel in range(14)}
         self.t7 = EmulatedT7(self.world, inputs, rng=np.random.default_rng(3))
         self.server = ModbusTcpServer(self.t7)
-        self.sensors: list[T7PositionSensor] = []
+        self.devices: list[T7PositionSensor | T7Switch] = []
 
     def sensor(self, **settings) -> T7PositionSensor:
         made = T7PositionSensor.connect("psd", Settings(port=self.server.address, **settings), self.clock)
-        self.sensors.append(made)
+        self.devices.append(made)
         return made
+
+    def switch(self, **settings) -> T7Switch:
+        given = {"line": 5} | settings
+        made = T7Switch.connect("fan", SwitchSettings(port=self.server.address, **given), self.clock)
+        self.devices.append(made)
+        return made
+
+    def guarded(self) -> int:
+        """The lines that the watchdog drives when it runs out."""
+        on = self.t7.read_value(61600) and self.t7.read_value(61630)
+        return ~int(self.t7.read_value(61636)) & ALL_LINES if on else 0
 
 
 @pytest.fixture
@@ -48,8 +64,8 @@ def bench() -> Iterator[Bench]:
     bench = Bench()
     with bench.server:
         yield bench
-        for sensor in bench.sensors:
-            sensor.close()
+        for device in bench.devices:
+            device.close()
 
 
 class Scripted:
@@ -99,6 +115,22 @@ class Altered:
         self._instrument.write_registers(address, values)
 
 
+class Recorded(Altered):
+    """A T7 that keeps what was asked of it."""
+
+    def __init__(self, instrument: EmulatedT7) -> None:
+        super().__init__(instrument, lambda _, words: words)
+        self.requests: list[tuple[str, int, int]] = []
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        self.requests.append(("read", address, count))
+        return super().read_registers(address, count)
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        self.requests.append(("write", address, len(values)))
+        super().write_registers(address, values)
+
+
 # Settings
 
 
@@ -139,6 +171,16 @@ def test_address_is_completed(given, kept):
         {"position_limits": (1e-6, -1e-6)},
         {"position_limits": (-96e-6, 0.0), "readout": "currents", "channels": (0, 1)},
         {"colour": "red"},
+        RATIOMETRIC | {"channels": (2,)},
+        RATIOMETRIC | {"channels": (2, 3, 4)},
+        RATIOMETRIC | {"range": 1.0},
+        RATIOMETRIC | {"stroke": 0.0},
+        RATIOMETRIC | {"zero_position": -1e-3},
+        RATIOMETRIC | {"zero_position": 0.036},
+        RATIOMETRIC | {"position_limits": (-1e-6, 0.035)},
+        RATIOMETRIC | {"position_limits": (0.0, 0.0351)},
+        RATIOMETRIC | {"position_limits": (0.0, 0.035), "zero_position": 0.01},
+        {"readout": "ratiometric", "channels": (2, 3)},
     ],
 )
 def test_wrong_settings_are_refused(wrong):
@@ -146,8 +188,39 @@ def test_wrong_settings_are_refused(wrong):
         Settings(**{"port": "host"} | wrong)
 
 
-def test_every_setting_is_described():
-    assert all(field.description for field in Settings.model_fields.values())
+@pytest.mark.parametrize("zero", [0.0, 0.005, 0.01, 0.012, 0.0175, 0.03, 0.035])
+def test_limits_may_be_the_whole_stroke(zero):
+    limits = (round(-zero, 6), round(0.035 - zero, 6))
+    made = Settings(port="host", **RATIOMETRIC | {"zero_position": zero, "position_limits": limits})
+    assert made.position_limits == limits
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"line": 23},
+        {"line": -1},
+        {"watchdog": 0},
+        {"watchdog": 3601},
+        {"watchdog": 2.5},
+        {"port": "serial:///dev/ttyUSB0"},
+        {"channels": (0,)},
+    ],
+)
+def test_wrong_settings_of_a_switch_are_refused(wrong):
+    SwitchSettings(port="host", line=0)
+    with pytest.raises(ValidationError):
+        SwitchSettings(**{"port": "host", "line": 0} | wrong)
+
+
+def test_a_switch_needs_a_line():
+    with pytest.raises(ValidationError, match="line"):
+        SwitchSettings(port="host")
+
+
+@pytest.mark.parametrize("settings", [Settings, SwitchSettings])
+def test_every_setting_is_described(settings):
+    assert all(field.description for field in settings.model_fields.values())
 
 
 # Bytes
@@ -168,6 +241,72 @@ def test_byte_vectors():
         assert t7.read_f32(0) == [2.5]
         t7.set_f32("AIN0_RANGE", 40000, 0.1)
         t7.close()
+    assert len(server.received) == len(exchanges)
+
+
+def test_byte_vectors_of_a_ratiometric_sensor():
+    volts = "4020 0000 40a0 0000"  # 2.5 and 5 V
+    exchanges = (
+        ("0001 0000 0006 01 03 0004 0004", f"0001 0000 000b 01 03 08 {volts}"),  # AIN2, AIN3
+        ("0002 0000 0006 01 03 1b5c 0004", f"0002 0000 000b 01 03 08 {volts}"),  # AIN2_EF_READ_A ...
+        ("0003 0000 0006 01 03 1c88 0004", "0003 0000 000b 01 03 08 4024 0000 40a4 0000"),  # AIN2_EF_READ_B ...
+        ("0004 0000 0006 01 03 1db4 0004", "0004 0000 000b 01 03 08 401c 0000 409c 0000"),  # AIN2_EF_READ_C ...
+    )
+    with Scripted(*exchanges) as server:
+        settings = Settings(port=server.address, **RATIOMETRIC | {"zero_position": 0.0, "position_limits": (0, 0.02)})
+        t7 = LabJackT7("slide", server.address, 2.0)
+        sensor = T7PositionSensor("slide", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        assert sensor.glance() == {"slide_position": pytest.approx(0.0175)}
+        assert sensor.measure() == {"slide_position": pytest.approx(0.0175)}
+        sensor.close()
+    assert len(server.received) == len(exchanges)
+
+
+def test_byte_vectors_of_a_switch():
+    exchanges = (
+        ("0001 0000 0006 01 03 d73c 0002", "0001 0000 0007 01 03 04 0011 2233"),  # TEST
+        ("0002 0000 0006 01 03 d754 0002", "0002 0000 0007 01 03 04 c61c 3c00"),  # TEST_FLOAT32
+        ("0003 0000 0006 01 03 ea60 0002", "0003 0000 0007 01 03 04 40e0 0000"),  # PRODUCT_ID 7
+        ("0004 0000 0006 01 03 ea64 0002", "0004 0000 0007 01 03 04 3f80 0000"),  # FIRMWARE 1
+        ("0005 0000 0006 01 03 ea7c 0002", "0005 0000 0007 01 03 04 1c03 dcb9"),  # SERIAL
+        ("0006 0000 0009 01 10 07d5 0001 02 0000", "0006 0000 0006 01 10 07d5 0001"),  # DIO5 low
+        ("0007 0000 0006 01 03 0b22 0002", "0007 0000 0007 01 03 04 0000 0020"),  # DIO_DIRECTION
+        ("0008 0000 0006 01 03 0af0 0002", "0008 0000 0007 01 03 04 007f ffdf"),  # DIO_STATE
+        ("0009 0000 0006 01 03 f0a0 0002", "0009 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_ENABLE
+        ("000a 0000 0006 01 03 f0a4 0002", "000a 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_TIMEOUT_S
+        ("000b 0000 0006 01 03 f0aa 0002", "000b 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_STRICT_ENABLE
+        (
+            "000c 0000 0006 01 03 f0be 0008",  # WATCHDOG_DIO_ENABLE, _STATE, _DIRECTION, _INHIBIT
+            "000c 0000 0013 01 03 10 0000 0000 0000 0000 0000 0000 0000 0000",
+        ),
+        ("000d 0000 000b 01 10 f0a0 0002 04 0000 0000", "000d 0000 0006 01 10 f0a0 0002"),
+        ("000e 0000 0006 01 03 f0a0 0002", "000e 0000 0007 01 03 04 0000 0000"),
+        ("000f 0000 000b 01 10 f0a4 0002 04 0000 0003", "000f 0000 0006 01 10 f0a4 0002"),
+        ("0010 0000 0006 01 03 f0a4 0002", "0010 0000 0007 01 03 04 0000 0003"),
+        ("0011 0000 000b 01 10 f0aa 0002 04 0000 0000", "0011 0000 0006 01 10 f0aa 0002"),
+        ("0012 0000 0006 01 03 f0aa 0002", "0012 0000 0007 01 03 04 0000 0000"),
+        (
+            "0013 0000 0017 01 10 f0be 0008 10 0000 0001 0000 0000 0000 0020 007f ffdf",
+            "0013 0000 0006 01 10 f0be 0008",
+        ),
+        (
+            "0014 0000 0006 01 03 f0be 0008",
+            "0014 0000 0013 01 03 10 0000 0001 0000 0000 0000 0020 007f ffdf",
+        ),
+        ("0015 0000 000b 01 10 f0a0 0002 04 0000 0001", "0015 0000 0006 01 10 f0a0 0002"),
+        ("0016 0000 0006 01 03 f0a0 0002", "0016 0000 0007 01 03 04 0000 0001"),
+        ("0017 0000 0009 01 10 07d5 0001 02 0001", "0017 0000 0006 01 10 07d5 0001"),  # DIO5 high
+        ("0018 0000 0006 01 03 0b22 0002", "0018 0000 0007 01 03 04 0000 0020"),
+        ("0019 0000 0006 01 03 0af0 0002", "0019 0000 0007 01 03 04 007f ffff"),
+        ("001a 0000 0006 01 03 0af0 0002", "001a 0000 0007 01 03 04 007f ffff"),  # glance
+        ("001b 0000 0006 01 03 0af0 0002", "001b 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+    )
+    with Scripted(*exchanges) as server:
+        settings = SwitchSettings(port=server.address, line=5, watchdog=3)
+        switch = T7Switch.connect("fan", settings, VirtualClock())
+        switch.set(1.0)
+        assert switch.glance() == {"fan_state": 1.0}
+        switch.close()
     assert len(server.received) == len(exchanges)
 
 
@@ -411,3 +550,312 @@ def test_a_failure_in_the_instrument_is_passed_on(bench):
         with pytest.raises(DeviceError, match=r"exception 4.*reading register 7000"):
             sensor.measure()
         sensor.close()
+
+
+# A ratiometric sensor
+
+
+def test_a_ratiometric_position(bench):
+    sensor = bench.sensor(
+        readout="ratiometric", channels=(6, 4), stroke=0.05, zero_position=0.02, position_limits=(-0.02, 0.03)
+    )
+    for supply in (4.6, 5.0, 5.4):
+        for share in (0.15, 0.42, 0.9 - 1e-3):
+            bench.volts[6], bench.volts[4] = share * supply, supply
+            expected = 0.05 * (share - 0.1) / 0.8 - 0.02
+            assert sensor.measure()["psd_position"] == pytest.approx(expected, abs=2e-5)
+            assert sensor.glance()["psd_position"] == pytest.approx(expected, abs=2e-5)
+
+
+def test_the_mean_of_a_ratiometric_sensor_is_the_ratio_of_the_means(bench):
+    sensor = bench.sensor(**RATIOMETRIC, samples=2)
+    outputs, supplies = iter([1.0, 3.0]), iter([4.6, 5.4])
+    bench.t7._sources |= {2: lambda: next(outputs), 3: lambda: next(supplies)}
+    assert sensor.measure()["psd_position"] == pytest.approx(0.035 * (2.0 / 5.0 - 0.1) / 0.8, abs=1e-5)
+
+
+@pytest.mark.parametrize("supply", [0.0, 0.2, 4.49, 5.51, 9.0])
+def test_a_supply_out_of_its_range_is_named(bench, supply):
+    sensor = bench.sensor(**RATIOMETRIC)
+    bench.volts[2], bench.volts[3] = supply / 2, supply
+    message = rf"psd: supply voltage of the sensor is {supply:.3g}\d* V at AIN3, expected 4.5 to 5.5 V; .* failed"
+    for take in (sensor.measure, sensor.glance):
+        with pytest.raises(DeviceError, match=message if supply else "supply voltage .* at AIN3"):
+            take()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.0999, 0.1, 0.9, 0.9001, 0.95, 1.0])
+def test_an_output_out_of_its_window_is_named(bench, share):
+    sensor = bench.sensor(**RATIOMETRIC)
+    bench.volts[2], bench.volts[3] = 5.0 * share, 5.0
+    for take in (sensor.measure, sensor.glance):
+        with pytest.raises(DeviceError, match=r"psd: output of the sensor at AIN2 is \S+ % .* magnet .* wire"):
+            take()
+
+
+def test_requests_of_a_ratiometric_sensor(bench):
+    bench.volts[2], bench.volts[3] = 2.0, 5.0
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        sensor = T7PositionSensor.connect("psd", Settings(port=server.address, **RATIOMETRIC), bench.clock)
+        recorded.requests.clear()
+        sensor.glance()
+        assert recorded.requests == [("read", 4, 4)]
+        recorded.requests.clear()
+        sensor.measure()
+        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
+        sensor.close()
+
+
+# A switch
+
+
+def test_requests_of_a_switch(bench):
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
+        recorded.requests.clear()
+        switch.glance()
+        assert recorded.requests == [("read", 2800, 2)]
+        recorded.requests.clear()
+        switch.measure()
+        assert recorded.requests == [("read", 2850, 2), ("read", 2800, 2)]
+        recorded.requests.clear()
+        switch.set(1.0)
+        assert recorded.requests == [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2)]
+        switch.close()
+
+
+@pytest.mark.parametrize("active_high", [True, False])
+def test_connect_puts_the_line_under_the_watchdog(bench, active_high):
+    bench.switch(line=5, active_high=active_high, watchdog=7)
+    assert bench.guarded() == 1 << 5
+    assert int(bench.t7.read_value(61632)) >> 5 & 1 == (not active_high)
+    assert int(bench.t7.read_value(61634)) >> 5 & 1
+    assert bench.t7.read_value(61604) == 7
+    assert bench.t7.read_value(61610) == 0
+
+
+def test_connect_keeps_what_else_is_under_the_watchdog(bench):
+    kept = {61604: 30, 61630: 1, 61632: 0b0110, 61634: 0b0011, 61636: ALL_LINES & ~0b0111, 61640: 1, 61642: 0.5}
+    for address, value in (kept | {61600: 1}).items():
+        bench.t7.write_value(address, value)
+    bench.switch(line=5, watchdog=60)
+    assert bench.t7.read_value(61600) == 1
+    assert bench.guarded() == 0b10_0111
+    for address, value in (kept | {61634: 0b10_0011, 61636: ALL_LINES & ~0b10_0111}).items():
+        assert bench.t7.read_value(address) == value
+
+
+def test_what_a_watchdog_that_is_off_was_set_to_is_not_taken_over(bench):
+    for address, value in ((61604, 1), (61630, 1), (61636, 0)):
+        bench.t7.write_value(address, value)
+    bench.switch(line=5, watchdog=60)
+    assert bench.guarded() == 1 << 5
+    assert bench.t7.read_value(61604) == 60
+
+
+def test_a_watchdog_that_is_set_up_already_is_not_written(bench):
+    bench.switch().set(1.0)  # as after a host that died
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
+        assert [address for kind, address, _ in recorded.requests if kind == "write"] == [2005]
+        switch.close()
+
+
+def test_a_strict_watchdog_is_refused(bench):
+    for address, value in ((61604, 10), (61610, 1), (61612, 77), (61600, 1)):
+        bench.t7.write_value(address, value)
+    with pytest.raises(DeviceError, match=r"fan: the watchdog .* strict mode.*WATCHDOG_ENABLE_DEFAULT"):
+        bench.switch()
+    assert bench.t7.read_value(61600) == bench.t7.read_value(61610) == 1
+
+
+def test_a_setting_of_the_watchdog_that_is_not_taken_leaves_it_running_for_others(bench):
+    bench.switch(line=1, watchdog=30)
+
+    def alter(address: int, words: list[int]) -> list[int]:
+        return [0, 0, 0, 0, 0, 0, 0, 0] if address == 61630 and bench.t7.read_value(61600) == 0 else words
+
+    with (
+        ModbusTcpServer(Altered(bench.t7, alter)) as server,
+        pytest.raises(DeviceError, match="fan: WATCHDOG_DIO_ENABLE_DEFAULT reads back 0 after 1"),
+    ):
+        T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
+    assert bench.guarded() & 0b10
+    assert bench.t7.deadline() < math.inf
+
+
+def test_closing_the_last_switch_that_is_off_disables_the_watchdog(bench):
+    fan, pump = bench.switch(line=5), bench.switch(line=6)
+    fan.close()
+    assert bench.guarded() == 1 << 6
+    pump.close()
+    assert bench.t7.read_value(61600) == 0
+    assert bench.guarded() == 0
+    bench.clock.sleep(100.0)
+    bench.t7.world.advance()
+    assert not bench.t7.dio_level(5)
+    assert not bench.t7.dio_level(6)
+
+
+def test_closing_a_switch_keeps_the_watchdog_of_an_analog_output(bench):
+    for address, value in ((61604, 4), (61640, 1), (61642, 0.0), (61600, 1)):
+        bench.t7.write_value(address, value)
+    bench.t7.write_value(1000, 3.0)
+    bench.switch(line=5, watchdog=60).close()
+    bench.clock.sleep(4.0)
+    bench.t7.world.advance()
+    assert bench.t7.dac_volts(0) == 0.0
+
+
+def test_closing_a_switch_that_is_on_keeps_the_watchdog(bench):
+    switch = bench.switch(watchdog=4)
+    switch.set(1.0)
+    switch.close()
+    switch.close()
+    assert bench.t7.dio_level(5)
+    bench.clock.sleep(4.0)
+    bench.t7.world.advance()
+    assert not bench.t7.dio_level(5)
+
+
+def test_the_message_of_the_watchdog_has_its_time(bench):
+    switch = bench.switch(watchdog=60)
+    bench.switch(line=6, watchdog=4)
+    switch.set(1.0)
+    bench.clock.sleep(4.0)
+    with pytest.raises(DeviceError, match=r"fan: DIO5 is off .* nobody talked to it for 4 s"):
+        switch.glance()
+
+
+@pytest.mark.parametrize(("active_high", "stuck"), [(True, ALL_LINES), (False, 0)])
+def test_a_line_that_does_not_go_off_is_told(bench, active_high, stuck):
+    def alter(address: int, words: list[int]) -> list[int]:
+        return [stuck >> 16, stuck & 0xFFFF] if address == 2800 else words
+
+    with ModbusTcpServer(Altered(bench.t7, alter)) as server:
+        settings = SwitchSettings(port=server.address, line=5, active_high=active_high)
+        with pytest.raises(DeviceError, match="fan: DIO5 is on right after it was switched off; check the wiring"):
+            T7Switch.connect("fan", settings, bench.clock)
+
+
+def test_a_line_that_does_not_go_on_is_told(bench):
+    def alter(address: int, words: list[int]) -> list[int]:
+        return [words[0], words[1] & ~(1 << 5)] if address == 2800 else words
+
+    with ModbusTcpServer(Altered(bench.t7, alter)) as server:
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
+        with pytest.raises(DeviceError, match="fan: DIO5 is off right after it was switched on; check the wiring"):
+            switch.set(1.0)
+        switch.close()
+
+
+def test_a_line_that_became_an_input_is_told(bench):
+    switch = bench.switch()
+    switch.set(1.0)
+    bench.t7.read_value(2005)
+    with pytest.raises(DeviceError, match="fan: DIO5 is an input and drives nothing"):
+        switch.measure()
+    switch.safe()
+    assert switch.measure() == {"fan_state": 0.0}
+    assert not bench.t7.dio_level(5)
+
+
+def test_an_inhibited_line_is_switched_all_the_same(bench):
+    bench.t7.write_value(2900, ALL_LINES)
+    switch = bench.switch()
+    switch.set(1.0)
+    assert bench.t7.dio_level(5)
+    switch.safe()
+    assert not bench.t7.dio_level(5)
+
+
+def test_safe_of_a_switch_that_cannot_be_reached_raises(bench):
+    switch = bench.switch(watchdog=3)
+    switch.set(1.0)
+    bench.server.close()
+    with pytest.raises(DeviceConnectionError, match="fan: "):
+        switch.safe()
+    switch.close()
+    bench.clock.sleep(3.0)
+    bench.t7.world.advance()
+    assert not bench.t7.dio_level(5)
+
+
+def test_a_wrong_device_is_not_switched(bench):
+    with (
+        ModbusTcpServer(Altered(bench.t7, lambda _, words: words[::-1])) as server,
+        pytest.raises(DeviceConnectionError, match="swapped order"),
+    ):
+        T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
+    assert bench.t7.read_value(2850) == 0
+
+
+def test_an_output_that_is_not_guarded_stays(bench):
+    t7 = LabJackT7("fan", bench.server.address, 1.0)
+    output = DigitalOutput("fan", t7, 9, active_high=True)
+    output.switch(True)
+    bench.clock.sleep(1e4)
+    assert output.is_on
+    before = bench.t7.read_registers(61630, 8)
+    output.unguard()
+    assert bench.t7.read_value(61600) == 0
+    assert bench.t7.read_registers(61630, 8) == before
+    t7.close()
+
+
+# A sensor and a switch on one instrument
+
+
+def test_a_sensor_and_a_switch_at_once(bench):
+    bench.volts[2], bench.volts[3] = 2.5, 5.0
+    sensor, switch = bench.sensor(**RATIOMETRIC), bench.switch()
+    readings: list[float] = []
+    states: list[tuple[float, float]] = []
+
+    def look() -> None:
+        readings.extend(sensor.glance()["psd_position"] for _ in range(100))
+
+    def toggle() -> None:
+        for step in range(100):
+            switch.set(float(step % 2))
+            states.append((switch.glance()["fan_state"], float(step % 2)))
+
+    threads = [threading.Thread(target=task) for task in (look, toggle)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    np.testing.assert_allclose(readings, [0.0175] * 100, atol=2e-5)
+    assert len(states) == 100
+    assert all(state == wanted for state, wanted in states)
+    assert bench.t7.dio_level(5)
+    assert sensor.measure()["psd_position"] == pytest.approx(0.0175, abs=1e-5)
+
+
+def test_reading_the_sensor_feeds_the_watchdog_of_the_switch(bench):
+    bench.volts[2], bench.volts[3] = 2.5, 5.0
+    sensor, switch = bench.sensor(**RATIOMETRIC), bench.switch(watchdog=2)
+    switch.set(1.0)
+    for _ in range(10):
+        bench.clock.sleep(1.9)
+        sensor.glance()
+    assert switch.glance() == {"fan_state": 1.0}
+    bench.clock.sleep(2.0)
+    sensor.glance()
+    with pytest.raises(DeviceError, match="watchdog"):
+        switch.glance()
+
+
+def test_connecting_either_leaves_the_other_as_it_is(bench):
+    bench.volts[2], bench.volts[3] = 2.5, 5.0
+    switch = bench.switch()
+    switch.set(1.0)
+    sensor = bench.sensor(**RATIOMETRIC)
+    assert switch.measure() == {"fan_state": 1.0}
+    bench.switch(line=6)
+    assert sensor.measure()["psd_position"] == pytest.approx(0.0175, abs=1e-5)
+    sensor.close()
+    assert switch.measure() == {"fan_state": 1.0}

@@ -21,8 +21,10 @@ from sim_devices.instruments.labjack_t7 import (
     CONVERSIONS,
     RAIL,
     EmulatedPositionSensor,
+    EmulatedSwitch,
     EmulatedT7,
     NormalisedPSD,
+    RatiometricSensor,
     TwoCurrentPSD,
 )
 from sim_devices.wire.modbus_tcp import (
@@ -184,11 +186,30 @@ def test_digital_lines(t7):
     assert t7.dio_level(3)
     t7.write_value(2003, 0)
     assert not t7.dio_level(3)
-    assert t7.read_value(2003) == 0
+    assert t7.read_value(2800) == 0x7FFFFF & ~0b1000
     assert t7.read_value(2850) == 0b1000
     t7.write_value(2900, 0b1000)
     t7.write_value(2800, 0b1010)
-    assert t7.read_value(2800) == 0b0010
+    assert not t7.dio_level(3)
+    t7.write_value(2850, 0b0010)
+    assert t7.read_value(2850) == 0b1010
+    assert t7.read_value(2800) == 0x7FFFFF & ~0b1000
+
+
+def test_a_line_that_is_no_output_is_pulled_high(t7):
+    assert t7.read_value(2800) == 0x7FFFFF
+    t7.write_value(2800, 0)  # does not configure the direction
+    assert t7.read_value(2800) == 0x7FFFFF
+    t7.write_value(2850, 0b0100)
+    assert t7.read_value(2800) == 0x7FFFFF & ~0b0100
+
+
+def test_reading_a_single_line_makes_it_an_input(t7):
+    t7.write_value(2003, 0)
+    assert not t7.dio_level(3)
+    assert t7.read_value(2003) == 1
+    assert t7.read_value(2850) == 0
+    assert t7.dio_level(3)
 
 
 # The converter
@@ -420,6 +441,62 @@ def test_two_current_psd():
     deflection = 0.0
     psd.light = 0.25
     assert psd.first() + psd.second() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("position", "shown"),
+    [
+        (0.0, 0.0),
+        (1.981e-3, 2e-3),
+        (2.019e-3, 2e-3),
+        (2.021e-3, 2.04e-3),
+        (0.035, 0.035),
+        (-1e-3, 0.0),
+        (-1.0, 0.0),
+        (0.036, 0.035),
+        (1.0, 0.035),
+    ],
+)
+def test_ratiometric_sensor_without_noise(position, shown):
+    sensor = RatiometricSensor(lambda: position, noise=0.0, supply_error=0.0, rng=np.random.default_rng(2))
+    for volts in (5.0, 4.0):
+        assert sensor.supply() == volts
+        assert sensor.output() == pytest.approx(volts * (0.1 + 0.8 * shown / 0.035), abs=1e-9)
+        sensor.supply_volts = 4.0
+
+
+def test_noise_of_a_ratiometric_sensor():
+    sensor = RatiometricSensor(lambda: 0.0102, rng=np.random.default_rng(5))
+    shares = np.array([sensor.output() for _ in range(4000)]) / sensor.supply()
+    shown = 0.035 * (shares - 0.1) / 0.8
+    assert np.max(np.abs(shown - 0.04e-3 * np.round(shown / 0.04e-3))) < 1e-12
+    # On a step, noise of a quarter of it shows as the next step in 4.55 % of the conversions.
+    assert np.mean(np.abs(shown - 0.0102) > 1e-6) == pytest.approx(0.0455, abs=0.012)
+
+
+def test_supplies_of_ratiometric_sensors_differ_and_stay():
+    streams = np.random.default_rng(6).spawn(400)
+    sensors = [RatiometricSensor(lambda: 0.0, rng=stream) for stream in streams]
+    supplies = [sensor.supply() for sensor in sensors]
+    assert np.std(supplies) == pytest.approx(20e-3, rel=0.12)
+    assert np.mean(supplies) == pytest.approx(5.0, abs=4e-3)
+    assert supplies == [sensor.supply() for sensor in sensors]
+
+
+def test_emulated_switch_keeps_what_else_is_under_the_watchdog(t7):
+    arm(t7)
+    switch = EmulatedSwitch("fan", t7, line=5, watchdog=60)
+    switch.set(1.0)
+    t7.write_value(1000, 4.0)
+    t7.write_value(2000, 1)
+    t7.write_value(2001, 1)
+    assert t7.read_value(61604) == 2
+    t7.world.clock.sleep(2.0)
+    t7.world.advance()
+    assert t7.dac_volts(0) == 0.5
+    assert not t7.dio_level(0)
+    assert not t7.dio_level(5)
+    assert t7.dio_level(1)
 
 
 def test_emulated_sensor_refuses_a_wrong_number_of_channels(t7):

@@ -1,0 +1,281 @@
+"""What every switch promises, run against the emulated device and the driver on its wire."""
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from bench.clock import VirtualClock
+from bench.devices import Switch, role_of
+from bench.errors import DeviceError, LimitError
+from drivers.labjack_t7 import T7Switch
+from sim_devices.instruments.labjack_t7 import EmulatedSwitch, EmulatedT7
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.world import World
+
+WATCHDOG = 5
+
+
+class Lamp:
+    """A plant that the switch does not move."""
+
+    def advance(self, dt: float) -> None:
+        pass
+
+
+class RecordingT7(EmulatedT7):
+    """An instrument that keeps what was asked of it."""
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        self.requests.append(("read", address, count))
+        return super().read_registers(address, count)
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        self.requests.append(("write", address, values))
+        super().write_registers(address, values)
+
+
+@dataclass
+class Laboratory:
+    """Makes switches on the lines of one instrument."""
+
+    kind: str
+    active_high: bool
+    stack: ExitStack
+    clock: VirtualClock = field(default_factory=VirtualClock)
+    server: ModbusTcpServer | None = None
+
+    def __post_init__(self) -> None:
+        self.t7 = RecordingT7(World(Lamp(), self.clock), {}, rng=np.random.default_rng(4))
+        self.t7.requests = []
+        if self.kind == "wire":
+            self.server = self.stack.enter_context(ModbusTcpServer(self.t7))
+
+    def connect(self, line: int, watchdog: int = WATCHDOG, name: str = "fan") -> Switch:
+        said = {"line": line, "active_high": self.active_high, "watchdog": watchdog}
+        if self.server is None:
+            switch: Switch = EmulatedSwitch(name, self.t7, **said)
+        else:
+            switch = T7Switch.connect(name, T7Switch.Settings(port=self.server.address, **said), self.clock)
+        self.stack.callback(switch.close)
+        return switch
+
+    def on(self, line: int) -> bool:
+        """Whether a line is on, without a request that would feed the watchdog."""
+        return self.t7.dio_level(line) == self.active_high
+
+    def silence(self, seconds: float) -> None:
+        self.clock.sleep(seconds)
+        self.t7.world.advance()
+
+
+@pytest.fixture(params=["emulated", "wire"])
+def kind(request) -> str:
+    return request.param
+
+
+@pytest.fixture(params=[True, False], ids=["active high", "active low"])
+def lab(kind, request) -> Iterator[Laboratory]:
+    with ExitStack() as stack:
+        yield Laboratory(kind, request.param, stack)
+
+
+@pytest.fixture
+def fan(lab) -> Switch:
+    return lab.connect(3)
+
+
+def test_plays_the_role(fan):
+    assert role_of(type(fan)) == "switch"
+    assert fan.name == "fan"
+    assert fan.parent is None
+
+
+def test_says_who_it_is(fan):
+    assert str(fan.identity) == "LabJack T7, serial number 470012345, firmware 1.0300"
+
+
+def test_signals_readings_and_units_agree(fan, lab):
+    assert [(signal.name, signal.unit) for signal in fan.signals] == [("fan_state", "1")]
+    assert list(fan.measure()) == list(fan.glance()) == ["fan_state"]
+    readings, keys = fan.read(), fan.describe()
+    assert list(readings) == list(keys) == ["fan_state"]
+    assert keys["fan_state"]["units"] == "1"
+    assert keys["fan_state"]["source"] == "T7:470012345:fan_state"
+    assert readings["fan_state"]["timestamp"] == lab.clock.timestamp()
+    assert (fan.setpoint_signal.name, fan.setpoint_signal.unit) == ("fan_setpoint", "1")
+    assert (fan.limits.low, fan.limits.high) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("line", [0, 7, 22])
+def test_off_at_first(lab, line):
+    fan = lab.connect(line)
+    assert not lab.on(line)
+    assert math.isnan(fan.setpoint)
+    assert fan.measure() == fan.glance() == {"fan_state": 0.0}
+
+
+def test_off_after_another_program_left_it_on(lab):
+    lab.t7.write_value(2003, lab.active_high)
+    fan = lab.connect(3)
+    assert not lab.on(3)
+    assert fan.measure() == {"fan_state": 0.0}
+
+
+def test_switches_on_and_off(fan, lab):
+    for value in (1.0, 0.0, 1.0, 1, True, 0):
+        status = fan.set(value)
+        status.wait()
+        assert status.success
+        assert lab.on(3) == bool(value)
+        assert fan.setpoint == value
+        assert fan.measure() == fan.glance() == {"fan_state": float(value)}
+        assert fan.read()["fan_state"]["value"] == float(value)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.5, 1.0 + 1e-9, 2.0, math.nan, math.inf])
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_other_set_points_are_refused_and_nothing_is_sent(fan, lab, before, value):
+    fan.set(before)
+    lab.t7.requests.clear()
+    for call in (fan.set, fan.check):
+        with pytest.raises(LimitError, match=r"fan: set-point .* is neither 0 \(off\) nor 1 \(on\)"):
+            call(value)
+    assert lab.t7.requests == []
+    assert fan.setpoint == before
+    assert lab.on(3) == bool(before)
+
+
+def test_a_good_set_point_is_sent(fan, lab):
+    lab.t7.requests.clear()
+    fan.set(1.0)
+    assert ("write", 2003, [int(lab.active_high)]) in lab.t7.requests
+
+
+def test_stop_keeps_the_state(fan, lab):
+    fan.set(1.0)
+    fan.stop()
+    fan.stop(success=False)
+    assert lab.on(3)
+    assert fan.measure() == {"fan_state": 1.0}
+
+
+def bring_on(lab: Laboratory, fan: Switch) -> None:
+    fan.set(1.0)
+
+
+def bring_off(lab: Laboratory, fan: Switch) -> None:
+    fan.set(0.0)
+
+
+def run_out(lab: Laboratory, fan: Switch) -> None:
+    fan.set(1.0)
+    lab.silence(2 * WATCHDOG)
+
+
+def make_an_input(lab: Laboratory, fan: Switch) -> None:
+    fan.set(1.0)
+    lab.t7.write_value(2850, 0)
+
+
+def switch_on_from_elsewhere(lab: Laboratory, fan: Switch) -> None:
+    lab.t7.write_value(2003, lab.active_high)
+
+
+@pytest.mark.parametrize("bring", [None, bring_on, bring_off, run_out, make_an_input, switch_on_from_elsewhere])
+def test_safe_is_off_from_any_state(fan, lab, bring):
+    if bring is not None:
+        bring(lab, fan)
+    for _ in range(2):
+        fan.safe()
+        assert not lab.on(3)
+        assert int(lab.t7.read_value(2850)) >> 3 & 1
+        assert fan.setpoint == 0.0
+        assert fan.measure() == {"fan_state": 0.0}
+    fan.set(1.0)
+    assert lab.on(3)
+
+
+@pytest.mark.parametrize("take", ["measure", "glance", "read"])
+def test_the_watchdog_switches_off_and_is_told_once(fan, lab, take):
+    fan.set(1.0)
+    lab.silence(WATCHDOG - 0.001)
+    assert lab.on(3)
+    lab.silence(0.001)
+    assert not lab.on(3)
+    with pytest.raises(DeviceError, match=r"fan: DIO3 is off although it was switched on: the watchdog"):
+        getattr(fan, take)()
+    assert fan.setpoint == 0.0
+    assert fan.measure() == {"fan_state": 0.0}
+    fan.set(1.0)
+    assert lab.on(3)
+    assert fan.measure() == {"fan_state": 1.0}
+
+
+def test_the_watchdog_of_a_switch_that_is_off_is_not_told(fan, lab):
+    fan.set(1.0)
+    fan.set(0.0)
+    lab.silence(10 * WATCHDOG)
+    assert fan.measure() == {"fan_state": 0.0}
+
+
+def test_looking_at_it_keeps_it_on(fan, lab):
+    fan.set(1.0)
+    for _ in range(50):
+        lab.silence(0.9 * WATCHDOG)
+        assert fan.glance() == {"fan_state": 1.0}
+    assert lab.on(3)
+
+
+def test_closed_while_on_it_is_left_to_the_watchdog(fan, lab):
+    fan.set(1.0)
+    fan.close()
+    lab.silence(WATCHDOG - 0.001)
+    assert lab.on(3)
+    lab.silence(0.001)
+    assert not lab.on(3)
+
+
+def test_switches_of_one_instrument_share_its_watchdog(lab):
+    fan, pump = lab.connect(3), lab.connect(12, watchdog=3, name="pump")
+    lab.t7.write_value(2005, lab.active_high)
+    fan.set(1.0)
+    pump.set(1.0)
+    assert lab.on(3)
+    assert lab.on(12)
+    pump.safe()
+    assert lab.on(3)
+    pump.set(1.0)
+    lab.silence(3)
+    assert not lab.on(3)
+    assert not lab.on(12)
+    assert lab.on(5)  # is not under it
+    for switch in (fan, pump):
+        with pytest.raises(DeviceError, match="watchdog"):
+            switch.glance()
+
+
+def test_a_later_switch_does_not_lengthen_the_time_of_an_earlier_one(lab):
+    fan = lab.connect(3, watchdog=3)
+    lab.connect(12, watchdog=60, name="pump")
+    fan.set(1.0)
+    lab.silence(3)
+    assert not lab.on(3)
+
+
+def test_a_switch_alone_sets_its_own_time(lab):
+    lab.connect(3, watchdog=2).close()
+    fan = lab.connect(3, watchdog=60)
+    fan.set(1.0)
+    lab.silence(59)
+    assert lab.on(3)
+
+
+def test_bluesky_finds_its_protocols(fan):
+    protocols = pytest.importorskip("bluesky.protocols")
+    assert isinstance(fan, protocols.Readable)
+    assert isinstance(fan, protocols.Movable)
+    assert isinstance(fan, protocols.Stoppable)
