@@ -1,0 +1,386 @@
+"""Compiled inner loops of the hybrid cantilever plant.
+
+The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
+a microsecond and a fast loop asks for the deflection twenty thousand times a second. The constants below
+name the places in these arrays. Temperatures here are rises above the mean room temperature, in K;
+everything else is in SI units, and a positive current heats the beam.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# Nodes of the thermal chain, each joined to the next: insulated end and front of the block, back and
+# actuator face of the TEC, then the elements of the beam from its base to its tip.
+BLOCK_END, BLOCK_FRONT, BACK, FACE, BEAM = range(5)
+BEAM_NODES = 10
+NODES = BEAM + BEAM_NODES
+
+# Rows of the node table: heat capacity (J/K), conductance to the next node, conductance to air, further
+# conductance to air at 1 K above it, which grows with the fourth root (W/K), share in the bending of the tip.
+CAPACITY, LINK, AIR, EXCESS, WEIGHT = range(5)
+NODE_ROWS = 5
+
+# Rows of the factorised matrix of a step: inverse pivots, what elimination adds of the row before, and what
+# substitution adds of the node behind.
+PIVOT, FORWARD, BACKWARD = range(3)
+FACTOR_ROWS = 3
+
+# Slow state beside the node temperatures: fluctuation of the room, room and current of the step under way,
+# current for which the matrix was factorised, heat that the regulator's integral asks for (W).
+FLUCTUATION, ROOM, CURRENT, FACTORED, INTEGRAL = range(5)
+STATE_SIZE = 5
+
+# Command: regulated (1) or driven (0), current (A), target rise (K), current limit (A), step of the room (K).
+CLOSED, COMMAND, TARGET, LIMIT, ROOM_STEP = range(5)
+COMMAND_SIZE = 5
+
+# Coefficients, prepared once from the parameters.
+(
+    STEP,
+    KELVIN,
+    SEEBECK,
+    RESISTANCE,
+    ROOM_DECAY,
+    ROOM_KICK,
+    LOOP_PROPORTIONAL,
+    LOOP_INTEGRAL,
+    MAXIMUM_CURRENT,
+    STRAIGHT,
+    SENSITIVITY,
+    QUADRATIC,
+    CUBIC,
+    WARM_GAIN,
+) = range(14)
+COEFFICIENT_SIZE = 14
+
+# Fast state: voltage, hysteretic part (m), quasi-static piezo deflection that goes into the modes (m), then
+# each mode's distance from its steady value when the voltage last changed (m), the resonance's as cosine
+# and sine parts.
+VOLTAGE, LAG, DRIVE, COSINE, SINE, FIRST_REAL = range(6)
+REAL_MODES = 4
+FAST_SIZE = FIRST_REAL + REAL_MODES
+
+# Constants of the fast part: of the hysteresis, then steady gain, damping rate, angular frequency and gains
+# of the resonance, then rate and gain of each real mode.
+(
+    GAIN,
+    VOLTAGE_QUADRATIC,
+    LAG_GAIN,
+    LAG_WITH,
+    LAG_AGAINST,
+    STEADY,
+    DAMPING,
+    FREQUENCY,
+    COSINE_GAIN,
+    SINE_GAIN,
+    FIRST_RATE,
+) = range(11)
+FIRST_GAIN = FIRST_RATE + REAL_MODES
+FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
+
+Floats = NDArray[np.float64]
+
+
+@njit(cache=True)
+def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bool:
+    """Set room temperature and current for the step that begins here.
+
+    Parameters
+    ----------
+    rise : ndarray
+        Node temperatures, K.
+    state : ndarray
+        State, changed in place.
+    command : ndarray
+        What amplifier and room were told.
+    c : ndarray
+        Coefficients.
+
+    Returns
+    -------
+    bool
+        Whether the regulator wants more than the current can do.
+    """
+    state[ROOM] = state[FLUCTUATION] + command[ROOM_STEP]
+    if command[CLOSED] == 0.0:
+        state[CURRENT] = command[COMMAND]
+        return False
+    heat = c[LOOP_PROPORTIONAL] * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
+    pumped = c[SEEBECK] * (c[KELVIN] + rise[FACE])
+    square = pumped * pumped + 2.0 * c[RESISTANCE] * heat
+    # Of the two currents that give this heat the smaller; below the strongest cooling there is none.
+    wanted = 2.0 * heat / (pumped + math.sqrt(max(square, 0.0)))
+    limit = min(command[LIMIT], c[MAXIMUM_CURRENT])
+    state[CURRENT] = min(max(wanted, -limit), limit)
+    saturated: bool = square < 0.0 or abs(wanted) > limit
+    return saturated
+
+
+@njit(cache=True)
+def factorise(current: float, c: Floats, nodes: Floats, factors: Floats) -> None:
+    """Factorise the matrix of a step, which is tridiagonal and depends on the current alone.
+
+    Parameters
+    ----------
+    current : float
+        Current, A.
+    c, nodes : ndarray
+        Coefficients and node table.
+    factors : ndarray
+        `FACTOR_ROWS` rows, overwritten.
+    """
+    half = 0.5 * c[SEEBECK] * current
+    before = 0.0
+    for j in range(NODES):
+        after = 0.5 * nodes[LINK, j]
+        diagonal = nodes[CAPACITY, j] / c[STEP] + 0.5 * nodes[AIR, j] + before + after
+        if j == BACK:
+            diagonal += half
+        elif j == FACE:
+            diagonal -= half
+        factors[FORWARD, j] = 0.0
+        if j > 0:
+            factors[FORWARD, j] = before * factors[PIVOT, j - 1]
+            diagonal -= before * factors[FORWARD, j]
+        factors[PIVOT, j] = 1.0 / diagonal
+        factors[BACKWARD, j] = after / diagonal
+        before = after
+
+
+@njit(cache=True)
+def look_ahead(
+    rise: Floats, increment: Floats, state: Floats, command: Floats, c: Floats, nodes: Floats, factors: Floats
+) -> None:
+    """Find the change of the temperatures over the step that begins here.
+
+    The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
+    balance to rounding. What convection has beyond that changes over seconds and is taken at the middle of
+    the step, extrapolated from the step before.
+
+    Parameters
+    ----------
+    rise : ndarray
+        Node temperatures, K.
+    increment : ndarray
+        On entry the change over the step before, on return that over this one, K.
+    state, command, c, nodes, factors : ndarray
+        See the functions above; `state` and `factors` are changed in place.
+    """
+    saturated = take_commands(rise, state, command, c)
+    if command[CLOSED] != 0.0:
+        error = command[TARGET] - rise[FACE]
+        # A saturated loop integrates only what leads out of saturation.
+        if not saturated or error * state[CURRENT] < 0.0:
+            state[INTEGRAL] += c[LOOP_INTEGRAL] * error
+    current = state[CURRENT]
+    room = state[ROOM]
+    if current != state[FACTORED]:
+        factorise(current, c, nodes, factors)
+        state[FACTORED] = current
+
+    for j in range(BEAM, NODES):
+        excess = rise[j] + 0.5 * increment[j] - room
+        increment[j] = -nodes[EXCESS, j] * math.sqrt(math.sqrt(abs(excess))) * excess
+    joule = 0.5 * c[RESISTANCE] * current * current
+    pumped = c[SEEBECK] * current
+    for j in range(BEAM):
+        increment[j] = 0.0
+    increment[BACK] = joule - pumped * (c[KELVIN] + rise[BACK])
+    increment[FACE] = joule + pumped * (c[KELVIN] + rise[FACE])
+
+    # Heat into each node, and forward elimination on the way.
+    inflow = 0.0
+    eliminated = 0.0
+    for j in range(NODES):
+        outflow = 0.0
+        if j + 1 < NODES:
+            outflow = nodes[LINK, j] * (rise[j] - rise[j + 1])
+        heat = increment[j] + inflow - outflow - nodes[AIR, j] * (rise[j] - room)
+        eliminated = heat + factors[FORWARD, j] * eliminated
+        increment[j] = factors[PIVOT, j] * eliminated
+        inflow = outflow
+    after = 0.0
+    for j in range(NODES - 1, -1, -1):
+        after = increment[j] + factors[BACKWARD, j] * after
+        increment[j] = after
+
+
+@njit(cache=True)
+def advance_steps(
+    normals: Floats,
+    ahead: bool,
+    rise: Floats,
+    increment: Floats,
+    state: Floats,
+    command: Floats,
+    c: Floats,
+    nodes: Floats,
+    factors: Floats,
+) -> None:
+    """Complete one grid step for each of `normals`.
+
+    Parameters
+    ----------
+    normals : ndarray
+        Standard normal numbers, one a step, for the room.
+    ahead : bool
+        Whether the first step's change is already known.
+    rise, increment, state, command, c, nodes, factors : ndarray
+        See `look_ahead`; the first three and `factors` are changed in place.
+    """
+    for row in range(normals.size):
+        if not ahead:
+            look_ahead(rise, increment, state, command, c, nodes, factors)
+        ahead = False
+        for j in range(NODES):
+            rise[j] += increment[j]
+        state[FLUCTUATION] = c[ROOM_DECAY] * state[FLUCTUATION] + c[ROOM_KICK] * normals[row]
+    take_commands(rise, state, command, c)
+
+
+@njit(cache=True)
+def bending(fraction: float, rise: Floats, increment: Floats, c: Floats, nodes: Floats) -> tuple[float, float]:
+    """Add up the bending of the beam.
+
+    Parameters
+    ----------
+    fraction : float
+        How much of the step under way has gone by, in [0, 1].
+    rise, increment, c, nodes : ndarray
+        See `look_ahead`.
+
+    Returns
+    -------
+    tuple of float
+        Thermal deflection of the tip, m, and the factor of the piezo deflection. Either is the local value
+        weighted by the distance to the tip.
+    """
+    bent = 0.0
+    warm = 0.0
+    for j in range(BEAM, NODES):
+        d = rise[j] + fraction * increment[j] + c[STRAIGHT]
+        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c[QUADRATIC] + d * c[CUBIC]))
+        warm += nodes[WEIGHT, j] * d
+    return c[SENSITIVITY] * bent, 1.0 + c[WARM_GAIN] * warm
+
+
+@njit(cache=True)
+def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats, nodes: Floats) -> float:
+    """Add up the heat that all nodes give to the air.
+
+    Parameters
+    ----------
+    fraction, rise, increment, state, nodes
+        See `bending` and `look_ahead`.
+
+    Returns
+    -------
+    float
+        Heat flow, W.
+    """
+    total = 0.0
+    for j in range(NODES):
+        excess = rise[j] + fraction * increment[j] - state[ROOM]
+        total += (nodes[AIR, j] + nodes[EXCESS, j] * math.sqrt(math.sqrt(abs(excess)))) * excess
+    return total
+
+
+@njit(cache=True)
+def piezo_deflection(elapsed: float, fast: Floats, f: Floats) -> float:
+    """Evaluate the piezo deflection some time after the last change of the voltage.
+
+    Parameters
+    ----------
+    elapsed : float
+        Time since then, s.
+    fast, f : ndarray
+        State and constants of the fast part.
+
+    Returns
+    -------
+    float
+        Deflection of the tip at the temperature of the straight beam, m.
+    """
+    phase = f[FREQUENCY] * elapsed
+    swing = math.exp(-f[DAMPING] * elapsed)
+    total: float = f[STEADY] * fast[DRIVE]
+    total += swing * (fast[COSINE] * math.cos(phase) + fast[SINE] * math.sin(phase))
+    for m in range(REAL_MODES):
+        total += math.exp(-f[FIRST_RATE + m] * elapsed) * fast[FIRST_REAL + m]
+    return total
+
+
+@njit(cache=True)
+def hysteresis(lag: float, change: float, f: Floats) -> float:
+    """Move the Bouc-Wen part over a change of the voltage: the exact solution of its equation.
+
+    Seen along the motion, ``g = sign(change) h`` obeys ``dg/dv = a - b g - c |g|``, which is linear on
+    either side of zero; it crosses zero at most once, upwards.
+
+    Parameters
+    ----------
+    lag : float
+        Hysteretic part before, m.
+    change : float
+        Change of the voltage, V.
+    f : ndarray
+        Constants of the fast part.
+
+    Returns
+    -------
+    float
+        Hysteretic part afterwards, m.
+    """
+    sign = math.copysign(1.0, change)
+    way = abs(change)
+    g = sign * lag
+    if g < 0.0:
+        level = f[LAG_GAIN] / f[LAG_AGAINST]
+        crossing = math.log1p(-g / level) / f[LAG_AGAINST]
+        if way <= crossing:
+            before: float = sign * (level + (g - level) * math.exp(-f[LAG_AGAINST] * way))
+            return before
+        way -= crossing
+        g = 0.0
+    level = f[LAG_GAIN] / f[LAG_WITH]
+    after: float = sign * (level + (g - level) * math.exp(-f[LAG_WITH] * way))
+    return after
+
+
+@njit(cache=True)
+def apply_voltage(voltage: float, elapsed: float, fast: Floats, f: Floats) -> None:
+    """Change the voltage.
+
+    Parameters
+    ----------
+    voltage : float
+        New voltage, V.
+    elapsed : float
+        Time since the last change, s.
+    fast : ndarray
+        State of the fast part, changed in place.
+    f : ndarray
+        Constants of the fast part.
+    """
+    lag = hysteresis(fast[LAG], voltage - fast[VOLTAGE], f)
+    drive = f[GAIN] * voltage - lag + f[VOLTAGE_QUADRATIC] * voltage * voltage
+    step = drive - fast[DRIVE]
+    phase = f[FREQUENCY] * elapsed
+    swing = math.exp(-f[DAMPING] * elapsed)
+    sine, cosine = swing * math.sin(phase), swing * math.cos(phase)
+    # What is C cos + S sin of the time since the last change, seen from now.
+    fast[COSINE], fast[SINE] = (
+        fast[COSINE] * cosine + fast[SINE] * sine - f[COSINE_GAIN] * step,
+        fast[SINE] * cosine - fast[COSINE] * sine - f[SINE_GAIN] * step,
+    )
+    for m in range(REAL_MODES):
+        remaining = math.exp(-f[FIRST_RATE + m] * elapsed) * fast[FIRST_REAL + m]
+        fast[FIRST_REAL + m] = remaining - f[FIRST_GAIN + m] * step
+    fast[VOLTAGE] = voltage
+    fast[LAG] = lag
+    fast[DRIVE] = drive
