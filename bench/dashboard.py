@@ -21,15 +21,19 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
     estimated disturbance. Each has a band of two standard deviations of that estimate. nan while no controller
     is at work.
 `/loop/data/path`, `/loop/data/now`
-    Output against input: the line from each point to the next, and the last point.
+    Output against input: the line from each point to the next, and the last point. Further loops of the rig are
+    `/loops/0`, `/loops/1` ...
 `/plane/data/memory`, `/plane/data/input`, `/plane/density`
     The Preisach plane: the memory curve at each point, the input on the diagonal, the model's density.
+`/planes/NAME/density`
+    A density over another input, on a plane of its own, which has no memory curve: the second stage of a two-stage
+    model is `H2`, and so on after Zhang and Yip 2017.
 `/state/phase`, `/state/run`
     Where the protocol stands: changes only.
 `/events`, `/card`
     What happened, and the run card.
 
-The points of loop and plane are the readings of the steps and, while a controller is at work, the ticks. Every
+The points of loops and plane are the readings of the steps and, while a controller is at work, the ticks. Every
 tick moves the memory, but a point is drawn only if it is `_REDRAW_SECONDS` after the last and can be told from
 it with the eye; the line to it leads through what was left out.
 """
@@ -57,9 +61,9 @@ from rerun.experimental import ViewerClient
 from bench.clock import WallClock
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve, Preisach
+from bench.hysteresis import MemoryCurve, Operator, Preisach, Summed, TwoStage
 from bench.journal import Event, Record, StepRecord
-from bench.model_file import parse_model
+from bench.model_file import FORMAT, is_coupled_model, parse_coupled_model, parse_model
 from bench.protocol import TRACES
 from bench.runs import run_card
 
@@ -87,6 +91,11 @@ _WIDTH = 1.15
 _REDRAW_SECONDS = 0.1
 _VISIBLE = 0.002
 """Part of an axis that the eye can tell; a controller at its target moves by less."""
+
+_LOOPS_IN_A_ROW = 3
+
+_ARGUMENT_STAGES = ("H2", "H5")
+"""Stages whose input is the force less what the voltage makes of it, which no signal measures."""
 
 _CLOSE = 0.01
 """Part of the output's range that the close view of the error shows to either side of none."""
@@ -169,13 +178,31 @@ _QUANTITIES = {
 
 
 @dataclass(frozen=True)
+class LoopLayout:
+    """What a loop shows.
+
+    Attributes
+    ----------
+    input, output : str
+        Names of the signals on the horizontal and the vertical axis.
+    input_range, output_range : tuple of float
+        Ranges of the axes, in the units of the signals.
+    """
+
+    input: str
+    output: str
+    input_range: tuple[float, float]
+    output_range: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class DashboardLayout:
-    """What the loop and the plane of a dashboard show; the `[dashboard]` table of a rig file.
+    """What the loops and the plane of a dashboard show; the `[dashboard]` table of a rig file.
 
     Attributes
     ----------
     title : str
-        What the loop is, for its headline.
+        What the loop is, for its headline; of several, each is named after its signals.
     input, output : str
         Names of the signals on the horizontal and the vertical axis of the loop; the input also drives
         the memory curve.
@@ -185,11 +212,15 @@ class DashboardLayout:
         Range of the Preisach plane, in the unit of the input.
     levels : int
         Number of intervals of the plane's lattice.
+    loops : tuple of LoopLayout
+        Further loops; the tables that a journal has of them become such.
 
     Raises
     ------
     ConfigurationError
         If a range is empty or there is no interval.
+    TypeError
+        If the table of a further loop lacks a key, or has an unknown one.
     """
 
     title: str
@@ -199,14 +230,25 @@ class DashboardLayout:
     output_range: tuple[float, float]
     plane: tuple[float, float]
     levels: int
+    loops: tuple[LoopLayout, ...] = ()
 
     def __post_init__(self) -> None:
-        for key in ("input_range", "output_range", "plane"):
-            low, high = getattr(self, key)
+        loops = tuple(loop if isinstance(loop, LoopLayout) else LoopLayout(**loop) for loop in self.loops)
+        object.__setattr__(self, "loops", loops)
+        ranges = {"plane": self.plane}
+        for prefix, loop in self.all_loops.items():
+            ranges |= {f"{prefix}input_range": loop.input_range, f"{prefix}output_range": loop.output_range}
+        for key, (low, high) in ranges.items():
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ConfigurationError(f"dashboard: {key}: expected low < high, got {low} and {high}")
         if self.levels < 1:
             raise ConfigurationError(f"dashboard: levels: expected at least 1, got {self.levels}")
+
+    @property
+    def all_loops(self) -> dict[str, LoopLayout]:
+        """The first loop and the further ones, by what their keys begin with."""
+        first = LoopLayout(self.input, self.output, self.input_range, self.output_range)
+        return {"": first} | {f"loops.{i}.": loop for i, loop in enumerate(self.loops)}
 
 
 class Dashboard:
@@ -219,7 +261,7 @@ class Dashboard:
     signals : sequence of Signal
         What is measured, in the order in which values will be handed over.
     layout : DashboardLayout or None
-        What the loop and the plane show; None for a rig that has neither.
+        What the loops and the plane show; None for a rig that has neither.
     run_id : str
         Identifier of the run; live view and file carry it.
     title : str
@@ -393,7 +435,8 @@ def rebuild(record: Record, path: Path) -> None:
     try:
         table = meta.get("dashboard")
         layout = DashboardLayout(title=meta["rig_title"], **table) if table else None
-        writer = _Writer(record.signals, layout, meta.get("controls", ""), str(meta["run"]))
+        models = list(_densities(record))
+        writer = _Writer(record.signals, layout, meta.get("controls", ""), str(meta["run"]), models)
         card, title = run_card(meta), f"{meta['rig_title']}: {meta['protocol']}"
         properties = {key: meta[key] for key in ("rig", "protocol", "seed")}
     except (ConfigurationError, KeyError, TypeError) as error:
@@ -403,7 +446,7 @@ def rebuild(record: Record, path: Path) -> None:
         entries = _entries(record)
         for start in range(0, len(entries), _CHUNK_ROWS):
             writer.write(entries[start : start + _CHUNK_ROWS])
-        writer.write([_Model(name, *density) for name, density in _densities(record)])
+        writer.write(models)
         if "status" in meta:
             writer.write([_End(str(meta["status"]), str(meta.get("reason", "")))])
     finally:
@@ -476,9 +519,14 @@ def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, i
 
 @dataclass(frozen=True)
 class _Model:
+    """A density, as `Dashboard.model` takes it; `stage` of a coupled model, `input_unit` if it is known."""
+
     name: str
     density: Floats
     grid: Floats
+    stage: str = ""
+    input_unit: str = ""
+    output_unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -494,14 +542,23 @@ _Entry = _Tick | StepRecord | Event | _Model | _End
 class _Writer:
     """Turns what happened into Rerun's columns; used by one thread at a time."""
 
-    def __init__(self, signals: Sequence[Signal], layout: DashboardLayout | None, controls: str, run_id: str) -> None:
+    def __init__(
+        self,
+        signals: Sequence[Signal],
+        layout: DashboardLayout | None,
+        controls: str,
+        run_id: str,
+        models: Sequence[_Model] = (),
+    ) -> None:
         self._signals = tuple(signals)
         self._layout = layout
-        self._axes: tuple[int, int] | None = None
-        ranges = {}
-        if layout is not None:
-            self._axes = _column(signals, "input", layout.input), _column(signals, "output", layout.output)
-            ranges = {layout.input: layout.input_range, layout.output: layout.output_range}
+        self._loops = [] if layout is None else _Loop.all_of(layout, signals)
+        ranges: dict[str, tuple[float, float]] = {}
+        for loop in self._loops:
+            ranges.setdefault(loop.layout.input, loop.layout.input_range)
+            ranges.setdefault(loop.layout.output, loop.layout.output_range)
+        # Planes beside that of the first input, for which the models that are known from the start ask.
+        self._planes = {path: model for model in models if (path := self._plane_of(model)) != "plane"}
         self._control = _Control.of(signals, controls, ranges.get(controls)) if controls else None
         self._groups = _group_by_unit(self._signals, ranges, _TRACE_NAMES if controls else ())
         self._run_id = run_id
@@ -509,8 +566,6 @@ class _Writer:
         self._live: rr.RecordingStream | None = None
         self._unseen = 0
         self._memory: MemoryCurve | None = None
-        self._path: list[tuple[float, float]] = []
-        self._drawn = -math.inf
         self._states: dict[str, str] = {}
         self._phases: list[str] = []
         self._step = 0
@@ -547,11 +602,18 @@ class _Writer:
             for name, style in self._control.styles().items():
                 self._log(f"control/{name}", style)
         self._log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
-        if self._layout is not None and self._axes is not None:
-            x, y = (self._signals[column] for column in self._axes)
-            self._draw_frame("loop", _Frame.of_loop(self._layout, x, y))
-            self._draw_frame("plane", _Frame.of_plane(self._layout, x))
-            self._draw_plane(self._layout)
+        for loop in self._loops:
+            self._draw_frame(loop.path, _Frame.of_loop(loop.layout, self._signals[loop.x], self._signals[loop.y]))
+            self._log(f"{loop.path}/data/path", _line_style(1.25))
+            self._log(f"{loop.path}/data/now", _point_style())
+        if self._layout is not None:
+            low, high = self._layout.plane
+            self._draw_plane("plane", _Frame.of_plane((low, high), self._signals[self._loops[0].x].unit))
+            inner = np.linspace(low, high, self._layout.levels + 1)[1:-1]
+            lattice = [[(low, value), (value, value), (value, high)] for value in inner]
+            self._log("plane/data/lattice", _lines(lattice, _FAINT, 0.5, -15.0))
+            self._log("plane/data/memory", _line_style(1.75, _MARKER))
+            self._log("plane/data/input", _point_style())
 
     def write(self, entries: Sequence[_Entry]) -> None:
         """Write entries in the order in which they happened."""
@@ -636,56 +698,43 @@ class _Writer:
         self._scalars("readings", times, np.array([step.values for step in steps], dtype=np.float64))
 
     def _points(self, entries: Iterable[_Entry]) -> Iterator[_Point]:
-        """Yield where loop and memory curve go: to each reading and, under control, to each tick."""
-        if self._axes is None:
-            return
-        x, y = self._axes
+        """Yield where loops and memory curve go: to each reading and, under control, to each tick."""
         for entry in entries:
             if isinstance(entry, StepRecord):
-                yield _Point(entry.finished, entry.step, entry.values[x], entry.values[y], True)
+                yield _Point(entry.finished, entry.step, entry.values, True)
             elif isinstance(entry, tuple) and self._control is not None and self._control.is_at_work(entry[2]):
-                yield _Point(entry[0], entry[1], entry[2][x], entry[2][y], False)
+                yield _Point(entry[0], entry[1], entry[2], False)
 
     def _draw_points(self, points: Iterable[_Point]) -> None:
         if self._layout is None:
             return
-        paths, colours, drawn, memories, inputs = [], [], [], [], []
+        first = self._loops[0]
+        drawn: list[list[tuple[_Point, _Line]]] = [[] for _ in self._loops]
+        memories = []
         for point in points:
-            here = x, y = point.x, point.y
-            if not math.isfinite(x):
+            x = point.values[first.x]
+            if math.isfinite(x):
+                self._memory = self._memory.step(x) if self._memory else MemoryCurve.from_negative_saturation(x)
+            for loop, lines in zip(self._loops, drawn, strict=True):
+                line = loop.line_to(point)
+                if line is None:
+                    continue
+                lines.append((point, line))
+                if loop is first and self._memory is not None:
+                    memories.append(self._memory.corners(*self._layout.plane))
+        for loop, shown in zip(self._loops, drawn, strict=True):
+            if not shown:
                 continue
-            self._memory = self._memory.step(x) if self._memory else MemoryCurve.from_negative_saturation(x)
-            if not math.isfinite(y):
-                continue
-            self._path = self._path or [here]
-            if not (point.is_reading or self._is_visible(here)):
-                continue
-            self._path.append(here)
-            if not point.is_reading and point.t - self._drawn < _REDRAW_SECONDS:
-                continue
-            paths.append(self._path)
-            colours.append(_RISING if x >= self._path[0][0] else _FALLING)
-            memories.append(self._memory.corners(*self._layout.plane))
-            inputs.append(memories[-1][-1])
-            drawn.append(point)
-            self._path, self._drawn = [here], point.t
-        if not drawn:
-            return
-        times = _times([point.t for point in drawn], [point.step for point in drawn])
-        send = self._send
-        send("loop/data/path", times, rr.LineStrips2D.columns(strips=paths, colors=colours))
-        send("loop/data/now", times, rr.Points2D.columns(positions=[path[-1] for path in paths]))
-        send("plane/data/memory", times, rr.LineStrips2D.columns(strips=memories))
-        send("plane/data/input", times, rr.Points2D.columns(positions=inputs))
-
-    def _is_visible(self, point: tuple[float, float]) -> bool:
-        """Return whether a point can be told from the one that was drawn last."""
-        assert self._layout is not None
-        ranges = self._layout.plane, self._layout.output_range
-        return any(
-            abs(new - old) > _VISIBLE * (high - low)
-            for new, old, (low, high) in zip(point, self._path[0], ranges, strict=True)
-        )
+            times = _times([point.t for point, _ in shown], [point.step for point, _ in shown])
+            strips = [line for _, line in shown]
+            colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
+            self._send(f"{loop.path}/data/path", times, rr.LineStrips2D.columns(strips=strips, colors=colours))
+            ends = [line[-1] for line in strips]
+            self._send(f"{loop.path}/data/now", times, rr.Points2D.columns(positions=ends))
+            if loop is first:
+                self._send("plane/data/memory", times, rr.LineStrips2D.columns(strips=memories))
+                inputs = [memory[-1] for memory in memories]
+                self._send("plane/data/input", times, rr.Points2D.columns(positions=inputs))
 
     def _write_events(self, events: Sequence[tuple[int, Event]]) -> None:
         if not events:
@@ -752,48 +801,53 @@ class _Writer:
         matrix = np.diag([frame.x(1.0) - frame.x(0.0), frame.y(1.0) - frame.y(0.0), 1.0])
         self._log(f"{path}/data", rr.Transform3D(mat3x3=matrix, translation=[frame.x(0.0), frame.y(0.0), 0.0]))
 
-    def _draw_plane(self, layout: DashboardLayout) -> None:
-        low, high = layout.plane
-        inner = np.linspace(low, high, layout.levels + 1)[1:-1]
-        lattice = [[(low, value), (value, value), (value, high)] for value in inner]
+    def _draw_plane(self, path: str, frame: _Frame) -> None:
+        """Draw axes and triangle of a Preisach plane."""
+        self._draw_frame(path, frame)
+        low, high = frame.x_range
         triangle = [(low, low), (high, high), (low, high), (low, low)]
-        self._log("plane/data/lattice", _lines(lattice, _FAINT, 0.5, -15.0))
-        self._log("plane/data/triangle", _lines([triangle], _INK, 1.0, 10.0))
-        self._log("plane/data/memory", _line_style(1.75, _MARKER))
-        self._log("plane/data/input", _point_style())
-        self._log("loop/data/path", _line_style(1.25))
-        self._log("loop/data/now", _point_style())
+        self._log(f"{path}/data/triangle", _lines([triangle], _INK, 1.0, 10.0))
+
+    def _plane_of(self, model: _Model) -> str:
+        """Return the path of the plane on which a density is drawn."""
+        unit = self._signals[self._loops[0].x].unit if self._loops else ""
+        if model.stage not in _ARGUMENT_STAGES and model.input_unit in ("", unit):
+            return "plane"
+        return f"planes/{rr.escape_entity_path_part(model.stage or model.name)}"
 
     def _draw_model(self, model: _Model) -> None:
-        if self._layout is None or self._axes is None:
+        if self._layout is None:
             return
-        x, y = (self._signals[column] for column in self._axes)
-        frame = _Frame.of_plane(self._layout, x)
-        low, high, cells = model.grid[0], model.grid[-1], len(model.grid) - 1
+        x, y = self._signals[self._loops[0].x], self._signals[self._loops[0].y]
+        path, x_unit, y_unit = self._plane_of(model), model.input_unit or x.unit, model.output_unit or y.unit
+        low, high, cells = float(model.grid[0]), float(model.grid[-1]), len(model.grid) - 1
+        if path == "plane":
+            frame = _Frame.of_plane(self._layout.plane, x.unit)
+        else:
+            frame = _Frame.of_plane((low, high), x_unit)
+            self._draw_plane(path, frame)
         # Several pixels a cell, for the diagonal and for intervals of unequal length.
         pixels = cells * max(8, 256 // cells)
         middles = low + (np.arange(pixels) + 0.5) * (high - low) / pixels
         cell = np.clip(np.searchsorted(model.grid, middles, side="right") - 1, 0, cells - 1)
         density = np.where(middles[:, None] >= middles, model.density[np.ix_(cell, cell)], np.nan)
         greatest = float(np.nanmax(np.abs(density))) or 1.0
-        self._draw_image("plane/density", _coloured(density / greatest)[::-1], frame, (low, high), (low, high))
+        self._draw_image(f"{path}/density", _coloured(density / greatest)[::-1], frame, (low, high), (low, high))
         # The legend stands in the corner below the diagonal, where there is no plane.
         least = -greatest if np.nanmin(density) < 0 else 0.0
         ramp = np.linspace(least / greatest, 1.0, 128)[None, :].repeat(8, axis=0)
-        low, high = self._layout.plane
+        low, high = frame.x_range
         left, right, bottom, top = low + np.array([0.62, 0.92, 0.06, 0.1]) * (high - low)
-        self._draw_image("plane/legend/bar", _coloured(ramp), frame, (left, right), (bottom, top))
-        unit = f"{_in_brackets(y.unit)}/{_in_brackets(x.unit)}²"
+        self._draw_image(f"{path}/legend/bar", _coloured(ramp), frame, (left, right), (bottom, top))
+        title = " ".join(("density", model.stage)).strip()
+        factor, y_unit = _prefixed(y_unit, (least, greatest))
+        unit = f"{_in_brackets(y_unit)}/{_in_brackets(x_unit)}²"
         middle, above = frame.x((left + right) / 2), frame.y(top)
+        ends = [(frame.x(left), above - 0.09), (frame.x(right), above - 0.09)]
+        self._log(f"{path}/legend/ends", _texts(ends, [f"{factor * value:.3g}" for value in (least, greatest)]))
         self._log(
-            "plane/legend/ends",
-            _texts(
-                [(frame.x(left), above - 0.09), (frame.x(right), above - 0.09)], [f"{least:.3g}", f"{greatest:.3g}"]
-            ),
-        )
-        self._log(
-            "plane/legend/title",
-            _texts([(middle, above - 0.23), (middle, above - 0.16)], [model.name, f"density [{unit}]"]),
+            f"{path}/legend/title",
+            _texts([(middle, above - 0.23), (middle, above - 0.16)], [model.name, f"{title} [{unit}]"]),
         )
 
     def _draw_image(
@@ -816,7 +870,7 @@ class _Writer:
         ]
         left = rrb.Vertical(*series, row_shares=[group.height for group in self._groups])
         if self._control is not None:
-            driven = [self._axes is not None and self._axes[0] in group.columns for group in self._groups]
+            driven = [bool(self._loops) and self._loops[0].x in group.columns for group in self._groups]
             others = rrb.Tabs(*series, active_tab=driven.index(True) if any(driven) else 0)
             left = rrb.Vertical(*self._control.views(), others, row_shares=[5, 4, 4, 4])
         state = rrb.StateTimelineView(origin="/state", name="Protocol", time_view=whole_run)
@@ -831,39 +885,41 @@ class _Writer:
         card = rrb.TextDocumentView(origin="/card", name="Run card")
         below = rrb.Vertical(state, rrb.Horizontal(log, card, column_shares=[3, 2]), row_shares=[3, 5])
         right: rrb.Container = below
-        if self._layout is not None:
-            past = [
-                rrb.VisibleTimeRange(
-                    timeline,
-                    start=rrb.TimeRangeBoundary.infinite(),
-                    end=rrb.TimeRangeBoundary.cursor_relative(),
-                )
-                for timeline in ("t", "step")
-            ]
-            bounds = rrb.VisualBounds2D(x_range=(-0.2, _WIDTH + 0.08), y_range=(-1.16, 0.2))
-            views = [
-                rrb.Spatial2DView(
-                    origin="/loop",
-                    name=self._layout.title,
-                    visual_bounds=bounds,
-                    background=_BACKGROUND,
-                    overrides={"/loop/data/path": rrb.VisibleTimeRanges(past)},
-                ),
-                rrb.Spatial2DView(
-                    origin="/plane", name="Preisach plane", visual_bounds=bounds, background=_BACKGROUND
-                ),
-            ]
-            right = rrb.Vertical(rrb.Horizontal(*views), below, row_shares=[8, 7])
+        loops, planes = self._loop_views(), self._plane_views()
+        if len(loops) == 1:
+            right = rrb.Vertical(rrb.Horizontal(*loops, *planes), below, row_shares=[8, 7])
+        elif loops:
+            right = rrb.Vertical(
+                rrb.Grid(*loops, grid_columns=min(len(loops), _LOOPS_IN_A_ROW)),
+                rrb.Horizontal(*planes, rrb.Tabs(log, card, active_tab=0)),
+                state,
+                row_shares=[5 * math.ceil(len(loops) / _LOOPS_IN_A_ROW), 5, 2],
+            )
         return rrb.Blueprint(
-            rrb.Horizontal(
-                left,
-                right,
-                column_shares=[2, 3],
-            ),
+            rrb.Horizontal(left, right, column_shares=[2, 3] if len(loops) + len(planes) <= 2 else [1, 2]),
             rrb.BlueprintPanel(state="hidden"),
             rrb.SelectionPanel(state="hidden"),
             rrb.TimePanel(state="collapsed", timeline="t", play_state="following"),
         )
+
+    def _loop_views(self) -> list[rrb.Spatial2DView]:
+        names = [f"{loop.layout.output} over {loop.layout.input}" for loop in self._loops]
+        if self._layout is not None and len(names) == 1:
+            names = [self._layout.title]
+        return [
+            _drawing(loop.path, name, f"/{loop.path}/data/path")
+            for loop, name in zip(self._loops, names, strict=True)
+        ]
+
+    def _plane_views(self) -> list[rrb.Spatial2DView | rrb.Tabs]:
+        if self._layout is None:
+            return []
+        views = [
+            _drawing(path, f"Preisach plane of {model.stage or model.name}")
+            for path, model in sorted(self._planes.items())
+        ]
+        others = [rrb.Tabs(*views, active_tab=0)] if len(views) > 1 else views
+        return [_drawing("plane", "Preisach plane"), *others]
 
 
 @dataclass(frozen=True)
@@ -879,13 +935,70 @@ class _Group:
 
 
 class _Point(NamedTuple):
-    """A point of the loop: a reading that was waited for, or a tick under control."""
+    """A point of the loops: a reading that was waited for, or a tick under control."""
 
     t: float
     step: int
-    x: float
-    y: float
+    values: Sequence[float]
     is_reading: bool
+
+
+_Line = list[tuple[float, float]]
+
+
+class _Loop:
+    """A loop: where it is drawn, and the line since the point that was drawn last.
+
+    Parameters
+    ----------
+    path : str
+        Entity below which it is drawn.
+    layout : LoopLayout
+        Its axes.
+    x, y : int
+        Columns of its signals.
+    extent : tuple of float
+        Range of the input of which a small part is still seen.
+    """
+
+    def __init__(self, path: str, layout: LoopLayout, x: int, y: int, extent: tuple[float, float]) -> None:
+        self.path, self.layout, self.x, self.y = path, layout, x, y
+        self._extents = extent, layout.output_range
+        self._line: _Line = []
+        self._drawn = -math.inf
+
+    @classmethod
+    def all_of(cls, layout: DashboardLayout, signals: Sequence[Signal]) -> list[_Loop]:
+        """Return the loops of a layout, the first one first."""
+        loops = []
+        for prefix, loop in layout.all_loops.items():
+            x = _column(signals, f"{prefix}input", loop.input)
+            y = _column(signals, f"{prefix}output", loop.output)
+            # What moves the first loop moves the memory curve, too.
+            extent = loop.input_range if prefix else layout.plane
+            loops.append(cls(prefix.replace(".", "/").strip("/") or "loop", loop, x, y, extent))
+        return loops
+
+    def line_to(self, point: _Point) -> _Line | None:
+        """Return the line that leads to a point from the one that was drawn last; None if it is not drawn yet."""
+        here = x, y = point.values[self.x], point.values[self.y]
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return None
+        self._line = self._line or [here]
+        if not (point.is_reading or self._is_visible(here)):
+            return None
+        self._line.append(here)
+        if not point.is_reading and point.t - self._drawn < _REDRAW_SECONDS:
+            return None
+        line, self._line, self._drawn = self._line, [here], point.t
+        return line
+
+    def _is_visible(self, point: tuple[float, float]) -> bool:
+        """Return whether a point can be told from the one that was drawn last."""
+        return any(
+            abs(new - old) > _VISIBLE * (high - low)
+            for new, old, (low, high) in zip(point, self._line[0], self._extents, strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -969,16 +1082,16 @@ class _Frame:
     y_factor: float
 
     @classmethod
-    def of_loop(cls, layout: DashboardLayout, x: Signal, y: Signal) -> _Frame:
+    def of_loop(cls, layout: LoopLayout, x: Signal, y: Signal) -> _Frame:
         x_factor, x_unit = _prefixed(x.unit, layout.input_range)
         y_factor, y_unit = _prefixed(y.unit, layout.output_range)
         titles = f"{x.description} [{x_unit}]", f"{y.description} [{y_unit}]"
         return cls(layout.input_range, layout.output_range, *titles, x_factor, y_factor)
 
     @classmethod
-    def of_plane(cls, layout: DashboardLayout, x: Signal) -> _Frame:
-        factor, unit = _prefixed(x.unit, layout.plane)
-        return cls(layout.plane, layout.plane, f"β [{unit}]", f"α [{unit}]", factor, factor)
+    def of_plane(cls, extent: tuple[float, float], unit: str) -> _Frame:
+        factor, shown = _prefixed(unit, extent)
+        return cls(extent, extent, f"β [{shown}]", f"α [{shown}]", factor, factor)
 
     def x(self, value: float) -> float:
         low, high = self.x_range
@@ -1036,6 +1149,19 @@ def _plot(
     )
 
 
+def _drawing(path: str, name: str, of_the_past: str = "") -> rrb.Spatial2DView:
+    """Return the view of what `_draw_frame` frames; of the entity `of_the_past` it shows all that went before."""
+    forever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    past = [rrb.VisibleTimeRange(timeline, start=forever, end=now) for timeline in ("t", "step")]
+    return rrb.Spatial2DView(
+        origin=f"/{path}",
+        name=name,
+        visual_bounds=rrb.VisualBounds2D(x_range=(-0.2, _WIDTH + 0.08), y_range=(-1.16, 0.2)),
+        background=_BACKGROUND,
+        overrides={of_the_past: rrb.VisibleTimeRanges(past)} if of_the_past else None,
+    )
+
+
 def _whole_run() -> rrb.TimeAxis:
     forever = rrb.TimeRangeBoundary.infinite()
     return rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
@@ -1065,12 +1191,27 @@ def _entries(record: Record) -> list[_Entry]:
     return [entry for _, entry in dated]
 
 
-def _densities(record: Record) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
-    """Yield name, density and grid of the models that have a density, the newest last."""
+def _densities(record: Record) -> Iterator[_Model]:
+    """Yield the densities of the models that have one, the newest last."""
     for name, content in record.models().items():
-        operator = parse_model(content, f"{record.path}: model {name}").operator
-        if isinstance(operator, Preisach):
-            yield name, (operator.density_matrix(), operator.levels)
+        for stage, operator in _stages(content, f"{record.path}: model {name}").items():
+            if isinstance(operator, Preisach):
+                units = operator.input_unit, operator.output_unit
+                yield _Model(name, operator.density_matrix(), operator.levels, stage, *units)
+
+
+def _stages(content: object, source: str) -> dict[str, Operator[Any]]:
+    """Return the operators of a model's document by their names in a coupled model; none of an unknown document."""
+    if is_coupled_model(content):
+        model = parse_coupled_model(content, source).model
+        if isinstance(model, TwoStage):
+            return {"H1": model.first, "H2": model.second}
+        if isinstance(model, Summed):
+            return {"H3": model.by_force, "H4": model.by_voltage}
+        return {"H5": model.operator}
+    if isinstance(content, dict) and content.get("format") == FORMAT:
+        return {"": parse_model(content, source).operator}
+    return {}
 
 
 def _times(t: npt.ArrayLike, step: npt.ArrayLike) -> list[rr.TimeColumn]:

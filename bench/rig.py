@@ -27,6 +27,11 @@ A rig file is TOML::
     output = "curvature"
     ...
 
+    [[dashboard.loops]]                            # further loops beside the first
+    input = "tec_current"
+    output = "curvature"
+    ...
+
     [emulation]                                    # only in the rig file of an emulated rig
     laboratory = "sim_devices.vo2:VO2Laboratory"
     ...
@@ -45,9 +50,9 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from bench.calibration import DerivedSignal
 from bench.clock import Clock
@@ -75,22 +80,31 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
-class DashboardTable(_Table):
-    """The table `[dashboard]`: the hysteresis loop and the Preisach plane of the live view."""
+def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError("expected two numbers, the lower one first")
+    return ends
+
+
+_Range = Annotated[tuple[float, float], AfterValidator(_check_range)]
+
+
+class LoopTable(_Table):
+    """A table `[[dashboard.loops]]`: one more loop of the live view."""
+
+    input: str = Field(description="signal on the horizontal axis of the loop")
+    output: str = Field(description="signal on the vertical axis of the loop")
+    input_range: _Range = Field(description="ends of the horizontal axis")
+    output_range: _Range = Field(description="ends of the vertical axis")
+
+
+class DashboardTable(LoopTable):
+    """The table `[dashboard]`: the hysteresis loops and the Preisach plane of the live view."""
 
     input: str = Field(description="signal on the horizontal axis of the loop, and input of the plane")
-    output: str = Field(description="signal on the vertical axis of the loop")
-    input_range: tuple[float, float] = Field(description="ends of the horizontal axis")
-    output_range: tuple[float, float] = Field(description="ends of the vertical axis")
-    plane: tuple[float, float] = Field(description="ends of both axes of the Preisach plane")
+    plane: _Range = Field(description="ends of both axes of the Preisach plane")
     levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
-
-    @field_validator("input_range", "output_range", "plane")
-    @classmethod
-    def _range_is_not_empty(cls, ends: tuple[float, float]) -> tuple[float, float]:
-        if not ends[0] < ends[1]:
-            raise ValueError("expected two numbers, the lower one first")
-        return ends
+    loops: tuple[LoopTable, ...] = Field(default=(), description="further loops")
 
 
 class _RigFileContent(_Table):
@@ -314,10 +328,10 @@ class Rig:
         known = ", ".join(names)
         used = [(f"interlocks.{i}.signal", lock.signal) for i, lock in enumerate(self.file.interlocks)]
         if self.file.dashboard is not None:
-            used += [
-                ("dashboard.input", self.file.dashboard.input),
-                ("dashboard.output", self.file.dashboard.output),
-            ]
+            loops: dict[str, LoopTable] = {"dashboard": self.file.dashboard}
+            loops |= {f"dashboard.loops.{i}": loop for i, loop in enumerate(self.file.dashboard.loops)}
+            for key, loop in loops.items():
+                used += [(f"{key}.input", loop.input), (f"{key}.output", loop.output)]
         for key, signal in used:
             if signal not in names:
                 raise ConfigurationError(

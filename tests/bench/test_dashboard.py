@@ -17,12 +17,21 @@ import rerun_cli
 from rerun.chunk import RrdReader
 
 from bench.clock import Stopwatch, WallClock
-from bench.dashboard import QUEUED_TICKS, Dashboard, DashboardLayout, picture, rebuild
+from bench.dashboard import QUEUED_TICKS, Dashboard, DashboardLayout, LoopLayout, picture, rebuild
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
+from bench.hysteresis import (
+    Linear,
+    MemoryCurve,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    Summed,
+    TwoStage,
+    uniform_levels,
+)
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
-from bench.model_file import ModelFile
+from bench.model_file import CoupledFile, ModelFile
 from bench.protocol import TRACES
 
 SIGNALS = (
@@ -44,6 +53,28 @@ LAYOUT = DashboardLayout(
     plane=(30.0, 70.0),
     levels=20,
 )
+MUSCLE_SIGNALS = (
+    Signal("supply_setpoint", "V", "average voltage set-point", 3),
+    Signal("supply_voltage", "V", "average output voltage", 3),
+    Signal("supply_current", "A", "output current", 2),
+    Signal("load_cell_force", "N", "force", 3),
+    Signal("wire_end_position", "m", "position", 9),
+)
+VOLTAGE, FORCE, LENGTH = 1, 3, 4
+MUSCLE_LAYOUT = DashboardLayout(
+    title="SMA wire",
+    input="supply_voltage",
+    output="load_cell_force",
+    input_range=(-0.1, 3.2),
+    output_range=(-1.0, 13.0),
+    plane=(0.0, 3.0),
+    levels=20,
+    loops=(
+        LoopLayout("supply_voltage", "wire_end_position", (-0.1, 3.2), (-8e-3, 6e-3)),
+        LoopLayout("load_cell_force", "wire_end_position", (-1.0, 13.0), (-8e-3, 6e-3)),
+    ),
+)
+LOOPS = {"/loop": (VOLTAGE, FORCE), "/loops/0": (VOLTAGE, LENGTH), "/loops/1": (FORCE, LENGTH)}
 PROPERTIES = {"rig": "vo2", "protocol": "identify", "seed": 7}
 CONTROL_COLOURS = {"output": (255, 122, 72), "error": (255, 206, 84), "disturbance": (64, 208, 206)}
 VULKAN = Path("/usr/share/vulkan/icd.d")
@@ -147,11 +178,65 @@ def make_control_run(targets: int, ticks: int) -> Iterator[Tick | StepRecord | E
     yield Event(t, "INFO", "end", "completed")
 
 
+def make_stage(
+    ends: tuple[float, float], rise: tuple[float, float], width: float, units: tuple[str, str]
+) -> Preisach:
+    """Return an operator that rises by `rise` between `ends`, with loops of some width."""
+    levels = uniform_levels(*ends, 24)
+    middles = (levels[1:] + levels[:-1]) / 2
+    alpha, beta = np.meshgrid(middles, middles, indexing="ij")
+    density = np.exp(-((((alpha - beta) - width) / width) ** 2) - ((alpha + beta - sum(ends)) / (2 * width)) ** 2)
+    stage = Preisach(levels, density[np.tril_indices(24)], input_unit=units[0], output_unit=units[1])
+    low, high = rise
+    scale = 0.5 * (high - low) / (stage.density @ stage.cell_areas())
+    return Preisach(levels, stage.density * scale, 0.5 * (low + high), input_unit=units[0], output_unit=units[1])
+
+
+def make_wire() -> TwoStage:
+    force = make_stage((0.0, 3.0), (0.3, 10.0), 0.6, ("V", "N"))
+    return TwoStage(force, make_stage((-11.5, 11.5), (-6e-3, 5e-3), 3.0, ("N", "m")), 0.3)
+
+
+def make_plays(units: tuple[str, str]) -> PrandtlIshlinskii:
+    return PrandtlIshlinskii(
+        np.array([0.0, 1.0]),
+        np.array([1.0, 0.5]),
+        0.0,
+        0.0,
+        input_range=(-12.0, 12.0),
+        input_unit=units[0],
+        output_unit=units[1],
+    )
+
+
+def make_muscle_run() -> Iterator[Tick | StepRecord | Event]:
+    """Yield what an engine tells of a wire under one load after another, and then between fixed ends."""
+    wire, random, t, step = make_wire(), np.random.default_rng(3), 0.0, 0
+    state = wire.initial_state()
+    swing = [1.5 - 1.5 * float(np.cos(0.35 * n) * np.exp(-n / 60)) for n in range(72)]
+    for load in (1.0, 3.5, 6.0, None):
+        text = "force over voltage" if load is None else f"length over voltage at {load:g} N"
+        yield Event(t, "INFO", "phase", text)
+        state, _ = wire.step(state, 0.0, load or 0.3)
+        for voltage in swing:
+            state, length = (
+                wire.move(state, voltage, state.argument) if load is None else wire.step(state, voltage, load)
+            )
+            noisy = (state.force + 0.02 * random.normal(), length + 2e-5 * random.normal())
+            values = (voltage, voltage, 0.8 * voltage, *map(float, noisy))
+            yield t + 15.0, step, values
+            yield StepRecord(step, t, t + 30.0, "", "", True, {"supply": voltage}, values)
+            t, step = t + 30.0, step + 1
+    yield Event(t, "INFO", "end", "completed")
+
+
 def keep_journal(
     folder: Path,
     entries: list[Tick | StepRecord | Event],
     signals: tuple[Signal, ...] = SIGNALS,
     controls: str = "",
+    dashboard: dict[str, object] | None = None,
+    models: dict[str, object] | None = None,
 ) -> Path:
     meta = {
         "run": folder.name,
@@ -168,7 +253,7 @@ def keep_journal(
         "plan": {"steps": 400, "seconds": 3200.0},
         "git": "0123456789ab",
         "controls": controls,
-        "dashboard": {key: value for key, value in asdict(LAYOUT).items() if key != "title"},
+        "dashboard": dashboard or to_table(LAYOUT),
     }
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
@@ -184,10 +269,27 @@ def keep_journal(
     journal._db.execute("COMMIT")
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
-    polynomial = Polynomial(np.array([1.0, 2.0]), (20.0, 90.0), input_unit="°C", output_unit="1/m")
-    add_model(folder, "polynomial", 1.0, ModelFile("polynomial", polynomial, None).to_json())
-    add_model(folder, "preisach", 2.0, make_model().to_json())
+    if models is None:
+        polynomial = Polynomial(np.array([1.0, 2.0]), (20.0, 90.0), input_unit="°C", output_unit="1/m")
+        models = {
+            "polynomial": ModelFile("polynomial", polynomial, None).to_json(),
+            "preisach": make_model().to_json(),
+        }
+    for i, (name, model) in enumerate(models.items()):
+        add_model(folder, name, float(i), model)
     return folder
+
+
+def to_table(layout: DashboardLayout) -> dict[str, object]:
+    return {key: value for key, value in asdict(layout).items() if key != "title"}
+
+
+def keep_muscle_journal(folder: Path, models: dict[str, object], layout: DashboardLayout = MUSCLE_LAYOUT) -> Path:
+    """Return the recording made of a journal of a wire with these models."""
+    keep_journal(folder, list(make_muscle_run()), MUSCLE_SIGNALS, dashboard=to_table(layout), models=models)
+    with Record(folder) as record:
+        rebuild(record, folder / "rebuilt.rrd")
+    return folder / "rebuilt.rrd"
 
 
 def tell(dashboard: Dashboard, entries: list[Tick | StepRecord | Event]) -> None:
@@ -226,6 +328,19 @@ def read(path: Path) -> dict[str, dict[str, list[object]]]:
     return found
 
 
+def read_views(path: Path) -> dict[str, str]:
+    """Return the names of the views of an .rrd's blueprint, by what they show."""
+    reader, views = RrdReader(path), {}
+    (blueprint,) = reader.blueprints()
+    for chunk in reader.stream(store=blueprint):
+        batch = chunk.to_record_batch()
+        columns = {field.name: column for field, column in zip(batch.schema, batch.columns, strict=True)}
+        if "ViewBlueprint:display_name" in columns:
+            origin, name = (columns[f"ViewBlueprint:{key}"].to_pylist() for key in ("space_origin", "display_name"))
+            views[origin[0][0]] = name[0][0]
+    return views
+
+
 def table(columns: dict[str, list[object]], component: str) -> tuple[np.ndarray, np.ndarray, list[object]]:
     """Return times in s, step numbers and values in order of time; static rows left out."""
     order = np.argsort(np.array(columns["t"], dtype=np.int64), kind="stable")
@@ -249,6 +364,12 @@ def rebuilt(run_folder: Path) -> Path:
     with Record(run_folder) as record:
         rebuild(record, run_folder / "rebuilt.rrd")
     return run_folder / "rebuilt.rrd"
+
+
+@pytest.fixture(scope="module")
+def muscle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    models = {"two-stage": CoupledFile("two-stage", make_wire()).to_json()}
+    return keep_muscle_journal(tmp_path_factory.mktemp("runs") / "run", models)
 
 
 @pytest.fixture(scope="module")
@@ -316,6 +437,164 @@ def test_the_density_of_a_model_is_drawn(rebuilt: Path) -> None:
     found = read(rebuilt)
     assert len(found["/plane/density"]["buffer"]) == 1
     assert ["preisach", "density [(1/m)/°C²]"] in found["/plane/legend/title"]["labels"]
+
+
+def test_every_loop_follows_the_readings(muscle: Path) -> None:
+    found = read(muscle)
+    steps = [entry for entry in make_muscle_run() if isinstance(entry, StepRecord)]
+    for path, axes in LOOPS.items():
+        points = np.array([[record.values[column] for column in axes] for record in steps])
+        t, step, strips = table(found[f"{path}/data/path"], "strips")
+        np.testing.assert_allclose(t, [record.finished for record in steps], atol=1e-9)
+        np.testing.assert_array_equal(step, [record.step for record in steps])
+        segments = np.array(strips)[:, 0]
+        np.testing.assert_allclose(segments[:, 1], points, rtol=1e-6)
+        np.testing.assert_allclose(segments[1:, 0], points[:-1], rtol=1e-6)
+        now = np.array(table(found[f"{path}/data/now"], "positions")[2])[:, 0]
+        np.testing.assert_allclose(now, points, rtol=1e-6)
+    assert len(table(found["/plane/data/memory"], "strips")[0]) == len(steps)
+
+
+def test_every_loop_has_its_axes(muscle: Path) -> None:
+    found = read(muscle)
+    voltage, force, position = "average output voltage [V]", "force [N]", "position [mm]"
+    assert found["/loop/axes/titles"]["labels"] == [[voltage, force]]
+    assert found["/loops/0/axes/titles"]["labels"] == [[voltage, position]]
+    assert found["/loops/1/axes/titles"]["labels"] == [[force, position]]
+    # Voltages below, millimetres beside.
+    expected = ["0", "0.5", "1", "1.5", "2", "2.5", "3", "-7.5", "-5", "-2.5", "0", "2.5", "5"]
+    assert found["/loops/0/axes/ticks"]["labels"] == [expected]
+    # The frame of a loop is as high and wide as that of any other.
+    for path, (x, y) in LOOPS.items():
+        (matrix,), (shift,) = (found[f"{path}/data"][key][0] for key in ("mat3x3", "translation"))
+        ranges = {VOLTAGE: (-0.1, 3.2), FORCE: (-1.0, 13.0), LENGTH: (-8e-3, 6e-3)}
+        corners = np.array(list(zip(ranges[x], ranges[y], strict=True)))
+        placed = corners * (matrix[0], matrix[4]) + shift[:2]
+        np.testing.assert_allclose(placed, [(0.0, 0.0), (1.15, -1.0)], atol=1e-6)
+
+
+def test_views_are_named_after_what_they_show(muscle: Path, rebuilt: Path) -> None:
+    views = read_views(muscle)
+    assert {origin: name for origin, name in views.items() if origin.startswith(("/loop", "/plane"))} == {
+        "/loop": "load_cell_force over supply_voltage",
+        "/loops/0": "wire_end_position over supply_voltage",
+        "/loops/1": "wire_end_position over load_cell_force",
+        "/plane": "Preisach plane",
+        "/planes/H2": "Preisach plane of H2",
+    }
+    assert {"/signals/force": "Force [N]", "/events": "Log", "/card": "Run card", "/state": "Protocol"}.items() <= (
+        views.items()
+    )
+    views = read_views(rebuilt)
+    assert views["/loop"] == "VO2 microcantilever (emulated)"
+    assert views["/plane"] == "Preisach plane"
+    assert not [origin for origin in views if origin.startswith(("/loops", "/planes"))]
+
+
+def test_both_densities_of_a_two_stage_model_are_drawn(muscle: Path) -> None:
+    found = read(muscle)
+    assert found["/plane/legend/title"]["labels"] == [["two-stage", "density H1 [N/V²]"]]
+    assert found["/planes/H2/legend/title"]["labels"] == [["two-stage", "density H2 [µm/N²]"]]
+    assert found["/plane/axes/titles"]["labels"] == [["β [V]", "α [V]"]]
+    assert found["/planes/H2/axes/titles"]["labels"] == [["β [N]", "α [N]"]]
+    wire = make_wire()
+    for path, stage, factor in (("/plane", wire.first, 1.0), ("/planes/H2", wire.second, 1e6)):
+        assert len(found[f"{path}/density"]["buffer"]) == 1
+        assert found[f"{path}/legend/ends"]["labels"] == [["0", f"{factor * stage.density.max():.3g}"]]
+        (matrix,), (shift,) = (found[f"{path}/density"][key][0] for key in ("mat3x3", "translation"))
+        # 24 levels of ten pixels each fill the frame, the first row at the top.
+        np.testing.assert_allclose([240 * matrix[0], 240 * matrix[4]], [1.15, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(shift[:2], [0.0, -1.0], atol=1e-6)
+    # What the second stage remembers is no input that is measured.
+    assert "/plane/data/memory" in found
+    assert "/planes/H2/data/memory" not in found
+
+
+@pytest.mark.parametrize(
+    ("model", "planes"),
+    [
+        (TwoStage(make_plays(("V", "N")), make_wire().second), {"/planes/H2": "density H2 [µm/N²]"}),
+        (TwoStage(make_wire().first, make_plays(("N", "m"))), {"/plane": "density H1 [N/V²]"}),
+        (TwoStage(make_plays(("V", "N")), make_plays(("N", "m"))), {}),
+        (
+            Summed(make_wire().second, make_stage((0.0, 3.0), (0.0, 8e-3), 0.6, ("V", "m"))),
+            {"/planes/H3": "density H3 [µm/N²]", "/plane": "density H4 [mm/V²]"},
+        ),
+        (
+            Linear(3.0, 0.5, make_wire().second, (0.0, 3.0), voltage_unit="V"),
+            {"/planes/H5": "density H5 [µm/N²]"},
+        ),
+    ],
+)
+def test_stages_that_have_a_density_are_drawn(
+    tmp_path: Path, model: TwoStage | Summed | Linear, planes: dict[str, str]
+) -> None:
+    path = keep_muscle_journal(tmp_path / "run", {"wire": CoupledFile("wire", model).to_json()})
+    found = read(path)
+    titles = {origin: found[origin + "/legend/title"]["labels"][0][1] for origin in planes}
+    assert titles == planes
+    drawn = {entity.removesuffix("/density") for entity in found if entity.endswith("/density")}
+    assert drawn == planes.keys()
+    own = {origin for origin in planes if origin != "/plane"}
+    assert {origin for origin in read_views(path) if origin.startswith("/planes")} == own
+
+
+def test_the_force_of_a_stage_is_never_taken_for_the_measured_one(tmp_path: Path) -> None:
+    first, second = MUSCLE_LAYOUT.all_loops["loops.1."], MUSCLE_LAYOUT.all_loops[""]
+    layout = replace(MUSCLE_LAYOUT, plane=(0.0, 12.0), loops=(second,), **asdict(first))
+    path = keep_muscle_journal(tmp_path / "run", {"wire": CoupledFile("wire", make_wire()).to_json()}, layout)
+    found = read(path)
+    assert "/plane/density" not in found
+    assert found["/plane/axes/titles"]["labels"] == [["β [N]", "α [N]"]]
+    assert found["/planes/H1/axes/titles"]["labels"] == [["β [V]", "α [V]"]]
+    assert found["/planes/H2/axes/titles"]["labels"] == [["β [N]", "α [N]"]]
+    assert {"/planes/H1", "/planes/H2"} <= read_views(path).keys()
+
+
+def test_an_operator_over_another_signal_has_its_own_plane(tmp_path: Path) -> None:
+    models = {
+        "force": ModelFile("force", make_wire().first, None).to_json(),
+        "length": ModelFile("length", make_wire().second, None).to_json(),
+    }
+    path = keep_muscle_journal(tmp_path / "run", models)
+    found = read(path)
+    assert found["/plane/legend/title"]["labels"] == [["force", "density [N/V²]"]]
+    assert found["/planes/length/legend/title"]["labels"] == [["length", "density [µm/N²]"]]
+    assert read_views(path)["/planes/length"] == "Preisach plane of length"
+
+
+@pytest.mark.parametrize("document", [{"format": "bench-other-model", "version": 1}, {}, [1, 2], "text", None])
+def test_other_models_are_left_out(tmp_path: Path, document: object) -> None:
+    models = {"two-stage": CoupledFile("two-stage", make_wire()).to_json(), "other": document}
+    found = read(keep_muscle_journal(tmp_path / "run", models))
+    assert found["/plane/legend/title"]["labels"] == [["two-stage", "density H1 [N/V²]"]]
+    assert found["/planes/H2/legend/title"]["labels"] == [["two-stage", "density H2 [µm/N²]"]]
+
+
+def test_a_damaged_model_is_named(tmp_path: Path) -> None:
+    document = CoupledFile("two-stage", make_wire()).to_json()
+    with pytest.raises(DataError, match="model two-stage is damaged: key 'model' is missing"):
+        keep_muscle_journal(tmp_path / "run", {"two-stage": {k: v for k, v in document.items() if k != "model"}})
+    assert not (tmp_path / "run" / "rebuilt.rrd").exists()
+
+
+def test_a_journal_from_before_there_were_further_loops_is_rebuilt(
+    tmp_path: Path, entries: list[Tick | StepRecord | Event], rebuilt: Path
+) -> None:
+    table_of_then = {key: value for key, value in to_table(LAYOUT).items() if key != "loops"}
+    folder = keep_journal(tmp_path / "run", entries, dashboard=table_of_then)
+    with Record(folder) as record:
+        rebuild(record, folder / "again.rrd")
+    assert read(folder / "again.rrd").keys() == read(rebuilt).keys()
+
+
+@pytest.mark.parametrize("loop", [{"input": "supply_voltage"}, {**asdict(MUSCLE_LAYOUT.loops[0]), "x": 1}, None])
+def test_a_journal_with_a_damaged_loop_is_no_run(tmp_path: Path, loop: object) -> None:
+    dashboard = {**to_table(MUSCLE_LAYOUT), "loops": [loop]}
+    folder = keep_journal(tmp_path / "run", [], MUSCLE_SIGNALS, dashboard=dashboard)
+    with Record(folder) as record, pytest.raises(DataError, match="does not say what its dashboard was"):
+        rebuild(record, folder / "run.rrd")
+    assert not (folder / "run.rrd").exists()
 
 
 @pytest.mark.parametrize("controls", ["", "curvature"])
@@ -426,6 +705,36 @@ def test_a_controller_that_holds_its_target_is_not_drawn_again(tmp_path: Path) -
     assert len(table(found["/control/error"], "scalars")[0]) == 1_000
 
 
+def test_loops_are_drawn_independently_under_control(tmp_path: Path) -> None:
+    nan, values = float("nan"), (60.0, 60.0, 24.0, 1.0, 3.0, 1e-6, 900.0, 900.0, 900.0, 0.0, 1.0)
+    layout = replace(LAYOUT, loops=(LoopLayout("tec_current", "tec_voltage", (-2.0, 2.0), (-4.0, 4.0)),))
+    rows = [
+        (60.0, 900.0, 1.0, 3.0),
+        (60.0, 1000.0, 1.0, 3.0),  # moves the first loop
+        (60.0, 1000.0, 1.05, 3.0),  # moves the second one
+        (65.0, nan, 1.05, 3.5),  # leaves a gap in the first
+        (65.0, 1000.0, 1.051, 3.501),  # cannot be told from the last in the second
+    ]
+    path = tmp_path / "run.rrd"
+    with make_dashboard(path, layout=layout, signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
+        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", True, {}, values))
+        for i, (temperature, curvature, current, voltage) in enumerate(rows[1:], 1):
+            row = (60.0, temperature, 24.0, current, voltage, 1e-6, curvature, *values[7:])
+            dashboard.telemetry(8.0 + i, 1, row)
+    assert dashboard.dropped == 0
+    found = read(path)
+    expected = {"/loop": ([0, 1, 4], [0, 1]), "/loops/0": ([0, 2, 3], [2, 3])}
+    for loop, (drawn, columns) in expected.items():
+        t, _, strips = table(found[f"{loop}/data/path"], "strips")
+        np.testing.assert_allclose(t, [8.0 + i for i in drawn])
+        np.testing.assert_allclose(
+            [strip[0][-1] for strip in strips], [[rows[i][column] for column in columns] for i in drawn], rtol=1e-6
+        )
+    # A reading that is not a number moves the memory all the same.
+    curves = [np.array(curve[0]) for curve in table(found["/plane/data/memory"], "strips")[2]]
+    assert [curve[-1, 0] for curve in curves] == [60.0, 60.0, 65.0]
+
+
 def test_a_step_run_has_nothing_of_control(rebuilt: Path) -> None:
     assert not [path for path in read(rebuilt) if path.startswith("/control")]
 
@@ -479,9 +788,26 @@ def test_a_layout_must_name_signals_that_there_are(tmp_path: Path, change: dict[
     assert not (tmp_path / "run.rrd").exists()
 
 
-@pytest.mark.parametrize("change", [{"plane": (70.0, 30.0)}, {"input_range": (0.0, float("nan"))}, {"levels": 0}])
-def test_a_layout_must_be_possible(change: dict[str, object]) -> None:
-    with pytest.raises(ConfigurationError, match="dashboard: "):
+@pytest.mark.parametrize("end", ["input", "output"])
+def test_further_loops_must_name_signals_that_there_are(tmp_path: Path, end: str) -> None:
+    loops = (*MUSCLE_LAYOUT.loops[:1], replace(MUSCLE_LAYOUT.loops[1], **{end: "x"}))
+    with pytest.raises(ConfigurationError, match=rf"dashboard: loops\.1\.{end}: there is no signal 'x'; there are: "):
+        make_dashboard(tmp_path / "run.rrd", layout=replace(MUSCLE_LAYOUT, loops=loops), signals=MUSCLE_SIGNALS)
+    assert not (tmp_path / "run.rrd").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"plane": (70.0, 30.0)}, "plane"),
+        ({"input_range": (0.0, float("nan"))}, "input_range"),
+        ({"levels": 0}, "levels"),
+        ({"loops": (LoopLayout("a", "b", (1.0, 1.0), (0.0, 1.0)),)}, r"loops\.0\.input_range"),
+        ({"loops": (LoopLayout("a", "b", (0.0, 1.0), (0.0, float("inf"))),)}, r"loops\.0\.output_range"),
+    ],
+)
+def test_a_layout_must_be_possible(change: dict[str, object], key: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"dashboard: {key}: expected"):
         replace(LAYOUT, **change)
 
 
@@ -695,6 +1021,21 @@ def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, contro
     assert all(len(rows) > 100 for rows in heights.values())
     # Tracking above error above disturbance.
     assert heights["output"].mean() < heights["error"].mean() < heights["disturbance"].mean()
+
+
+@NEEDS_VULKAN
+def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, muscle: Path) -> None:
+    png = tmp_path / "dashboard.png"
+    assert picture(muscle, png, at=8000.0) == []
+    pixels = read_png(png)
+    assert pixels.shape[:2] == (1000, 1600)
+    # The right two thirds: three loops above; two densities and the log below.
+    top, below = (pixels[rows, 540:, :3].astype(int) for rows in (slice(40, 400), slice(440, 780)))
+    for loop in np.array_split(top, 3, axis=1):
+        for colour in ((255, 122, 72), (78, 160, 255), (150, 248, 228)):
+            assert (abs(loop - colour).sum(axis=2) < 60).sum() > 10
+    for plane, is_drawn in zip(np.array_split(below, 3, axis=1), (True, True, False), strict=True):
+        assert ((abs(plane - (255, 226, 138)).sum(axis=2) < 60).sum() > 100) == is_drawn
 
 
 def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> float:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
+from bench.dashboard import DashboardLayout
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.rig import Rig, load_rig, packaged_rigs
 
@@ -27,6 +28,13 @@ output = "probe_temperature"
 input_range = [0.0, 100.0]
 output_range = [0.0, 100.0]
 plane = [30.0, 70.0]
+"""
+LOOP = """
+[[dashboard.loops]]
+input = "probe_temperature"
+output = "tec_current"
+input_range = [0.0, 100.0]
+output_range = [-2.0, 2.0]
 """
 
 
@@ -100,7 +108,20 @@ class TestRight:
         assert load_rig("vo2").name == "vo2"
 
     def test_dashboard(self, rig_file):
-        assert load_rig(rig_file(append=DASHBOARD)).dashboard.levels == 20
+        dashboard = load_rig(rig_file(append=DASHBOARD)).dashboard
+        assert dashboard.levels == 20
+        assert dashboard.loops == ()
+
+    def test_further_loops(self, rig_file):
+        loops = DASHBOARD + LOOP + LOOP.replace("tec_current", "tec_voltage")
+        with Rig(load_rig(rig_file(append=loops)), VirtualClock(), 1) as rig:
+            first, second = rig.file.dashboard.loops
+            table = rig.file.dashboard.model_dump(mode="json")
+        assert (first.input, first.output, first.output_range) == ("probe_temperature", "tec_current", (-2.0, 2.0))
+        assert second.output == "tec_voltage"
+        layout = DashboardLayout(title="a heated plate", **table)
+        assert list(layout.all_loops) == ["", "loops.0.", "loops.1."]
+        assert [loop.output for loop in layout.loops] == ["tec_current", "tec_voltage"]
 
 
 class TestFile:
@@ -160,6 +181,13 @@ class TestUnknownKeys:
 
     def test_in_the_dashboard(self, rig_file):
         wrong(rig_file(append=DASHBOARD + "level = 3\n"), "dashboard.level: there is no such key", "levels")
+
+    def test_in_a_further_loop(self, rig_file):
+        wrong(
+            rig_file(append=DASHBOARD + LOOP.replace("output_range", "outputs")),
+            "dashboard.loops.0.outputs: there is no such key; allowed are: input, output, input_range, output_range",
+            "dashboard.loops.0.output_range: is missing (ends of the vertical axis)",
+        )
 
     def test_in_a_derived_signal(self, rig_file):
         wrong(
@@ -312,6 +340,19 @@ class TestWrongValues:
             "tec_setpoint",
         )
 
+    @pytest.mark.parametrize(("key", "value"), [("input_range", "[1.0, 1.0]"), ("output_range", "[2.0, nan]")])
+    def test_ranges_of_a_further_loop(self, rig_file, key, value):
+        lines = [line for line in LOOP.splitlines() if not line.startswith(key)]
+        wrong(rig_file(append="\n".join([DASHBOARD, *lines, f"{key} = {value}\n"])), f"dashboard.loops.0.{key}")
+
+    @pytest.mark.parametrize(("key", "name"), [("input", "probe_temperature"), ("output", "tec_current")])
+    def test_signals_of_a_further_loop(self, rig_file, key, name):
+        wrong(
+            rig_file(append=DASHBOARD + LOOP + LOOP.replace(f'{key} = "{name}"', f'{key} = "tec"')),
+            f"dashboard.loops.1.{key} = 'tec'",
+            "tec_setpoint",
+        )
+
 
 class TestDerived:
     def test_is_computed(self, rig_file):
@@ -457,7 +498,7 @@ values = st.one_of(
 @settings(max_examples=400, deadline=None)
 @given(data=st.data())
 def test_any_mutation_loads_or_is_a_configuration_error(tmp_path_factory, data):
-    content = tomllib.loads(RIG + SPOT + DASHBOARD + DERIVED)
+    content = tomllib.loads(RIG + SPOT + DASHBOARD + LOOP + DERIVED)
     for _ in range(data.draw(st.integers(1, 3))):
         known = list(_paths(content))
         if not known:
