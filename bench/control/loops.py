@@ -8,7 +8,8 @@ from typing import Protocol
 
 from bench.control.tracking import Command, Follower, TargetController, Trace
 
-_SHORTEST_WAIT = 1e-3  # s
+SHORTEST_WAIT = 1e-3
+"""Least time between two commands of a loop that is late, s."""
 
 
 class Loop(Protocol):
@@ -106,7 +107,7 @@ class FollowReference:
         end = self._sample * self._period
         self._setpoint = self._follower.update(t, measured_input, output, self._reference(end))
         # Counted from the beginning, so that what is late once is not late ever after.
-        return Command(self._setpoint, max(_SHORTEST_WAIT, self._start + end - t))
+        return Command(self._setpoint, max(SHORTEST_WAIT, self._start + end - t))
 
     @property
     def trace(self) -> Trace:

@@ -229,8 +229,8 @@ class Actuator:
         self._plausible_input = self._plausible_output = (-math.inf, math.inf)
         if model is not None:
             self._state = model.initial_state() if state is None else state
-            self._plausible_input = _widened(*model.input_range)
-            self._plausible_output = _widened(*model.output_range())
+            self._plausible_input = widened(*model.input_range)
+            self._plausible_output = widened(*model.output_range())
         self._setpoint = self._clip(0.5 * (low + high) if self._state is None else self._state.input)
         self._started = self._state is not None
         self._reach = Reach.MET
@@ -281,7 +281,7 @@ class Actuator:
         return setpoints
 
 
-def _widened(low: float, high: float) -> tuple[float, float]:
+def widened(low: float, high: float) -> tuple[float, float]:
     """Return a range with its own width added at both ends."""
     return 2.0 * low - high, 2.0 * high - low
 
