@@ -217,7 +217,7 @@ class Engine:
         actuator = self._actuator(message.actuator)
         started = self._clock.now()
         latest = started + message.timeout
-        low, high = message.limits
+        low, high = message.limits or (actuator.limits.low, actuator.limits.high)
         command: Command | None = None
         try:
             while True:

@@ -129,8 +129,8 @@ class Control:
         Signal that says what the actuator did.
     output : str
         Signal that is controlled.
-    limits : (float, float)
-        Set-points that the controller may ask for, in the actuator's unit.
+    limits : (float, float) or None
+        Set-points that the controller may ask for, in the actuator's unit; None for all that the actuator takes.
     timeout : float
         Seconds after which the step has failed and the run ends in the safe state.
     label : str
@@ -143,13 +143,13 @@ class Control:
     actuator: str
     input: str
     output: str
-    limits: tuple[float, float]
+    limits: tuple[float, float] | None
     timeout: float
     label: str = ""
     others: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = self.limits
+        low, high = self.limits or (0.0, 0.0)
         if not (-math.inf < low <= high < math.inf and 0 < self.timeout < math.inf):
             raise ValueError(
                 "Control: expected finite limits, the lower one first, and a finite timeout > 0, got "
@@ -467,8 +467,9 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
             elif isinstance(message, Control):
-                low, high = extremes.get(message.actuator, message.limits)
-                extremes[message.actuator] = (min(low, message.limits[0]), max(high, message.limits[1]))
+                if message.limits is not None:
+                    low, high = extremes.get(message.actuator, message.limits)
+                    extremes[message.actuator] = (min(low, message.limits[0]), max(high, message.limits[1]))
                 watched |= {message.input, message.output, *message.others}
                 at_most += message.timeout
                 reading = Reading(steps, seconds, True, echo)

@@ -1,0 +1,43 @@
+"""Characterization of a muscle at constant length: its force over the voltage."""
+
+from __future__ import annotations
+
+from bench.identification.two_stage import voltage_steps
+from bench.protocol import Dwell, Messages, Phase, Step, parameter, protocol
+from protocols.muscle import ON_STAGE, StageParameters, fasten, reset_on_stage, sample_voltages, stretch
+
+
+class Parameters(StageParameters):
+    """What can be set."""
+
+    points: int = parameter(37, unit="1", low=11, high=10000, help="number of voltages")
+    conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
+
+
+@protocol(needs=ON_STAGE)
+def force_voltage(parameters: Parameters) -> Messages:
+    """Characterize the force of a muscle over the voltage, with its ends held near its resting length.
+
+    The muscle is fastened to the stage, reset, and conditioned by cycles of the voltage at constant length. Then
+    the stage stretches it to the pretension, and the voltage goes through a damped oscillation, with one reading
+    after each dwell (Zhang and Yip 2017, sections II-A and V-A: 0 to 3 V, 37 voltages, 30 s, 0.3 N).
+    """
+    yield from fasten()
+    yield from reset_on_stage(parameters)
+    yield from condition(parameters, parameters.conditioning)
+    yield from stretch(parameters.pretension)
+    yield Phase("force over voltage")
+    yield from sample_voltages(parameters, scaled_steps(parameters.highest, parameters.points))
+
+
+def condition(parameters: StageParameters, cycles: int) -> Messages:
+    """Condition the muscle by cycles of the voltage at constant length."""
+    yield Phase("conditioning")
+    for _ in range(cycles):
+        yield Step({"supply": parameters.highest}, Dwell(parameters.dwell), label="conditioning")
+        yield Step({"supply": 0.0}, Dwell(parameters.dwell), label="conditioning")
+
+
+def scaled_steps(highest: float, points: int) -> list[float]:
+    """Return the paper's damped oscillation, stretched to another highest voltage (V)."""
+    return [float(voltage) for voltage in voltage_steps(count=points) * (highest / 3.0)]

@@ -1,0 +1,70 @@
+"""Characterization of a muscle under dead loads: its length over the voltage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.protocol import Messages, Phase, parameter, protocol
+from protocols.force_voltage import scaled_steps
+from protocols.muscle import (
+    LOADS,
+    ON_WEIGHTS,
+    MuscleParameters,
+    hang,
+    parse_numbers,
+    reset_under_weights,
+    sample_voltages,
+)
+
+
+class Loaded(MuscleParameters):
+    """What can be set for either sequence of voltages."""
+
+    loads: str = parameter(
+        ", ".join(f"{load:g}" for load in LOADS), unit="N", help="dead loads, with commas between them"
+    )
+
+
+class Parameters(Loaded):
+    """What can be set."""
+
+    points: int = parameter(37, unit="1", low=11, high=10000, help="number of voltages at each load")
+
+
+class RandomParameters(Loaded):
+    """What can be set."""
+
+    points: int = parameter(18, unit="1", low=1, high=10000, help="number of voltages at each load")
+    sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the voltages")
+
+
+@protocol(needs=ON_WEIGHTS)
+def length_voltage(parameters: Parameters) -> Messages:
+    """Characterize the length of a muscle over the voltage, under one dead load after another.
+
+    For each load the operator hangs the pretension alone, the memory is reset, the load is hung on, and the
+    voltage goes through a damped oscillation, with one reading after each dwell (Zhang and Yip 2017, sections
+    II-A and V-A: five loads, 37 voltages, 30 s).
+    """
+    yield from _under_loads(parameters, scaled_steps(parameters.highest, parameters.points))
+
+
+@protocol(needs=ON_WEIGHTS)
+def length_verification(parameters: RandomParameters) -> Messages:
+    """Verify a model of a muscle by random voltages, the same under one dead load after another.
+
+    As `length-voltage`, with uniformly distributed voltages (Zhang and Yip 2017, section V-C: five loads, 18
+    voltages).
+    """
+    rng = np.random.default_rng(parameters.sequence_seed)
+    yield from _under_loads(parameters, rng.uniform(0.0, parameters.highest, parameters.points).tolist())
+
+
+def _under_loads(parameters: Loaded, voltages: Sequence[float]) -> Messages:
+    for load in parse_numbers("loads", parameters.loads):
+        yield from reset_under_weights(parameters)
+        yield from hang(load)
+        yield Phase(f"length over voltage at {load:g} N")
+        yield from sample_voltages(parameters, voltages)

@@ -1,0 +1,176 @@
+"""Control of a muscle: its length under a weight, or its force between fixed ends, to one target after another."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from bench.control.muscle import MuscleController, ReachMuscleTarget
+from bench.controllers import MuscleControllerName, load_two_stage_model, make_muscle_controller
+from bench.hysteresis import TwoStage, TwoStageState
+from bench.muscle_runs import FORCE, LENGTH
+from bench.protocol import Control, Dwell, Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
+from bench.tracking_results import REACH, READING
+from protocols.force_voltage import condition
+from protocols.muscle import (
+    ON_STAGE,
+    ON_WEIGHTS,
+    MuscleParameters,
+    Part,
+    StageParameters,
+    fasten,
+    hang,
+    reset_on_stage,
+    reset_under_weights,
+    stretch,
+)
+
+_MARGIN = 0.05
+"""Part of the model's range at either end where no target is drawn."""
+_TARGETS_AT_A_LOAD = 5
+_GRACE = 60.0
+
+
+class Controlled(ProtocolParameters):
+    """What can be set for either task."""
+
+    model: str = parameter(..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it")
+    controller: MuscleControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
+    sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
+    duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
+    readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
+
+
+class LengthParameters(Controlled, MuscleParameters):
+    """What can be set."""
+
+    load: float = parameter(4.90, unit="N", low=0.05, high=100, help="weight on the muscle")
+    change: float = parameter(
+        0.0, unit="N", low=0, high=100, help="added weight for five targets in ten; 0 for a constant one"
+    )
+
+
+class ForceParameters(Controlled, StageParameters):
+    """What can be set."""
+
+    conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
+
+
+@protocol(needs=ON_WEIGHTS, controls=LENGTH)
+def length_control(parameters: LengthParameters) -> Messages:
+    """Bring the length of a muscle under a weight to one target after another.
+
+    The memory is reset, the weight is hung on, and targets are drawn at random from the range that the model says
+    it can reach. After its time at each target, `readings` readings are taken: their mean less the target is the
+    error that counts. With `change` the operator hangs more on after every five targets, and takes it off again
+    after the next five; the controller learns of it by the load cell alone.
+    """
+    model = load_two_stage_model(parameters.model)
+    state = model.initial_state()
+    ranges = [
+        _range(model, _hung(model, state, load), parameters.highest, "length")
+        for load in (parameters.load, parameters.load + parameters.change)
+    ]
+    low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
+    if not low < high:
+        raise ValueError("change: under the two weights the model has no length in common; choose a smaller one")
+    yield from reset_under_weights(parameters)
+    yield from hang(parameters.load)
+    controller = make_muscle_controller(
+        parameters.controller,
+        model,
+        "length",
+        state=state,
+        limits=(0.0, parameters.highest),
+        duration=parameters.duration,
+    )
+    yield Phase(parameters.controller)
+    errors: list[float] = []
+    for i, target in enumerate(_targets(parameters, low, high)):
+        if parameters.change and i and i % _TARGETS_AT_A_LOAD == 0:
+            heavier = i // _TARGETS_AT_A_LOAD % 2 == 1
+            yield from hang(parameters.load + parameters.change * heavier)
+        errors.append((yield from _reach(parameters, controller, target, LENGTH, (FORCE,))))
+    yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
+
+
+@protocol(needs=ON_STAGE, controls=FORCE)
+def force_control(parameters: ForceParameters) -> Messages:
+    """Bring the force of a muscle between fixed ends to one target after another.
+
+    The muscle is fastened to the stage, reset, conditioned by cycles of the voltage and stretched to the
+    pretension; then the stage stands still. Targets and errors are as in `length-control`.
+    """
+    model = load_two_stage_model(parameters.model)
+    state = model.initial_state()
+    low, high = _range(model, state, parameters.highest, "force")
+    yield from fasten()
+    yield from reset_on_stage(parameters)
+    yield from condition(parameters, parameters.conditioning)
+    yield from stretch(parameters.pretension)
+    controller = make_muscle_controller(
+        parameters.controller,
+        model,
+        "force",
+        state=state,
+        limits=(0.0, parameters.highest),
+        duration=parameters.duration,
+    )
+    yield Phase(parameters.controller)
+    errors: list[float] = []
+    for target in _targets(parameters, low, high):
+        errors.append((yield from _reach(parameters, controller, target, FORCE, ())))
+    yield _summary(parameters.controller, np.array(errors), "N")
+
+
+def _hung(model: TwoStage, state: TwoStageState, load: float) -> TwoStageState:
+    return model.step(state, state.voltage, load)[0]
+
+
+def _range(
+    model: TwoStage, state: TwoStageState, highest: float, output: Literal["length", "force"]
+) -> tuple[float, float]:
+    """Return the outputs (m or N) between the ends of a full cycle of the voltage, less a margin at either end."""
+    values = []
+    for voltage in (highest, 0.0):
+        if output == "length":
+            state, value = model.step(state, voltage, state.force)
+        else:
+            state = model.move(state, voltage, state.argument)[0]
+            value = state.force
+        values.append(value)
+    low, high = min(values), max(values)
+    return low + _MARGIN * (high - low), high - _MARGIN * (high - low)
+
+
+def _targets(parameters: Controlled, low: float, high: float) -> list[float]:
+    rng = np.random.default_rng(parameters.sequence_seed)
+    return [float(target) for target in rng.uniform(low, high, parameters.count)]
+
+
+def _reach(
+    parameters: Controlled, controller: MuscleController, target: float, signal: str, others: tuple[str, ...]
+) -> Part[float]:
+    """Go to a target and read; return the error (m or N)."""
+    yield Control(
+        ReachMuscleTarget(controller, target),
+        "supply",
+        "supply_voltage",
+        signal,
+        controller.limits,
+        parameters.duration + _GRACE,
+        label=REACH,
+        others=others,
+    )
+    outputs = []
+    for _ in range(parameters.readings):
+        reading = yield Step({}, Dwell(0.1), label=READING)
+        outputs.append(reading[signal])
+    return float(np.mean(outputs)) - target
+
+
+def _summary(controller: str, errors: np.ndarray[tuple[int], np.dtype[np.float64]], unit: str) -> Note:
+    rms = np.sqrt(np.mean(errors**2))
+    return Note(f"{controller}: {len(errors)} targets, error max {np.abs(errors).max():.3f}, RMS {rms:.3f} {unit}")

@@ -1,0 +1,271 @@
+"""Super-coiled polymer muscle: silver-plated nylon thread, twisted until it coils, heated by a voltage.
+
+The plant is deliberately not of the structure that identification fits. A fitted model is a pair of nested
+hysteresis operators in voltage and force; in the plant heat contracts and softens the coil at once, coils that
+touch end the contraction, and the friction between them depends on temperature, load and contact.
+
+Sources: coils that contract as heat untwists the thread, and that cannot contract where they touch, are those of
+Haines et al., "Artificial muscles from fishing line and sewing thread", Science 343, 2014; Joule heating of plated
+thread, a single thermal time constant, and stiffness, damping and thermal force side by side are those of Yip and
+Niemeyer, "On the control and properties of supercoiled polymer artificial muscles", IEEE Transactions on Robotics
+33, 2017; springs behind sliders as friction are those of Iwan, Journal of Applied Mechanics 33, 1966. The size is
+that of the muscle in Zhang and Yip, Robotics: Science and Systems, 2017, Fig. 1c: a coil of 0.62 mm. All other
+numbers are *assumed*, chosen so that the loads and voltages of the other muscles suit this one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from sim_devices.plants import friction_muscle as kernels
+from sim_devices.plants.friction_muscle import MILLIMETRE, FrictionMuscle, MuscleParameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoiledPolymerParameters(MuscleParameters):
+    """Every number of the plant; those shared with the braided muscle are described in `MuscleParameters`.
+
+    Attributes
+    ----------
+    cold_stiffness, hot_stiffness : float
+        Stiffness of the coil well below and well above the glass transition, N/m.
+    softening, softening_width : float
+        Middle and width of the softening, °C and K; nylon 6,6 has its glass transition near 50 °C.
+    expansion, expansion_above : float
+        Contraction of the unloaded coil per temperature below the softening, and what is added above it, m/K.
+    coil_contact : float
+        Force with which touching coils resist contraction, per square of it, N/m².
+    coil_length : float
+        Elongation below which coils touch, m.
+    friction : float
+        Yield force of all contacts of the cold unloaded muscle, N. It softens with the coil.
+    friction_load : float
+        Yield force of all contacts per tension of the coil, in [0, 1).
+    friction_coils : float
+        Yield force of all contacts per force between touching coils, in [0, 1).
+    slip : float
+        How much of the free contraction an average contact sees as the heated thread untwists at constant length.
+    arm_stiffness, arm_time : float
+        Stiffness (N/m) and relaxation time (s) of the Maxwell arm: the viscoelastic part.
+    ambient_temperature : float
+        Mean temperature of the room, °C.
+    time_constant, fan_time_constant : float
+        Thermal time constants in still air and with the fan on, s. The fan raises the heat loss, so that the
+        steady temperature rise falls in the same ratio. The heat of 100 mm of coil, some 0.06 J/K, and 0.75 W at
+        3 V go with 8 s and 95 K.
+    rise : float
+        Steady temperature rise in still air at the rated voltage, K. It goes as the voltage squared: 3 V are
+        120 °C. Nylon is spoilt above some 180 °C, at 3.8 V, which the plant leaves to the rig's limits.
+    temperature_step : float
+        Largest sub-step of the temperature, K.
+    ambient_sd, ambient_time : float
+        Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default, switches it off;
+        0.3 K is sensible for dynamic tests.
+    ambient_gain : float
+        Relative change of the heating gain with the deviation of the room temperature, 1/K.
+    """
+
+    contact_stiffness: float = 600.0
+    contact_spread: float = 0.8
+    rest_length: float = 100e-3
+    force_limit: float = 15.0
+    resistance: float = 12.0
+    cold_stiffness: float = 1.3e3
+    hot_stiffness: float = 0.9e3
+    softening: float = 60.0
+    softening_width: float = 15.0
+    expansion: float = 0.07e-3
+    expansion_above: float = 0.07e-3
+    coil_contact: float = 1.0e6
+    coil_length: float = -6.0e-3
+    friction: float = 0.35
+    friction_load: float = 0.06
+    friction_coils: float = 0.1
+    slip: float = 0.4
+    arm_stiffness: float = 100.0
+    arm_time: float = 6.0
+    ambient_temperature: float = 25.0
+    time_constant: float = 8.0
+    fan_time_constant: float = 3.0
+    rise: float = 95.0
+    temperature_step: float = 1.0
+    ambient_sd: float = 0.0
+    ambient_time: float = 120.0
+    ambient_gain: float = 0.004
+
+    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = (
+        "expansion",
+        "expansion_above",
+        "coil_contact",
+        "friction",
+        "friction_load",
+        "friction_coils",
+        "slip",
+        "arm_stiffness",
+        "ambient_sd",
+    )
+    _SIGNED: ClassVar[tuple[str, ...]] = ("softening", "coil_length", "ambient_temperature", "ambient_gain")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("friction_load", "friction_coils"):
+            if not getattr(self, name) < 1.0:
+                # Otherwise a muscle that is stretched further could pull less.
+                raise ValueError(f"{name} must lie in [0, 1), not {getattr(self, name)}")
+        if not self.hot_stiffness <= self.cold_stiffness:
+            raise ValueError(
+                f"hot_stiffness must not exceed cold_stiffness, not {self.hot_stiffness} > {self.cold_stiffness} N/m"
+            )
+        if not self.ambient_temperature > -273.15:
+            raise ValueError(f"ambient_temperature must be above absolute zero, not {self.ambient_temperature} °C")
+
+
+class CoiledPolymerSnapshot(NamedTuple):
+    """Every output of the plant at one instant.
+
+    Attributes
+    ----------
+    temperature, ambient_temperature : float
+        Temperature of the muscle and of the room, °C.
+    voltage : float
+        Effective heating voltage, V.
+    current : float
+        Current through the plating, A.
+    force : float
+        Tension of the muscle, N.
+    length : float
+        Elongation of the muscle from its resting length, m; contraction is negative.
+    position : float
+        Position of the moving end, m: elongation of muscle, frame and load cell.
+    """
+
+    temperature: float
+    ambient_temperature: float
+    voltage: float
+    current: float
+    force: float
+    length: float
+    position: float
+
+
+class CoiledPolymerMuscle(FrictionMuscle):
+    """Length and force of a coiled polymer muscle, advanced in time.
+
+    At temperature T and elongation x the tension is::
+
+        F = k(T) [x + a(T)]                     coil: k falls at the softening, a rises
+            - c (x1 - x)², if x < x1            touching coils
+            + Maxwell arm                       stiffness and relaxation time
+            + sum of the contacts               each limited by its share of
+                                                y0 k(T)/k(cold) + m k(T) [x + a(T)] + n c (x1 - x)²
+
+    A contact moves with x and, by a share of its own, against a(T): the thread untwists even where the length is
+    held. The contacts do not depend on the rate; temperature and Maxwell arm need some 60 s to settle.
+
+    The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
+    servo (`clamp`: the length is imposed, the force follows). Changing between them keeps contacts, force and
+    position. Frame and load cell are in series with the muscle, so `position`, which is what `clamp` imposes,
+    exceeds `length` by the force over their stiffness.
+
+    Time runs on a fixed grid of ``parameters.step`` seconds from construction. A command acts from the next grid
+    step on, at once for load and position, before the muscle is heated; outputs stay constant between grid points.
+    So neither the number nor the size of the calls of `advance` changes the trajectory, the noise included.
+    There is no sensor noise here and no protection either.
+
+    At the start the muscle is cold and hangs without load, after it was heated under the pretension and went twice
+    through 0 V, rated voltage, 0 V at constant position; `length` counts from there.
+
+    Parameters
+    ----------
+    parameters : CoiledPolymerParameters
+        The numbers.
+    rng : numpy.random.Generator
+        The session's randomness: the temperature of the room. The plant spawns its own generator from it.
+    """
+
+    def __init__(self, parameters: CoiledPolymerParameters, rng: np.random.Generator) -> None:
+        self._parameters = parameters
+        room = parameters.ambient_temperature
+        super().__init__(parameters, _coefficients(parameters), room, room + parameters.rise, rng)
+        offset = parameters.ambient_sd * float(self._noise.standard_normal())
+        self._state[kernels.OFFSET] = offset
+        self._drive(room + offset, clamped=False)
+
+    @property
+    def parameters(self) -> CoiledPolymerParameters:
+        """The numbers of this plant."""
+        return self._parameters
+
+    def blow(self, on: bool) -> None:
+        """Switch the fan, which shortens the time constant and lowers the steady rise alike.
+
+        Parameters
+        ----------
+        on : bool
+            Whether the fan runs; it does not at the start.
+        """
+        self._command[kernels.FAN] = float(on)
+
+    @property
+    def temperature(self) -> float:
+        """Temperature of the muscle, °C; 120 °C at 3 V."""
+        return float(self._state[kernels.DRIVE])
+
+    @property
+    def ambient_temperature(self) -> float:
+        """Temperature of the room, °C."""
+        return float(self._parameters.ambient_temperature + self._state[kernels.OFFSET])
+
+    def snapshot(self) -> CoiledPolymerSnapshot:
+        """Take all outputs at the present instant.
+
+        Returns
+        -------
+        CoiledPolymerSnapshot
+            The outputs.
+        """
+        return CoiledPolymerSnapshot(
+            temperature=self.temperature,
+            ambient_temperature=self.ambient_temperature,
+            voltage=self.voltage,
+            current=self.current,
+            force=self.force,
+            length=self.length,
+            position=self.position,
+        )
+
+
+def _coefficients(parameters: CoiledPolymerParameters) -> dict[int, float]:
+    """Prepare the numbers that the compiled loops need every step."""
+    p = parameters
+    ambient_decay = math.exp(-p.step / p.ambient_time)
+    return kernels.shared_coefficients(p) | {
+        kernels.KIND: kernels.THERMAL,
+        kernels.DRIVE_STEP: p.temperature_step,
+        kernels.BASE: p.ambient_temperature,
+        kernels.GAIN: p.rise / p.rated_voltage**2,
+        kernels.DECAY: math.exp(-p.step / p.time_constant),
+        kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
+        kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
+        kernels.OFFSET_DECAY: ambient_decay,
+        kernels.OFFSET_KICK: p.ambient_sd * math.sqrt(1.0 - ambient_decay**2),
+        kernels.OFFSET_GAIN: p.ambient_gain,
+        kernels.ARM: p.arm_stiffness * MILLIMETRE,
+        kernels.ARM_TIME: p.arm_time,
+        kernels.FRICTION: p.friction,
+        kernels.FRICTION_PRESS: p.friction_coils,
+        kernels.FRICTION_DRIVE: p.friction_load,
+        kernels.SLIP: p.slip,
+        kernels.COLD_STIFFNESS: p.cold_stiffness * MILLIMETRE,
+        kernels.HOT_STIFFNESS: p.hot_stiffness * MILLIMETRE,
+        kernels.SOFTENING: p.softening,
+        kernels.SOFTENING_WIDTH: p.softening_width,
+        kernels.EXPANSION: p.expansion / MILLIMETRE,
+        kernels.EXPANSION_ABOVE: p.expansion_above / MILLIMETRE,
+        kernels.CONTACT: p.coil_contact * MILLIMETRE**2,
+        kernels.CONTACT_AT: p.coil_length / MILLIMETRE,
+    }

@@ -1,0 +1,260 @@
+"""McKibben muscle: a rubber bladder in a braid, inflated through a pressure regulator that a voltage sets.
+
+The plant is deliberately not of the structure that identification fits. A fitted model is a pair of nested
+hysteresis operators in voltage and force; in the plant the pressure multiplies a stiffness that depends on the
+length, and it presses the threads together, so that friction, too, is a matter of pressure and length.
+
+Sources: the static force is that of Chou and Hannaford, "Measurement and modeling of McKibben pneumatic
+artificial muscles", IEEE Transactions on Robotics and Automation 12, 1996; a dry friction in proportion to
+pressure and contact surface is that of Tondu and Lopez, "Modeling and control of McKibben artificial muscle robot
+actuators", IEEE Control Systems Magazine 20, 2000; friction as many springs behind sliders is that of Iwan,
+Journal of Applied Mechanics 33, 1966, used for such muscles by Vo-Minh et al., "A new approach to modeling
+hysteresis in a pneumatic artificial muscle using the Maxwell-slip model", IEEE/ASME Transactions on Mechatronics
+16, 2011. The nominal diameter of 8 mm is that of the muscle in Zhang and Yip, Robotics: Science and Systems, 2017,
+Fig. 1b. All numbers are *assumed*, chosen so that the loads and voltages of the other muscles suit this one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from sim_devices.plants import friction_muscle as kernels
+from sim_devices.plants.friction_muscle import MILLIMETRE, FrictionMuscle, MuscleParameters
+
+_BAR = 1e5
+# One bar, N/mm².
+_BAR_NEWTON = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class McKibbenParameters(MuscleParameters):
+    """Every number of the plant; those shared with the coiled muscle are described in `MuscleParameters`.
+
+    Attributes
+    ----------
+    thread_length : float
+        Length of a braid thread, m; with `turns` and `rest_length` it makes a rest angle of 33° and a braid
+        diameter of 6.5 mm at rest, 9.7 mm at the angle of 54.7° where the muscle pulls no longer.
+    turns : float
+        Turns of a thread around the muscle.
+    bladder_stiffness : float
+        Stiffness of the bladder and the braid about the resting length, N/m.
+    bladder_cube : float
+        Cubic stiffening of the bladder, N/m³.
+    jam : float
+        Force with which the braid jams on the bladder, per square of the elongation, N/m².
+    friction : float
+        Yield force of all contacts of the empty muscle, N.
+    friction_coefficient : float
+        Yield force of all contacts per pressure and contact surface, the latter being that of the resting braid.
+        The surface changes by less than a tenth over the stroke, which is left out.
+    friction_jam : float
+        Yield force of all contacts per jamming force, in [0, 1).
+    slip : float
+        How far an average contact slips at constant length as the bladder presses the braid outward, m/Pa.
+    pressure_gain : float
+        Pressure per voltage, Pa/V.
+    pressure_band : float
+        Half-width of the regulator's hysteresis, Pa: a quarter of a percent of a span of 5 bar.
+    time_constant : float
+        Time constant of the pressure, s.
+    exhaust_time_constant : float
+        Time constant of a falling pressure with the quick exhaust open, s.
+    pressure_step : float
+        Largest sub-step of the pressure, Pa.
+    supply_sd, supply_time : float
+        Standard deviation (Pa) and correlation time (s) of the pressure that the regulator gives. Zero, the
+        default, switches it off; 500 Pa is sensible for dynamic tests.
+    """
+
+    contact_stiffness: float = 1.2e3
+    contact_spread: float = 0.8
+    rest_length: float = 110e-3
+    force_limit: float = 40.0
+    length_step: float = 0.25e-3
+    resistance: float = 10e3
+    thread_length: float = 131e-3
+    turns: float = 3.5
+    bladder_stiffness: float = 300.0
+    bladder_cube: float = 0.12e6
+    jam: float = 0.22e6
+    friction: float = 0.2
+    friction_coefficient: float = 0.0025
+    friction_jam: float = 0.08
+    slip: float = 1.5e-8
+    pressure_gain: float = 0.5e5
+    pressure_band: float = 1.25e3
+    time_constant: float = 0.3
+    exhaust_time_constant: float = 0.1
+    pressure_step: float = 2e3
+    supply_sd: float = 0.0
+    supply_time: float = 10.0
+
+    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = (
+        "bladder_cube",
+        "jam",
+        "friction",
+        "friction_coefficient",
+        "friction_jam",
+        "slip",
+        "pressure_band",
+        "supply_sd",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.friction_jam < 1.0:
+            # Otherwise a muscle that is stretched further could pull less.
+            raise ValueError(f"friction_jam must lie in [0, 1), not {self.friction_jam}")
+        shortest = self.thread_length / math.sqrt(3.0)
+        if not shortest < self.rest_length < self.thread_length:
+            # At the lower limit the threads are at 54.7° and the muscle pulls no longer.
+            raise ValueError(
+                f"rest_length must lie between {shortest:.4g} and {self.thread_length} m (thread_length / √3 and "
+                f"thread_length), not {self.rest_length} m"
+            )
+
+    @property
+    def braid_diameter(self) -> float:
+        """Diameter of the resting braid, m."""
+        return math.sqrt(self.thread_length**2 - self.rest_length**2) / (self.turns * math.pi)
+
+    @property
+    def braid_surface(self) -> float:
+        """Surface of the resting braid, m²."""
+        return math.pi * self.braid_diameter * self.rest_length
+
+
+class McKibbenSnapshot(NamedTuple):
+    """Every output of the plant at one instant.
+
+    Attributes
+    ----------
+    pressure : float
+        Gauge pressure in the muscle, Pa.
+    voltage : float
+        Voltage that sets the regulator, V.
+    current : float
+        Current into the regulator's input, A.
+    force : float
+        Tension of the muscle, N.
+    length : float
+        Elongation of the muscle from its resting length, m; contraction is negative.
+    position : float
+        Position of the moving end, m: elongation of muscle, frame and load cell.
+    """
+
+    pressure: float
+    voltage: float
+    current: float
+    force: float
+    length: float
+    position: float
+
+
+class McKibbenMuscle(FrictionMuscle):
+    """Length and force of a braided pneumatic muscle, advanced in time.
+
+    At gauge pressure p and braid length L the tension is::
+
+        F = p (3 L² - b²) / (4 π n²)            threads of length b, n turns (Chou and Hannaford 1996)
+            + k (L - L0) + k3 (L - L0)³         bladder
+            + j (L - L0)², if L > L0            the braid jams on the bladder
+            + sum of the contacts               each limited by its share of y0 + f p S + g j (L - L0)²
+
+    The first term is p (π D²/4) (3 cos²θ - 1)/sin²θ in the braid's diameter D and angle θ. A contact moves with
+    L and, by a share of its own, with the pressure at constant length. The bladder does not creep, so the loops
+    do not depend on the rate once the pressure has settled, which takes some 3 s.
+
+    The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
+    servo (`clamp`: the length is imposed, the force follows). Changing between them keeps contacts, force and
+    position. Frame and load cell are in series with the muscle, so `position`, which is what `clamp` imposes,
+    exceeds `length` by the force over their stiffness.
+
+    Time runs on a fixed grid of ``parameters.step`` seconds from construction. A command acts from the next grid
+    step on, at once for load and position, before the pressure moves; outputs stay constant between grid points.
+    So neither the number nor the size of the calls of `advance` changes the trajectory, the noise included.
+    There is no sensor noise here and no protection either.
+
+    At the start the muscle is empty and hangs without load, after it was inflated under the pretension and went
+    twice through 0 V, rated voltage, 0 V at constant position; `length` counts from there.
+
+    Parameters
+    ----------
+    parameters : McKibbenParameters
+        The numbers.
+    rng : numpy.random.Generator
+        The session's randomness: the regulator's supply. The plant spawns its own generator from it.
+    """
+
+    def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
+        self._parameters = parameters
+        rated = parameters.pressure_gain * parameters.rated_voltage / _BAR
+        super().__init__(parameters, _coefficients(parameters), 0.0, rated, rng)
+        self._state[kernels.OFFSET] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
+
+    @property
+    def parameters(self) -> McKibbenParameters:
+        """The numbers of this plant."""
+        return self._parameters
+
+    def blow(self, on: bool) -> None:
+        """Open the quick exhaust, which shortens the time constant of a falling pressure.
+
+        Parameters
+        ----------
+        on : bool
+            Whether it is open; it is not at the start. The steady pressure is the same.
+        """
+        self._command[kernels.FAN] = float(on)
+
+    @property
+    def pressure(self) -> float:
+        """Gauge pressure in the muscle, Pa; 1.5 bar at 3 V."""
+        return float(self._state[kernels.DRIVE] * _BAR)
+
+    def snapshot(self) -> McKibbenSnapshot:
+        """Take all outputs at the present instant.
+
+        Returns
+        -------
+        McKibbenSnapshot
+            The outputs.
+        """
+        return McKibbenSnapshot(
+            pressure=self.pressure,
+            voltage=self.voltage,
+            current=self.current,
+            force=self.force,
+            length=self.length,
+            position=self.position,
+        )
+
+
+def _coefficients(parameters: McKibbenParameters) -> dict[int, float]:
+    """Prepare the numbers that the compiled loops need every step."""
+    p = parameters
+    supply_decay = math.exp(-p.step / p.supply_time)
+    return kernels.shared_coefficients(p) | {
+        kernels.KIND: kernels.PNEUMATIC,
+        kernels.DRIVE_STEP: p.pressure_step / _BAR,
+        kernels.GAIN: p.pressure_gain / _BAR,
+        kernels.BAND: p.pressure_band / _BAR,
+        kernels.DECAY: math.exp(-p.step / p.time_constant),
+        kernels.FAN_DECAY: math.exp(-p.step / p.exhaust_time_constant),
+        kernels.OFFSET_DECAY: supply_decay,
+        kernels.OFFSET_KICK: p.supply_sd / _BAR * math.sqrt(1.0 - supply_decay**2),
+        kernels.FRICTION: p.friction,
+        kernels.FRICTION_STRETCH: p.friction_jam,
+        kernels.FRICTION_DRIVE: p.friction_coefficient * p.braid_surface * _BAR,
+        kernels.SLIP: p.slip * _BAR / MILLIMETRE,
+        kernels.PRESSURE_AREA: _BAR_NEWTON / (4.0 * math.pi * p.turns**2),
+        kernels.THREAD_LENGTH: p.thread_length / MILLIMETRE,
+        kernels.BLADDER: p.bladder_stiffness * MILLIMETRE,
+        kernels.BLADDER_CUBE: p.bladder_cube * MILLIMETRE**3,
+        kernels.JAM: p.jam * MILLIMETRE**2,
+    }
