@@ -306,6 +306,44 @@ def identify_(
     write_json(json_file, found.summary())
 
 
+@app.command("identify-muscle")
+def identify_muscle_(
+    force_run: Annotated[Path, typer.Argument(metavar="FORCE_RUN", help="A run of force-voltage.")],
+    length_runs: Annotated[
+        list[Path], typer.Argument(metavar="LENGTH_RUN...", help="Runs of length-voltage and of length-force.")
+    ],
+    model: Annotated[
+        Literal["two-stage", "two-stage-prandtl-ishlinskii", "summed", "linear"],
+        typer.Option(metavar="NAME", help="two-stage, two-stage-prandtl-ishlinskii, summed or linear."),
+    ] = "two-stage",
+    verify: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="A run, as of length-verification, that the model is tried on.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Identify a model among voltage, force and length of a muscle from the runs that characterized it.
+
+    The two-stage model is length = H2[force - H1[voltage]]; see `bench run length-control --help` for what it is
+    good for. Errors are the average and the RMS in percent of the measured range.
+    """
+    from bench.identification.two_stage import measure_series
+    from bench.muscle_runs import errors_json, identify_muscle, muscle_file, read_resting, read_series
+
+    series = [one for run in length_runs for one in read_series(run)]
+    found = identify_muscle(model, read_resting(force_run), series)
+    errors = dict(found.errors)
+    if verify is not None:
+        errors["verification"] = measure_series(found.model, read_series(verify))
+    rows = [(kind, f"average {e.average_percent:.2f} %, RMS {e.rms_percent:.2f} %") for kind, e in errors.items()]
+    rows += [(f"KKT residual, {stage}", f"{fit.kkt_residual:.1e}") for stage, fit in found.certificates.items()]
+    print_rows(f"{model} from {len(series)} series of lengths", rows)
+    if out is not None:
+        muscle_file(model, found, [force_run, *length_runs]).save(out)
+        console.print(f"model: {out}", highlight=False, soft_wrap=True)
+    write_json(json_file, {"model": model, "errors": {kind: errors_json(e) for kind, e in errors.items()}})
+
+
 @app.command("predict")
 def predict_(
     model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
@@ -651,3 +689,45 @@ def reproduce_vo2_(
 
     result = reproduce_vo2(rig="vo2", seed=seed, out=out, live=live, console=console)
     write_json(json_file, result)
+
+
+@reproduce.command("sma")
+def reproduce_sma_(
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the emulated laboratory's noise, the voltages and the targets.")
+    ] = 0,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
+    live: Annotated[
+        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.
+
+    Zhang and Yip, Three-dimensional hysteresis modeling of robotic artificial muscles with application to shape
+    memory alloy actuators, 2017.
+    """
+    from bench.reproduce.sma import reproduce_sma
+
+    result = reproduce_sma(rig="sma", seed=seed, out=out, live=live, console=console)
+    write_json(json_file, result)
+
+
+@reproduce.command("muscles")
+def reproduce_muscles_(
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the emulated laboratories' noise and of the voltages.")
+    ] = 0,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
+    live: Annotated[
+        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """McKibben and super-coiled polymer muscles: the same protocols and models as for the SMA wire.
+
+    The outlook of Zhang and Yip, 2017.
+    """
+    from bench.reproduce.muscles import reproduce_muscles
+
+    write_json(json_file, reproduce_muscles(seed=seed, out=out, live=live, console=console))

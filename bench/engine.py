@@ -211,7 +211,8 @@ class Engine:
         return self._finish_step(started, step.label, step.setpoints, values)
 
     def _control(self, message: Control) -> Reading:
-        for name in (message.input, message.output, *message.others):
+        wanted = (message.input, message.output, *message.others)
+        for name in wanted:
             if name not in self._names:
                 raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
         actuator = self._actuator(message.actuator)
@@ -222,10 +223,10 @@ class Engine:
         try:
             while True:
                 asked = self._clock.now()
-                values = self._values(self._rig.measure)
+                values = self._values(lambda: self._rig.sample(wanted))
                 now = self._clock.now()
                 ask = message.loop.begin if command is None else message.loop.update
-                command = ask(now, *(values[name] for name in (message.input, message.output, *message.others)))
+                command = ask(now, *(values[name] for name in wanted))
                 trace = message.loop.trace
                 self._trace = dict(
                     zip(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -32,6 +32,14 @@ _STYLE: dict[Any, Any] = {
     "savefig.bbox": "tight",
 }
 _COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
+
+
+class Curve(NamedTuple):
+    """One curve: its name in the legend (empty for none) and its points, each of shape (N,)."""
+
+    label: str
+    horizontal: Floats
+    vertical: Floats
 
 
 def plot_loops(
@@ -155,44 +163,103 @@ def plot_tracking(
         figure.savefig(path)
 
 
-def plot_density(path: Path, model: Preisach) -> None:
-    """Draw a Preisach density on its plane; cells without density are white (Figs. 6 and 8).
+def plot_panels(
+    path: Path,
+    panels: Mapping[str, Sequence[Curve]],
+    *,
+    horizontal_label: str,
+    vertical_label: str,
+    columns: int = 2,
+) -> None:
+    """Draw several sets of curves on the same axes, one panel a set.
 
     Parameters
     ----------
     path : Path
         File to write.
-    model : Preisach
-        The operator.
+    panels : mapping of str to sequence of Curve
+        Curves by the panel's title.
+    horizontal_label, vertical_label : str
+        Axis labels, with units.
+    columns : int
+        Panels beside each other.
     """
+    rows = -(-len(panels) // columns)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(3.3 * columns, 0.4 + 2.6 * rows), layout="constrained")
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for i, (axes, (title, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
+            for k, curve in enumerate(curves):
+                axes.plot(
+                    curve.horizontal,
+                    curve.vertical,
+                    ".-",
+                    color=f"C{k}",
+                    linewidth=0.7,
+                    markersize=2.5,
+                    label=curve.label,
+                )
+            axes.set_title(title, fontsize=9, loc="left")
+            if i == 0 and any(curve.label for curve in curves):
+                axes.legend(fontsize=6.5)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes in grid[-1]:
+            axes.set_xlabel(horizontal_label)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(vertical_label)
+        figure.savefig(path)
+
+
+def plot_densities(path: Path, models: Mapping[str, Preisach]) -> None:
+    """Draw Preisach densities on their planes, side by side; cells without density are white.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    models : mapping of str to Preisach
+        Operators by the panel's title.
+    """
+    with mpl.rc_context({**_STYLE, "axes.grid": False}):
+        figure = Figure(figsize=(5.2 * len(models), 4.2), layout="constrained")
+        panels = figure.subplots(1, len(models), squeeze=False)[0]
+        for axes, (title, model) in zip(panels, models.items(), strict=True):
+            _density_panel(axes, model)
+            axes.set_title(title, fontsize=9, loc="left")
+        figure.savefig(path)
+
+
+def plot_density(path: Path, model: Preisach) -> None:
+    """Draw one Preisach density on its plane; see `plot_densities`."""
+    plot_densities(path, {"": model})
+
+
+def _density_panel(axes: Axes, model: Preisach) -> None:
     levels = np.asarray(model.levels)
     matrix = np.full((levels.size - 1, levels.size - 1), np.nan)
     rows, columns = np.tril_indices(levels.size - 1)
     matrix[rows, columns] = model.density
     signed = bool(np.any(model.density < 0))
     largest = float(np.max(np.abs(model.density))) or 1.0
-    with mpl.rc_context({**_STYLE, "axes.grid": False}):
-        figure = Figure(figsize=(5.2, 4.2), layout="constrained")
-        axes = figure.subplots()
-        image = axes.pcolormesh(
-            levels,
-            levels,
-            np.ma.masked_where(~(np.abs(matrix) > 0), matrix),
-            cmap="RdBu_r" if signed else "viridis",
-            vmin=-largest if signed else 0.0,
-            vmax=largest,
-        )
-        axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
-        axes.set(
-            xlabel=f"β / {model.input_unit or '1'}",
-            ylabel=f"α / {model.input_unit or '1'}",
-            aspect="equal",
-            xlim=(levels[0], levels[-1]),
-            ylim=(levels[0], levels[-1]),
-        )
-        unit = f"({model.output_unit or '1'})/({model.input_unit or '1'})²"
-        figure.colorbar(image, ax=axes, label=f"density / {unit}")
-        figure.savefig(path)
+    image = axes.pcolormesh(
+        levels,
+        levels,
+        np.ma.masked_where(~(np.abs(matrix) > 0), matrix),
+        cmap="RdBu_r" if signed else "viridis",
+        vmin=-largest if signed else 0.0,
+        vmax=largest,
+    )
+    axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
+    axes.set(
+        xlabel=f"β / {model.input_unit or '1'}",
+        ylabel=f"α / {model.input_unit or '1'}",
+        aspect="equal",
+        xlim=(levels[0], levels[-1]),
+        ylim=(levels[0], levels[-1]),
+    )
+    unit = f"({model.output_unit or '1'})/({model.input_unit or '1'})²"
+    axes.figure.colorbar(image, ax=axes, label=f"density / {unit}")
 
 
 def plot_coverage(path: Path, model: Preisach, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from bench.errors import DataError
 from bench.hysteresis import PrandtlIshlinskii
+from bench.identification import Errors
 from bench.identification.two_stage import (
     CoupledIdentification,
     Series,
@@ -25,6 +26,7 @@ from bench.identification.two_stage import (
     identify_two_stage,
 )
 from bench.journal import Record
+from bench.model_file import CoupledFile
 
 Floats = npt.NDArray[np.float64]
 
@@ -142,6 +144,24 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         )
     except ValueError as error:
         raise DataError(f"model {name} cannot be identified: {error}") from error
+
+
+def muscle_file(name: ModelName, found: CoupledIdentification[Any], sources: Sequence[Path]) -> CoupledFile:
+    """Return the model file of an identification; `sources` are the runs that it comes from."""
+    return CoupledFile(
+        name,
+        found.model,
+        {
+            "sources": [source.name for source in sources],
+            "errors": {kind: errors_json(errors) for kind, errors in found.errors.items()},
+            "kkt": {stage: certificate.kkt_residual for stage, certificate in found.certificates.items()},
+        },
+    )
+
+
+def errors_json(errors: Errors) -> dict[str, float]:
+    """Return average and RMS errors in percent of the range, for programs."""
+    return {"average": errors.average_percent, "rms": errors.rms_percent}
 
 
 def _samples(run: Path) -> list[Floats]:

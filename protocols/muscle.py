@@ -53,7 +53,7 @@ class StageParameters(MuscleParameters):
     """What can be set where the stage stretches the muscle."""
 
     slack: float = parameter(
-        -10e-3, unit="m", low=-0.1, high=0, help="position of the stage at which the muscle is slack at any voltage"
+        -6e-3, unit="m", low=-0.1, high=0, help="position of the stage at which the muscle is slack at any voltage"
     )
 
 

@@ -40,11 +40,20 @@ FAN_LINE = 0
 
 _FINEST = 0.1
 """Longest piece of time, s, in which a moving stage pulls the muscle along."""
+_HEARTBEAT_TIME = 0x1017
+"""Object of the supply with the period of its heartbeat, ms; 0 for none."""
 _BROKEN_CELL = -1e3
 """What a load cell with a broken wire shows, N."""
 
 FaultName = Literal[
-    "none", "silent-supply", "servo-overload", "broken-load-cell", "forgotten-load", "heavy-load", "unplugged-sensor"
+    "none",
+    "silent-supply",
+    "missing-heartbeat",
+    "servo-overload",
+    "broken-load-cell",
+    "forgotten-load",
+    "heavy-load",
+    "unplugged-sensor",
 ]
 
 
@@ -94,8 +103,9 @@ class MuscleLaboratorySettings(LaboratorySettings):
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
     fault: FaultName = Field(
         default="none",
-        description="what goes wrong: silent-supply, servo-overload, broken-load-cell, unplugged-sensor at "
-        "`fault_time`; forgotten-load (the operator hangs nothing), heavy-load (twice the weight) from then on",
+        description="what goes wrong at `fault_time`: silent-supply, missing-heartbeat, servo-overload, "
+        "broken-load-cell, unplugged-sensor; or from then on: forgotten-load (the operator hangs nothing), "
+        "heavy-load (twice the weight)",
     )
     fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
 
@@ -186,8 +196,8 @@ class MuscleLaboratory:
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
-        magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
-        self.t7 = EmulatedT7(self.world, {0: magnet.output, 1: magnet.supply}, rng=t7)
+        self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
+        self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
         self.frame.t7 = self.t7
         self._t7_server = ModbusTcpServer(self.t7)
         if settings.fault != "none":
@@ -243,6 +253,10 @@ class MuscleLaboratory:
         fault = self._settings.fault
         if fault == "silent-supply":
             self.supply.unplug()
+        elif fault == "missing-heartbeat":
+            self.supply.write_object(_HEARTBEAT_TIME, 0)
+        elif fault == "unplugged-sensor":
+            self.magnet.supply_volts = 0.0
         elif fault == "servo-overload":
             self.servo.trip(HardwareError.OVERLOAD)
         elif fault == "broken-load-cell":

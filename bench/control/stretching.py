@@ -6,18 +6,19 @@ from bench.control.tracking import Command, Trace
 
 
 class Stretch:
-    """Move an end until the muscle pulls with a given force, without overshoot; or go on doing so for a time.
+    """Move an end until the muscle pulls with a given force; or go on doing so for a time.
 
-    Input is the position of the end, m, positive when the muscle is longer; output the force, N. Each step is the
-    lacking force over a stiffness that the muscle never exceeds. So the force comes to its target from one side,
-    and the memory of the muscle sees no reversal that is not asked for.
+    Input is the position of the end, m, positive when the muscle is longer; output the force, N. Each step is half
+    of the lacking force over the stiffness that the step before it showed. So the force comes to its target from
+    one side, and the memory of the muscle sees no reversal that is not asked for, unless the stiffness doubles
+    within one step.
 
     Parameters
     ----------
     force : float
         Target, N.
-    stiffness : float
-        Greatest stiffness of muscle and frame together, N/m.
+    stiffnesses : (float, float)
+        Least and greatest stiffness of muscle and frame together that are believed, N/m.
     largest_step : float
         Longest step of the end, m; also what is taken up of a slack muscle at a time.
     tolerance : float
@@ -37,29 +38,32 @@ class Stretch:
         self,
         force: float,
         *,
-        stiffness: float = 12e3,
+        stiffnesses: tuple[float, float] = (0.8e3, 12e3),
         largest_step: float = 0.2e-3,
         tolerance: float = 0.03,
         period: float = 0.5,
         duration: float = 0.0,
     ) -> None:
-        if not (stiffness > 0 and largest_step > 0 and tolerance > 0 and period > 0 and duration >= 0):
+        if not 0.0 < stiffnesses[0] <= stiffnesses[1]:
+            raise ValueError(f"stiffnesses: expected two positive numbers, the lower one first, got {stiffnesses}")
+        if not (largest_step > 0 and tolerance > 0 and period > 0 and duration >= 0):
             raise ValueError(
-                "stiffness, largest_step, tolerance, period: expected positive numbers, duration ≥ 0, got "
-                f"{stiffness}, {largest_step}, {tolerance}, {period}, {duration}"
+                "largest_step, tolerance, period: expected positive numbers, duration ≥ 0, got "
+                f"{largest_step}, {tolerance}, {period}, {duration}"
             )
         self._force = force
-        self._stiffness = stiffness
+        self._stiffnesses = stiffnesses
         self._largest_step = largest_step
         self._tolerance = tolerance
         self._period = period
         self._duration = duration
-        self._start = self._setpoint = 0.0
+        self._start = self._setpoint = self._step = 0.0
+        self._output = 0.0
         self.trace = Trace(reference=force)
 
     def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Start from where the end is."""
-        self._start, self._setpoint = t, measured_input
+        self._start, self._setpoint, self._step = t, measured_input, 0.0
         return self.update(t, measured_input, output, *others)
 
     def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
@@ -67,6 +71,11 @@ class Stretch:
         lacking = self._force - output
         met = abs(lacking) <= self._tolerance if self._duration == 0 else t - self._start >= self._duration
         if not met:
-            step = lacking / self._stiffness
-            self._setpoint += min(max(step, -self._largest_step), self._largest_step)
+            softest, stiffest = self._stiffnesses
+            # The first step has nothing to go by, so it is the shortest.
+            seen = (output - self._output) / self._step if self._step else stiffest
+            step = 0.5 * lacking / min(max(seen, softest), stiffest)
+            self._step = min(max(step, -self._largest_step), self._largest_step)
+            self._setpoint += self._step
+        self._output = output
         return Command(self._setpoint, self._period, met)

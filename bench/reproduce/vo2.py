@@ -6,8 +6,7 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,18 +14,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.table import Table
 
 from bench.clock import Stopwatch
-from bench.errors import BenchError, DataError
+from bench.errors import DataError
 from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
 from bench.modelling import IdentifiedFile, errors_json, identify_file, predict
-from bench.protocol import find_protocol
 from bench.report import export_run
-from bench.runs import Run, RunResult, carry_out
+from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.runs import RunResult
 from bench.tracking_results import FollowingResult, TargetResults, following_result, target_results
 
 Floats = npt.NDArray[np.float64]
@@ -158,15 +156,12 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
         If a run did not complete; its record is kept.
     """
     stopwatch = Stopwatch()
-    folder = out / f"reproduce-vo2-seed-{seed}"
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    campaign = Campaign(rig, out / f"reproduce-vo2-seed-{seed}", seed, live, console)
+    folder = campaign.folder
     sign = 1.0 if seed % 2 == 0 else -1.0
-    # Every session has its own noise: no two, of this campaign or of one with another seed, share theirs.
-    seeds = (2 * seed + k % 2 + 100_000 * (k // 2) for k in itertools.count())
 
     def session(protocol: str, settings: Mapping[str, str], offset: float) -> RunResult:
-        overrides = {"emulation.session_offset": str(sign * offset)}
-        return _session(rig, protocol, settings, overrides, next(seeds), folder, live, console)
+        return campaign.run(protocol, settings, {"emulation.session_offset": str(sign * offset)})
 
     characterization = session("damped-oscillation", {}, 0.0)
     validation = session("random-validation", {}, SESSION_OFFSET)
@@ -196,7 +191,6 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
     reached = {key: _reached(run) for key, run in tracking_runs.items()}
     followed = {key: _followed(run) for key, run in following_runs.items()}
 
-    runs = [characterization, validation, *tracking_runs.values(), *following_runs.values()]
     for run in (characterization, validation):
         with Record(run.folder) as record:
             finished = float(record.meta["finished"])
@@ -205,11 +199,10 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
             add_model(run.folder, model.file.name, finished, model.file.to_json())
     for run in (*tracking_runs.values(), *following_runs.values()):
         add_model(run.folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
-    recordings = [export_run(run.folder, "rrd", None)[0] for run in runs]
+    recordings = [export_run(run.folder, "rrd", None)[0] for run in campaign.runs]
     figures = _draw(models, inputs, outputs, predictions, folder / "figures")
     figures += _draw_tracking(reached, followed, folder / "figures")
 
-    laboratory = sum(run.outcome.laboratory_seconds for run in runs)
     result = {
         "seed": seed,
         "session_offset": sign * SESSION_OFFSET,
@@ -224,7 +217,7 @@ def reproduce_vo2(*, rig: str, seed: int, out: Path, live: bool, console: Consol
         "continuous": {
             f"period_{period}": {key: followed[period, key].summary() for key in FOLLOWING} for period in PERIODS
         },
-        "laboratory_seconds": laboratory,
+        "laboratory_seconds": campaign.laboratory_seconds,
         "wall_seconds": stopwatch.seconds(),
         "folder": str(folder),
         "figures": [str(path) for path in figures],
@@ -247,39 +240,6 @@ def _followed(run: RunResult) -> FollowingResult:
         result = following_result(record, OUTPUT)
     if result is None:
         raise DataError(f"{run.folder}: has no reference")
-    return result
-
-
-def _session(
-    rig: str,
-    protocol: str,
-    settings: Mapping[str, str],
-    overrides: Mapping[str, str],
-    seed: int,
-    folder: Path,
-    live: bool,
-    console: Console,
-) -> RunResult:
-    definition = find_protocol(protocol)
-    result = carry_out(
-        Run(
-            protocol=definition,
-            parameters=definition.parse(settings),
-            rig=rig,
-            overrides=overrides,
-            seed=seed,
-            clock="virtual",
-            folder=folder,
-            live=live,
-            # Made from the journal afterwards, when the density is known and can be drawn with it.
-            recording=False,
-        ),
-        console,
-    )
-    if result.outcome.error is not None:
-        raise result.outcome.error
-    if not result.outcome.is_safe:
-        raise BenchError(f"{protocol}: the safe state was not confirmed: {dict(result.outcome.safe_state)}")
     return result
 
 
@@ -409,14 +369,14 @@ def _print_result(result: Mapping[str, Any], console: Console) -> None:
             )
             for entry, paper in zip(MODELS, papers, strict=True)
         ]
-        console.print(_table(title, ("model", "paper max", "bench max", "bench RMS"), errors))
+        console.print(make_table(title, ("model", "paper max", "bench max", "bench RMS"), errors))
     residuals = ", ".join(f"{entry.title} {result['kkt'][entry.key]:.0e}" for entry in MODELS)
     console.print(f"KKT residuals: {residuals}", highlight=False)
     rows: list[tuple[str, ...]] = [
         (name, f"{paper:g}", f"{result['parameters'][name]:.2f}", unit)
         for name, (paper, unit) in _PAPER_PARAMETERS.items()
     ]
-    console.print(_table("the proposed model's parameters", ("", "paper", "bench", "unit"), rows))
+    console.print(make_table("the proposed model's parameters", ("", "paper", "bench", "unit"), rows))
     rows = []
     for session in TRACKING:
         entry = result["tracking"][session.key]
@@ -431,7 +391,7 @@ def _print_result(result: Mapping[str, Any], console: Console) -> None:
         )
     columns: tuple[str, ...] = ("controller", "paper max", "paper RMS", "max", "RMS", "median", "s/target")
     title = f"tracking of 60 targets, errors in 1/m (Fig. 12; session offset {result['tracking_offset']:+g} K)"
-    console.print(_table(title, columns, rows))
+    console.print(make_table(title, columns, rows))
     rows = [
         (
             next(session.title for session in TRACKING if session.key == key),
@@ -444,23 +404,5 @@ def _print_result(result: Mapping[str, Any], console: Console) -> None:
         for key in FOLLOWING
     ]
     columns = ("controller", *(f"{what}, {period} s" for period in PERIODS for what in ("max", "RMS")))
-    console.print(_table("following a modulated sine at 2 Hz, errors in 1/m", columns, rows))
-    laboratory, wall = result["laboratory_seconds"], result["wall_seconds"]
-    console.print(
-        f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
-        highlight=False,
-    )
-    console.print(f"runs, models and recordings: {result['folder']}", highlight=False, soft_wrap=True)
-    console.print(f"figures: {result['folder']}/figures", highlight=False, soft_wrap=True)
-    console.print("open a recording with `rerun FILE`:", highlight=False)
-    for path in result["recordings"]:
-        console.print(f"  {path}", highlight=False, soft_wrap=True)
-
-
-def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    return table
+    console.print(make_table("following a modulated sine at 2 Hz, errors in 1/m", columns, rows))
+    print_end(result, console)
