@@ -1,11 +1,12 @@
-"""LabJack T7 over Modbus TCP: a position sensor on its analog inputs, and a switch on a digital line.
+"""LabJack T7 over Modbus TCP: sensors of position and temperature, a switch, and a high-voltage supply for a piezo.
 
 Several devices may stand for one instrument, each with a connection of its own; they are set up one after the
 other.
 
 Sources: `ljm_constants.json` (repository labjack/ljm_constants) for the register map; LabJack, Direct Modbus TCP,
 Protocol Details, for the byte order; LabJack T-series datasheet 14.1.7 for averaging in the instrument, 14.3.0
-for the analog inputs, 13.0 for the digital lines, 23.0 for the watchdog.
+for the analog inputs, 15.0 for the analog outputs, 13.0 for the digital lines, 23.0 for the watchdog; LJTick-DAC
+datasheet for the outputs TDAC; Steinhart and Hart 1968, Deep-Sea Research 15, for thermistors.
 
 Assumptions: error details 2371, 2372 and 2374 belong to the names that stand between the known 2370, 2373 and
 2375 in the error table; the instrument reads back the settings that were written; one request that spans the
@@ -26,6 +27,7 @@ import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -34,7 +36,16 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
 from bench.clock import Clock
-from bench.devices import DriverSettings, Identity, PositionSensor, Status, Switch
+from bench.devices import (
+    DriverSettings,
+    Identity,
+    Limits,
+    PositionSensor,
+    Status,
+    Switch,
+    TemperatureSensor,
+    VoltageSupply,
+)
 from bench.errors import DeviceConnectionError, DeviceError
 
 # Everything that pymodbus logs as an error is raised here with the name of the device.
@@ -50,6 +61,7 @@ _AVERAGE_MIN_MAX = 3  # AIN_EF_INDEX, datasheet 14.1.7
 _LONGEST_BURST = 0.18  # s, datasheet 14.1.7
 _MOST_SAMPLES = 16384
 _MISSED_SAMPLE = -9999.0  # what a stream puts in place of a sample that it had to leave out
+_LARGEST_RANGE = 10.0  # V
 _RAIL = 0.999  # share of the nominal range from which on a reading counts as over-range
 _USABLE = 0.95  # share of a detector's length that limits may use
 _READOUTS = {"voltage": 1, "currents": 2, "ratiometric": 2}  # inputs that each takes
@@ -58,12 +70,24 @@ _OUTPUT = (0.1, 0.9)  # share of the supply that its output takes over the strok
 _END = 5e-4  # share of the stroke next to its ends that may be the magnet beyond them; half a step of the sensor
 _ALL_LINES = (1 << LINES) - 1
 
+_SHORTED, _OPEN = 0.01, 0.99  # shares of the excitation at a divider below and above which its thermistor is no more
+_EXCITATION = 0.2  # share by which an excitation may be off
+_KELVIN = 273.15
+
+_DAC_REACH = (0.0, 5.0)  # V, datasheet 15.0
+_TDAC_REACH = (-10.0, 10.0)  # V, datasheet of the LJTick-DAC
+_STATUS_ON = 2.0  # V, from which on a status output is high, as TTL has it
+_STATUS_AGE = 0.1  # s, after which `set` looks at the status again
+_LOOKS, _LOOK_INTERVAL = 50, 0.01  # how often, and every how many s, a change of the status is looked for
+_DISCHARGED = 1.0  # V, below which an output counts as 0 V
+
 _TEST_WORDS = (0x0011, 0x2233)
 _TEST_FLOAT = -9999.0
 _PRODUCT = 7.0
 _PRODUCTS = {4.0: "a LabJack T4", 8.0: "a LabJack T8", 200.0: "a LabJack Digit"}
 
 _AIN = 0
+_DAC = 1000
 _DIO = 2000
 _DIO_STATE = 2800
 _DIO_DIRECTION = 2850
@@ -75,6 +99,7 @@ _EF_READ_MINIMUM = 7600
 _EF_INDEX = 9000
 _EF_SAMPLES = 9300
 _EF_SCAN_RATE = 10200
+_TDAC = 30000
 _RANGE = 40000
 _NEGATIVE_CH = 41000
 _RESOLUTION_INDEX = 41500
@@ -112,6 +137,8 @@ _DETAILS = {
     2375: "AIN resolution index not allowed",
 }
 
+_Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
+
 _HOST = re.compile(r"(?:tcp://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::(?P<port>[0-9]{1,5}))?/?")
 
 
@@ -138,7 +165,7 @@ class T7ConnectionSettings(DriverSettings):
 class T7InputSettings(T7ConnectionSettings):
     """How analog inputs are read; every sensor on a T7 extends it."""
 
-    channels: tuple[Annotated[int, Field(ge=0, lt=CHANNELS)], ...] = Field(
+    channels: tuple[_Channel, ...] = Field(
         default=(0,), description="analog inputs, 0 to 13; neighbours in ascending order are read at once"
     )
     range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
@@ -281,6 +308,125 @@ class T7SwitchSettings(T7ConnectionSettings):
         le=3600,
         description="silence of all hosts in s after which the instrument switches the line off, 1 to 3600",
     )
+
+
+class T7ThermistorSettings(T7InputSettings):
+    """What a rig file says of a T7 that reads a thermistor.
+
+    The thermistor is between the input of the divider and ground, the reference resistor between that input and
+    the excitation.
+    """
+
+    channels: tuple[_Channel, _Channel] = Field(
+        default=(0, 1),
+        description="analog inputs of the divider and of its excitation, 0 to 13; neighbours in ascending order are "
+        "read at once",
+    )
+    reference_ohms: float = Field(
+        default=10e3, gt=0.0, le=1e7, description="reference resistor of the divider in Ω, above 0 to 1e7"
+    )
+    excitation_volts: float = Field(
+        default=2.5, gt=0.0, le=8.0, description="excitation of the divider in V, above 0 to 8; 20 % off is an error"
+    )
+    steinhart_hart: tuple[float, float, float] = Field(
+        default=(1.129148e-3, 2.34125e-4, 8.76741e-8),
+        description="A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; the default is a common "
+        "thermistor of 10 kΩ at 25 °C",
+    )
+    temperature_limits: tuple[float, float] = Field(
+        default=(-40.0, 125.0), description="range in °C, low and high; a reading beyond is an error"
+    )
+
+    @model_validator(mode="after")
+    def _check_divider(self) -> Self:
+        highest = (1 + _EXCITATION) * self.excitation_volts
+        if highest >= _RAIL * self.range:
+            raise ValueError(
+                f"range: an excitation of up to {highest:g} V needs more than ±{self.range:g} V; choose a larger one"
+            )
+        a, b, c = self.steinhart_hart
+        least, most = (math.log(self.reference_ohms * share / (1 - share)) for share in (_SHORTED, _OPEN))
+        # The slope of 1/T over ln R has its extremes at the ends and where |ln R| is least.
+        slope = min(b + 3 * c * log**2 for log in (least, most, min(max(0.0, least), most)))
+        if slope <= 0 or a + b * least + c * least**3 <= 0:
+            raise ValueError(
+                f"steinhart_hart: the temperature must fall all the way from {math.exp(least):.3g} to "
+                f"{math.exp(most):.3g} Ω, which the divider tells apart; got {a:g}, {b:g} and {c:g}"
+            )
+        low, high = self.temperature_limits
+        coldest, hottest = (_celsius(self.steinhart_hart, math.exp(log)) for log in (most, least))
+        if not coldest < low < high < hottest:
+            raise ValueError(
+                f"temperature_limits: expected low < high within {coldest:.4g} to {hottest:.4g} °C, which the "
+                f"divider tells from an open and a shorted thermistor; got {low:g} and {high:g} °C"
+            )
+        return self
+
+
+class T7HighVoltageSettings(T7InputSettings, T7SwitchSettings):
+    """What a rig file says of a T7 with a high-voltage amplifier of fixed gain behind it."""
+
+    channels: tuple[_Channel, _Channel, _Channel] = Field(
+        default=(0, 1, 2),
+        description="analog inputs of the amplifier's voltage monitor, current monitor and status output (5 V while "
+        "it is on), 0 to 13; neighbours in ascending order are read at once",
+    )
+    line: int = Field(
+        ge=0, lt=LINES, description="digital line of the amplifier's enable input, 0 to 22, FIO0-7 are 0-7"
+    )
+    analog_output: str = Field(
+        default="tdac0",
+        pattern=r"^(dac[01]|tdac(1?\d|2[0-2]))$",
+        description="output of the set-point: dac0 or dac1 (0 to 5 V), or tdac0 to tdac22 (LJTick-DAC, -10 to 10 V)",
+    )
+    gain: float = Field(default=20.0, description="gain of the amplifier in V/V, not 0")
+    offset_volts: float = Field(
+        default=0.0, ge=-10.0, le=10.0, description="input of the amplifier in V at which it gives 0 V, -10 to 10"
+    )
+    volts_per_volt: float = Field(default=20.0, description="output voltage per volt of the voltage monitor, not 0")
+    amperes_per_volt: float = Field(default=0.01, description="output current in A per volt of its monitor, not 0")
+    voltage_limits: tuple[float, float] = Field(
+        default=(-40.0, 40.0), description="lowest and highest set-point in V, with 0 V between or at them"
+    )
+
+    @field_validator("gain", "volts_per_volt", "amperes_per_volt")
+    @classmethod
+    def _check_slope(cls, value: float) -> float:
+        if value == 0:
+            raise ValueError("must be a number other than 0")
+        return value
+
+    @model_validator(mode="after")
+    def _check_amplifier(self) -> Self:
+        if self.range != 10.0:
+            raise ValueError(f"range: a status output of 5 V needs 10 V, got {self.range:g} V")
+        low, high = self.voltage_limits
+        if not (low <= 0 <= high and low < high):
+            raise ValueError(f"voltage_limits: expected low ≤ 0 ≤ high and low < high, got {low:g} and {high:g} V")
+        first, last = _TDAC_REACH if self.analog_output.startswith("t") else _DAC_REACH
+        for volts in self.voltage_limits:
+            sent = self.sent(volts)
+            if not first <= sent <= last:
+                raise ValueError(
+                    f"voltage_limits: {volts:g} V takes {sent:g} V at {self.analog_output}, which gives {first:g} to "
+                    f"{last:g} V"
+                )
+        if max(-low, high) >= abs(self.volts_per_volt) * _RAIL * self.range:
+            raise ValueError(f"volts_per_volt: the voltage monitor would be over its range of ±{self.range:g} V")
+        if self.analog_output.startswith("t") and self.line // 2 == int(self.analog_output[4:]) // 2:
+            raise ValueError(f"line: DIO{self.line} is taken by the LJTick-DAC of {self.analog_output}")
+        return self
+
+    def sent(self, volts: float) -> float:
+        """Return the voltage in V at the analog output that makes the amplifier give `volts`."""
+        return self.offset_volts + volts / self.gain
+
+
+def _celsius(steinhart_hart: tuple[float, float, float], ohms: float) -> float:
+    """Return the temperature in °C of a thermistor by its resistance in Ω (Steinhart and Hart 1968)."""
+    a, b, c = steinhart_hart
+    log = math.log(ohms)
+    return 1 / (a + b * log + c * log**3) - _KELVIN
 
 
 class LabJackT7:
@@ -562,10 +708,11 @@ class AnalogInputs:
             limit = self._settings.range
             extreme = max(voltage, key=abs)
             if abs(extreme) >= _RAIL * limit:
+                larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
                 raise DeviceError(
                     self._name,
-                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; choose a larger "
-                    "`range`, or bring what is measured back into it",
+                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; {larger}bring what "
+                    "is measured back into it",
                 )
         return [voltage.mean for voltage in voltages]
 
@@ -1009,3 +1156,370 @@ class T7Switch(Switch):
             if not self._output.is_on:
                 self._output.unguard()
         self._instrument.close()
+
+
+class T7Thermistor(TemperatureSensor):
+    """A thermistor in a divider, of which a LabJack T7 measures the voltage and the excitation.
+
+    The temperature comes from the ratio of both by the equation of Steinhart and Hart, so that the excitation
+    need not be accurate. `measure` averages a burst of each input, `glance` takes one conversion: three requests
+    and one, with inputs that are neighbours in ascending order.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    clock : Clock
+        The clock of the run.
+    settings : T7Thermistor.Settings
+        What the rig file says.
+    instrument : LabJackT7
+        The connection; `connect` makes it.
+    identity : Identity
+        What the instrument said of itself.
+    """
+
+    Settings: ClassVar[type[T7ThermistorSettings]] = T7ThermistorSettings
+
+    def __init__(
+        self, name: str, clock: Clock, settings: T7ThermistorSettings, instrument: LabJackT7, identity: Identity
+    ) -> None:
+        super().__init__(name, clock)
+        self._settings = settings
+        self._instrument = instrument
+        self._inputs = AnalogInputs(name, instrument, settings)
+        self._identity = identity
+
+    @classmethod
+    def connect(cls, name: str, settings: T7ThermistorSettings, clock: Clock) -> T7Thermistor:
+        """Open the connection, check that a T7 answers, and set its inputs up.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If nobody answers, or another device, or with swapped words.
+        DeviceError
+            If the instrument does not take a setting.
+        """
+        instrument = LabJackT7(name, settings.port, settings.timeout)
+        try:
+            sensor = cls(name, clock, settings, instrument, instrument.identify())
+            sensor._inputs.set_up()
+        except BaseException:
+            instrument.close()
+            raise
+        return sensor
+
+    @property
+    def identity(self) -> Identity:
+        """Get the identity that the instrument gave on connecting."""
+        return self._identity
+
+    def measure(self) -> dict[str, float]:
+        """Measure the temperature in °C, by the means of `samples` conversions.
+
+        Raises
+        ------
+        DeviceError
+            If an input is over its range, the excitation has failed, the thermistor is open or shorted, or the
+            temperature is outside of its limits.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        return self._temperature(*self._inputs.average())
+
+    def glance(self) -> dict[str, float]:
+        """Measure the temperature in °C by one conversion; raises what `measure` does."""
+        return self._temperature(*self._inputs.convert())
+
+    def safe(self) -> None:
+        """Do nothing: a sensor is safe in any state."""
+
+    def close(self) -> None:
+        """Release the connection."""
+        self._instrument.close()
+
+    def _temperature(self, divider: float, excitation: float) -> dict[str, float]:
+        settings = self._settings
+        divider_channel, excitation_channel = settings.channels
+        low, high = ((1 + side * _EXCITATION) * settings.excitation_volts for side in (-1, 1))
+        if not low <= excitation <= high:
+            raise DeviceError(
+                self.name,
+                f"excitation of the thermistor is {excitation:.3g} V at AIN{excitation_channel}, expected {low:g} to "
+                f"{high:g} V; it has failed or is not connected",
+            )
+        share = divider / excitation
+        if share >= _OPEN:
+            raise DeviceError(
+                self.name,
+                f"thermistor open: the divider at AIN{divider_channel} is at {100 * share:.4g} % of its excitation; "
+                "a wire is broken or not connected",
+            )
+        if share <= _SHORTED:
+            raise DeviceError(
+                self.name,
+                f"thermistor shorted: the divider at AIN{divider_channel} is at {100 * share:.4g} % of its "
+                "excitation; check its wires for a short circuit",
+            )
+        temperature = _celsius(settings.steinhart_hart, settings.reference_ohms * share / (1 - share))
+        lowest, highest = settings.temperature_limits
+        if not lowest <= temperature <= highest:
+            raise DeviceError(
+                self.name,
+                f"temperature {temperature:.4g} °C is outside of {lowest:g} to {highest:g} °C; bring it back, or "
+                "check the thermistor and `temperature_limits`",
+            )
+        return {f"{self.name}_temperature": temperature}
+
+
+class T7HighVoltageSupply(VoltageSupply):
+    """A high-voltage amplifier of fixed gain, which a LabJack T7 gives its set-point, switches on and reads.
+
+    An analog output gives the set-point, a digital line enables the amplifier, and three analog inputs read its
+    voltage monitor, its current monitor and its status output. The watchdog of the instrument switches the enable
+    line off when no host has talked to the instrument for its time (see `DigitalOutput`); it cannot drive an
+    LJTick-DAC, which cannot be read back either: the voltage monitor confirms 0 V. An LJTick-DAC has 14 bits over
+    ±10 V, DAC0 and DAC1 have 12 over 5 V, so a gain that uses the whole range gives the finest steps.
+
+    Until `connect`, and after a restart of the instrument, the enable line is an input that is pulled up weakly: an
+    active high enable input needs a pull-down.
+
+    With inputs that are neighbours in ascending order, `glance` takes one request, `measure` three, and `safe`
+    five or more. `set` takes one request; the first one, and the first after the output went off, six or more, and
+    one whose last look at the status, by any call, was 0.1 s ago or more takes one more.
+
+    When the amplifier went off by itself, the next `measure` or `glance` says so once, and so does the next `set`
+    that looks at the status. The set-point is 0 then and the enable line off; `set` switches on again.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    clock : Clock
+        The clock of the run.
+    settings : T7HighVoltageSupply.Settings
+        What the rig file says.
+    instrument : LabJackT7
+        The connection; `connect` makes it.
+    identity : Identity
+        What the instrument said of itself.
+    """
+
+    Settings: ClassVar[type[T7HighVoltageSettings]] = T7HighVoltageSettings
+
+    def __init__(
+        self, name: str, clock: Clock, settings: T7HighVoltageSettings, instrument: LabJackT7, identity: Identity
+    ) -> None:
+        super().__init__(name, clock)
+        self._settings = settings
+        self._instrument = instrument
+        self._inputs = AnalogInputs(name, instrument, settings)
+        self._enable = DigitalOutput(name, instrument, settings.line, active_high=settings.active_high)
+        self._identity = identity
+        self._limits = Limits(*settings.voltage_limits, "V")
+        kind, number = settings.analog_output.split("dac")
+        self._address = (_TDAC if kind else _DAC) + 2 * int(number)
+        self._setpoint = math.nan
+        self._enabled = False
+        self._looked = -math.inf
+        self._sent = Status.completed(name, clock)
+
+    @classmethod
+    def connect(cls, name: str, settings: T7HighVoltageSettings, clock: Clock) -> T7HighVoltageSupply:
+        """Open the connection, check that a T7 answers, switch off and put the enable line under the watchdog.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If nobody answers, or another device, or with swapped words.
+        DeviceError
+            If the instrument does not take a setting, or the amplifier does not go off.
+        """
+        instrument = LabJackT7(name, settings.port, settings.timeout)
+        try:
+            supply = cls(name, clock, settings, instrument, instrument.identify())
+            supply._inputs.set_up()
+            supply._switch_off()
+            supply._enable.guard(settings.watchdog)
+        except BaseException:
+            instrument.close()
+            raise
+        return supply
+
+    @property
+    def identity(self) -> Identity:
+        """Get the identity that the instrument gave on connecting."""
+        return self._identity
+
+    @property
+    def limits(self) -> Limits:
+        """The voltages that are allowed."""
+        return self._limits
+
+    @property
+    def output(self) -> str:
+        """What the set-point is: a constant voltage."""
+        return "dc"
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent in V; 0 when the output went off, nan at first."""
+        return self._setpoint
+
+    def set(self, value: float) -> Status:
+        """Send a voltage in V, and switch the amplifier on if it is off, at 0 V.
+
+        The status is complete at once: an amplifier settles while the request goes back.
+
+        Raises
+        ------
+        LimitError
+            If `value` is outside of the limits; nothing is sent.
+        DeviceError
+            If the amplifier does not go on or went off by itself, or the instrument refuses.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        self.check(value)
+        if not self._enabled:
+            self._switch_on()
+        elif self._clock.now() - self._looked >= _STATUS_AGE:
+            self.glance()
+        self._setpoint = float(value)
+        self._send(value)
+        return self._sent
+
+    def measure(self) -> dict[str, float]:
+        """Measure voltage in V and current in A by the monitors, as means of `samples` conversions.
+
+        Raises
+        ------
+        DeviceError
+            Once, if the amplifier went off by itself; if it is on although it was switched off, or an input is
+            over its range.
+        DeviceConnectionError
+            If the instrument does not answer.
+        """
+        return self._values(*self._inputs.average())
+
+    def glance(self) -> dict[str, float]:
+        """Measure voltage in V and current in A by one conversion; raises what `measure` does."""
+        return self._values(*self._inputs.convert())
+
+    def safe(self) -> None:
+        """Send 0 V, switch the enable line off, and see that the amplifier is off and its output at 0 V.
+
+        Raises
+        ------
+        DeviceError
+            If that could not be confirmed; everything was tried.
+        """
+        self._setpoint = 0.0
+        self._switch_off()
+
+    def close(self) -> None:
+        """Release the connection; an output that is on is left to the watchdog."""
+        # An instrument that cannot be reached any more keeps its watchdog, which is as well.
+        with suppress(DeviceError):
+            if not self._enable.is_on:
+                self._enable.unguard()
+        self._instrument.close()
+
+    def _send(self, volts: float) -> None:
+        words = struct.unpack(">2H", struct.pack(">f", self._settings.sent(volts)))
+        self._instrument.write_words(self._address, words)
+
+    def _switch_on(self) -> None:
+        self._setpoint = 0.0
+        try:
+            self._send(0.0)
+            self._enable.switch(True)
+            for _ in range(_LOOKS):
+                if self._look()[2]:
+                    self._enabled = True
+                    return
+                self._clock.sleep(_LOOK_INTERVAL)
+            raise DeviceError(
+                self.name,
+                f"the amplifier does not report that it is on {_LOOKS * _LOOK_INTERVAL:g} s after {self._enable}, "
+                "its enable line, was switched on; check its power, its own protection and interlocks, and the wire "
+                f"from its status output to AIN{self._settings.channels[2]}",
+            )
+        except BaseException:
+            with suppress(DeviceError):
+                self._switch_off()
+            raise
+
+    def _switch_off(self) -> None:
+        """Try every step whatever comes of the others, and raise the first error."""
+        self._enabled = False
+        first: DeviceError | None = None
+        for step in (partial(self._send, 0.0), partial(self._enable.switch, False), self._check_off):
+            try:
+                step()
+            except DeviceError as error:
+                first = first or error
+        if first is not None:
+            raise first
+
+    def _check_off(self) -> None:
+        for _ in range(_LOOKS):
+            voltage, _, on = self._look()
+            if not on and abs(voltage) < _DISCHARGED:
+                return
+            self._clock.sleep(_LOOK_INTERVAL)
+        if on:
+            raise self._still_on()
+        raise DeviceError(
+            self.name,
+            f"the output is at {voltage:.3g} V although it was switched off; keep away from it and switch the "
+            "amplifier off by hand",
+        )
+
+    def _look(self) -> tuple[float, float, bool]:
+        """Get voltage in V, current in A, and whether the amplifier says that it is on, by one conversion."""
+        return self._monitored(*self._inputs.convert())
+
+    def _monitored(self, voltage: float, current: float, status: float) -> tuple[float, float, bool]:
+        self._looked = self._clock.now()
+        settings = self._settings
+        return settings.volts_per_volt * voltage, settings.amperes_per_volt * current, status >= _STATUS_ON
+
+    def _values(self, *volts: float) -> dict[str, float]:
+        voltage, current, on = self._monitored(*volts)
+        if on and not self._enabled:
+            raise self._still_on()
+        if self._enabled and not on:
+            raise self._went_off()
+        return {f"{self.name}_voltage": voltage, f"{self.name}_current": current}
+
+    def _still_on(self) -> DeviceError:
+        return DeviceError(
+            self.name,
+            f"the amplifier reports that it is on although {self._enable}, its enable line, was switched off; check "
+            "the wiring, and that no other program uses the line",
+        )
+
+    def _went_off(self) -> DeviceError:
+        """Bring everything into the safe state, and return what is known of the cause."""
+        self._setpoint = 0.0
+        if self._enable.is_on:
+            cause = (
+                f"{self._enable}, its enable line, is on: its own protection has tripped, an interlock is open, or "
+                "it has lost its power"
+            )
+        else:
+            cause = (
+                f"{self._enable}, its enable line, is off: the watchdog of the instrument has run out, as nobody "
+                f"talked to it for {self._enable.watchdog} s, or another program switched the line"
+            )
+        try:
+            self._switch_off()
+        except DeviceError as error:
+            cause += f"; that it is safe could not be confirmed ({error})"
+        return DeviceError(
+            self.name,
+            f"the amplifier went off by itself, while {cause}; the set-point is 0 V now: remove the cause, then set "
+            "it again",
+        )

@@ -1,8 +1,9 @@
-"""An emulated LabJack T7, and the transducers that are wired to its inputs.
+"""An emulated LabJack T7, and the transducers and the high-voltage amplifier that are wired to it.
 
 The register map is that of `ljm_constants.json` (repository labjack/ljm_constants), the behaviour that of the
-LabJack T-series datasheet: 14.1.7 (average, minimum and maximum), 14.3.0 (T7 analog inputs), A-3-1 (noise and
-resolution), and the descriptions of the watchdog registers in the map.
+LabJack T-series datasheet: 14.1.7 (average, minimum and maximum), 14.3.0 (T7 analog inputs), 15.0 (analog
+outputs), A-3-1 (noise and resolution), the datasheet of the LJTick-DAC, and the descriptions of the watchdog
+registers in the map. Thermistors follow Steinhart and Hart 1968, Deep-Sea Research 15.
 
 Assumptions, where these say nothing:
 
@@ -13,7 +14,8 @@ Assumptions, where these say nothing:
 - Detail 2371 belongs to the settling time, as the known 2370, 2373 and 2375 stand in the order of the error
   table with it in between.
 - A burst longer than the 0.18 s that the datasheet allows is refused with exception 4.
-- DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V.
+- DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
+  offset. The register of a DAC reads back what was written.
 - After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
   nothing as long as nobody communicates, so they are done once.
 - A single conversion takes no laboratory time; a burst takes what its scan rate says.
@@ -29,11 +31,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
-from bench.devices import Identity, PositionSensor, Status, Switch
+from bench.devices import Identity, Limits, PositionSensor, Status, Switch, TemperatureSensor, VoltageSupply
 from bench.errors import DeviceError
 from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
@@ -69,6 +71,12 @@ noise at ±10 V, µV rms
 That the noise is in proportion to the range is an assumption: the real one falls less at high gain.
 """
 
+DAC_STEP = 5.0 / 4096
+"""Step in V of DAC0 and DAC1, which have 12 bits (15.0)."""
+
+TDAC_STEP = 20.0 / 16384
+"""Step in V of an LJTick-DAC, which has 14 bits (its datasheet)."""
+
 _DEFAULT_INDEX = 8  # what index 0 means to a command-response reading of a T7
 _DEFAULT_STREAM_INDEX = 1  # and to a burst, as ljm_constants.json says of STREAM_RESOLUTION_INDEX
 _EF_OFF, _EF_AVERAGE = 0, 3
@@ -80,6 +88,7 @@ _TDACS = 23
 _DIOS = 23
 _DAC_TOP = 5.0
 _TDAC_TOP = 10.0
+_KELVIN = 273.15
 
 _FORMATS = {"F32": ">f", "U32": ">I", "U16": ">H"}
 
@@ -147,6 +156,10 @@ class _Watchdog:
     dac1: float = 0.0
 
 
+STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
+"""A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
+
+
 class EmulatedT7:
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
@@ -201,23 +214,44 @@ class EmulatedT7:
         self._watchdog = _Watchdog()
         self._due = math.inf
         self._expired_at: float | None = None
+        self._followers: list[Callable[[], None]] = []
         self._words: dict[int, tuple[int, _Register]] = {}
         self._build_map()
         world.add(self)
 
+    @property
+    def identity(self) -> Identity:
+        """What the instrument says of itself."""
+        return Identity("LabJack", "T7", str(self.serial_number), f"{self.firmware:.4f}")
+
     # What the laboratory around the instrument sees of it.
 
     def dac_volts(self, number: int) -> float:
-        """Return the voltage in V at DAC0 or DAC1."""
-        return self._dacs[number]
+        """Return the voltage in V at DAC0 or DAC1, in its steps."""
+        return DAC_STEP * round(self._dacs[number] / DAC_STEP)
 
     def tdac_volts(self, number: int) -> float:
-        """Return the voltage in V at an output of an LJTick-DAC, 0 to 22."""
-        return self._tdacs[number]
+        """Return the voltage in V at an output of an LJTick-DAC, 0 to 22, in its steps."""
+        return TDAC_STEP * round(self._tdacs[number] / TDAC_STEP)
 
-    def dio_level(self, number: int) -> bool:
-        """Return the level of a digital line, 0 to 22; a line that is not an output is pulled high."""
-        return bool(self._levels() >> number & 1)
+    def dio_level(self, number: int, *, pulled_down: bool = False) -> bool:
+        """Return the level of a digital line, 0 to 22.
+
+        A line that is not an output is pulled high by the instrument, weakly; `pulled_down` says that what it is
+        wired to pulls it low all the same.
+        """
+        levels = self._dio_state & self._dio_direction if pulled_down else self._levels()
+        return bool(levels >> number & 1)
+
+    def add_follower(self, follow: Callable[[], None]) -> None:
+        """Have `follow()` called now, after every request and when the watchdog acts.
+
+        What is wired to the outputs looks at them then; the world stands at that instant.
+        """
+        with self.world.lock:
+            self.world.advance()
+            self._followers.append(follow)
+            follow()
 
     @property
     def watchdog_expired(self) -> bool:
@@ -279,6 +313,12 @@ class EmulatedT7:
             except RegisterError as refusal:
                 self._last_error = refusal.detail if isinstance(refusal, _DetailedError) else 0
                 raise
+            finally:
+                self._lead()
+
+    def _lead(self) -> None:
+        for follow in self._followers:
+            follow()
 
     def read_value(self, address: int) -> float:
         """Return the value that begins at `address`, as one request would."""
@@ -309,6 +349,7 @@ class EmulatedT7:
             self._dio_direction = self._dio_direction & ~affected | dog.dio_direction & affected
         self._expired_at = self._due
         self._due = math.inf
+        self._lead()
 
     def _attend(self) -> None:
         """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
@@ -347,10 +388,28 @@ class EmulatedT7:
 
     # The analog inputs.
 
+    def set_inputs_up(
+        self, channels: Sequence[int], range_volts: float, resolution_index: int, samples: int, sample_rate: float
+    ) -> None:
+        """Set single-ended inputs up for `convert` and `burst`, as requests of a host would.
+
+        Raises
+        ------
+        RegisterError
+            If a setting is refused.
+        """
+        self.write_value(4010, resolution_index)
+        for channel in channels:
+            self.write_value(40000 + 2 * channel, range_volts)
+            self.write_value(41000 + channel, SINGLE_ENDED)
+            self.write_value(41500 + channel, resolution_index)
+            self.write_value(9000 + 2 * channel, _EF_AVERAGE)
+            self.write_value(9300 + 2 * channel, samples)
+            self.write_value(10200 + 2 * channel, sample_rate)
+
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
-        with self.world.lock:
-            self.world.advance()
+        with self._request():
             return self._convert(channel, self._inputs[channel].resolution_index or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
@@ -361,14 +420,13 @@ class EmulatedT7:
         RegisterError
             If the input is not set up for it, or the burst would take longer than 0.18 s.
         """
-        with self.world.lock:
+        with self._request():
             settings = self._inputs[channel]
             if settings.feature != _EF_AVERAGE:
                 raise RegisterError(ILLEGAL_ADDRESS, f"AIN{channel}_EF_INDEX is not {_EF_AVERAGE}")
             duration = settings.samples / settings.scan_rate
             if duration > _LONGEST_BURST:
                 raise RegisterError(DEVICE_FAILURE, f"a burst of {duration:g} s is too long")
-            self.world.advance()
             begin = self.world.time
             readings = []
             for sample in range(1, settings.samples + 1):
@@ -492,7 +550,9 @@ class EmulatedT7:
         for channel in range(CHANNELS):
             self._add_input(channel)
         for number in range(2):
-            self._add(1000 + 2 * number, "F32", partial(self.dac_volts, number), partial(self._set_dac, number))
+            self._add(
+                1000 + 2 * number, "F32", partial(self._dacs.__getitem__, number), partial(self._set_dac, number)
+            )
         for number in range(_TDACS):
             self._add(30000 + 2 * number, "F32", None, partial(self._set_tdac, number))
         for number in range(_DIOS):
@@ -553,6 +613,13 @@ class EmulatedT7:
 
 def _all_dio() -> int:
     return (1 << _DIOS) - 1
+
+
+def _bursts(name: str, instrument: EmulatedT7, channels: Sequence[int]) -> list[Burst]:
+    try:
+        return [instrument.burst(channel) for channel in channels]
+    except RegisterError as refusal:
+        raise DeviceError(name, f"the instrument refuses to measure: {refusal}") from refusal
 
 
 class EmulatedPositionSensor(PositionSensor):
@@ -628,27 +695,16 @@ class EmulatedPositionSensor(PositionSensor):
         self._stroke = stroke
         self._zero_position = zero_position
         self._limits = position_limits
-        instrument.write_value(4010, resolution_index)
-        for channel in self._channels:
-            instrument.write_value(40000 + 2 * channel, range_volts)
-            instrument.write_value(41000 + channel, SINGLE_ENDED)
-            instrument.write_value(41500 + channel, resolution_index)
-            instrument.write_value(9000 + 2 * channel, _EF_AVERAGE)
-            instrument.write_value(9300 + 2 * channel, samples)
-            instrument.write_value(10200 + 2 * channel, sample_rate)
+        instrument.set_inputs_up(self._channels, range_volts, resolution_index, samples, sample_rate)
 
     @property
     def identity(self) -> Identity:
         """Identity of the instrument."""
-        return Identity("LabJack", "T7", str(self._instrument.serial_number), f"{self._instrument.firmware:.4f}")
+        return self._instrument.identity
 
     def measure(self) -> dict[str, float]:
         """Measure the position in m, as a mean of conversions."""
-        try:
-            bursts = [self._instrument.burst(channel) for channel in self._channels]
-        except RegisterError as refusal:
-            raise DeviceError(self.name, f"the instrument refuses to measure: {refusal}") from refusal
-        return self._position(bursts)
+        return self._position(_bursts(self.name, self._instrument, self._channels))
 
     def glance(self) -> dict[str, float]:
         """Measure the position in m by one conversion."""
@@ -726,7 +782,7 @@ class EmulatedSwitch(Switch):
     @property
     def identity(self) -> Identity:
         """Identity of the instrument."""
-        return Identity("LabJack", "T7", str(self._instrument.serial_number), f"{self._instrument.firmware:.4f}")
+        return self._instrument.identity
 
     @property
     def setpoint(self) -> float:
@@ -774,6 +830,235 @@ class EmulatedSwitch(Switch):
         write(61634, direction | bit)
         write(61636, inhibit & ~bit)
         write(61600, 1)
+
+
+class EmulatedTemperatureSensor(TemperatureSensor):
+    """The role of a temperature sensor, played by an emulated T7 that is called directly, without a wire.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    instrument : EmulatedT7
+        The instrument; its inputs are set up here.
+    channels : tuple of int
+        Inputs of a thermistor's divider and of its excitation, 0 to 13.
+    reference_ohms, steinhart_hart : float and tuple of float
+        The divider and the thermistor, as those of `Thermistor`.
+    excitation_volts : float
+        Excitation in V; 20 % off is an error.
+    temperature_limits : tuple of float
+        Range in °C.
+    resolution_index, samples, sample_rate
+        Resolution index 0 to 8, conversions that one measurement averages, and conversions in a second in Hz.
+
+    Raises
+    ------
+    RegisterError
+        If the instrument refuses a setting.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        instrument: EmulatedT7,
+        *,
+        channels: tuple[int, int] = (0, 1),
+        reference_ohms: float = 10e3,
+        excitation_volts: float = 2.5,
+        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
+        temperature_limits: tuple[float, float] = (-40.0, 125.0),
+        resolution_index: int = 4,
+        samples: int = 10,
+        sample_rate: float = 1000.0,
+    ) -> None:
+        super().__init__(name, instrument.world.clock)
+        self._instrument = instrument
+        self._channels = channels
+        self._reference = reference_ohms
+        self._excitation = excitation_volts
+        self._steinhart_hart = steinhart_hart
+        self._limits = temperature_limits
+        instrument.set_inputs_up(channels, 10.0, resolution_index, samples, sample_rate)
+
+    @property
+    def identity(self) -> Identity:
+        """Identity of the instrument."""
+        return self._instrument.identity
+
+    def measure(self) -> dict[str, float]:
+        """Measure the temperature in °C, by means of conversions."""
+        return self._temperature(*(each.average for each in _bursts(self.name, self._instrument, self._channels)))
+
+    def glance(self) -> dict[str, float]:
+        """Measure the temperature in °C by one conversion."""
+        return self._temperature(*map(self._instrument.convert, self._channels))
+
+    def safe(self) -> None:
+        """Do nothing: a sensor is safe in any state."""
+
+    def close(self) -> None:
+        """Do nothing: there is no line."""
+
+    def _temperature(self, divider: float, excitation: float) -> dict[str, float]:
+        if not 0.8 <= excitation / self._excitation <= 1.2:
+            raise DeviceError(self.name, f"excitation of the thermistor is {excitation:.3g} V")
+        share = divider / excitation
+        if not 0.01 < share < 0.99:
+            raise DeviceError(self.name, f"thermistor {'open' if share > 0.5 else 'shorted'}")
+        a, b, c = self._steinhart_hart
+        log = math.log(self._reference * share / (1 - share))
+        temperature = 1 / (a + b * log + c * log**3) - _KELVIN
+        low, high = self._limits
+        if not low <= temperature <= high:
+            raise DeviceError(self.name, f"temperature {temperature:.4g} °C is outside of {low:g} to {high:g} °C")
+        return {f"{self.name}_temperature": temperature}
+
+
+class EmulatedHighVoltageSupply(VoltageSupply):
+    """The role of a voltage supply, played by an emulated T7 and the amplifier behind it, without a wire.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    instrument : EmulatedT7
+        The instrument; its inputs are set up here, its line is switched off and put under its watchdog.
+    channels : tuple of int
+        Inputs of the amplifier's voltage monitor, current monitor and status output, 0 to 13.
+    analog_output : str
+        Output of the set-point: dac0, dac1, or tdac0 to tdac22.
+    line, active_high, watchdog
+        Line of the enable input, as those of `EmulatedSwitch`.
+    gain, offset_volts, volts_per_volt, amperes_per_volt : float
+        The amplifier, as those of `PiezoAmplifier`.
+    voltage_limits : tuple of float
+        Lowest and highest set-point in V.
+    resolution_index, samples, sample_rate
+        Resolution index 0 to 8, conversions that one measurement averages, and conversions in a second in Hz.
+
+    Raises
+    ------
+    RegisterError
+        If the instrument refuses a setting.
+    """
+
+    _STATUS_AGE = 0.1  # s, after which `set` looks at the status again
+
+    def __init__(
+        self,
+        name: str,
+        instrument: EmulatedT7,
+        *,
+        line: int,
+        channels: tuple[int, int, int] = (0, 1, 2),
+        analog_output: str = "tdac0",
+        active_high: bool = True,
+        watchdog: int = 5,
+        gain: float = 20.0,
+        offset_volts: float = 0.0,
+        volts_per_volt: float = 20.0,
+        amperes_per_volt: float = 0.01,
+        voltage_limits: tuple[float, float] = (-40.0, 40.0),
+        resolution_index: int = 4,
+        samples: int = 10,
+        sample_rate: float = 1000.0,
+    ) -> None:
+        super().__init__(name, instrument.world.clock)
+        self._instrument = instrument
+        self._channels = channels
+        kind, number = analog_output.split("dac")
+        self._address = (30000 if kind else 1000) + 2 * int(number)
+        self._gain = gain
+        self._offset = offset_volts
+        self._scales = (volts_per_volt, amperes_per_volt)
+        self._limits = Limits(*voltage_limits, "V")
+        self._setpoint = math.nan
+        self._enabled = False
+        self._looked = -math.inf
+        self._sent = Status.completed(name, instrument.world.clock)
+        instrument.set_inputs_up(channels, 10.0, resolution_index, samples, sample_rate)
+        self._send(0.0)
+        self._enable = EmulatedSwitch(name, instrument, line=line, active_high=active_high, watchdog=watchdog)
+
+    @property
+    def identity(self) -> Identity:
+        """Identity of the instrument."""
+        return self._instrument.identity
+
+    @property
+    def limits(self) -> Limits:
+        """The voltages that are allowed."""
+        return self._limits
+
+    @property
+    def output(self) -> str:
+        """What the set-point is: a constant voltage."""
+        return "dc"
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent in V; 0 when the output went off, nan at first."""
+        return self._setpoint
+
+    def set(self, value: float) -> Status:
+        """Send a voltage in V, and switch the amplifier on if it is off, at 0 V."""
+        self.check(value)
+        if not self._enabled:
+            self._switch_on()
+        elif self._clock.now() - self._looked >= self._STATUS_AGE:
+            self.glance()
+        self._setpoint = float(value)
+        self._send(value)
+        return self._sent
+
+    def measure(self) -> dict[str, float]:
+        """Measure voltage in V and current in A by the monitors, as means of conversions."""
+        return self._values(*(each.average for each in _bursts(self.name, self._instrument, self._channels)))
+
+    def glance(self) -> dict[str, float]:
+        """Measure voltage in V and current in A by one conversion."""
+        return self._values(*map(self._instrument.convert, self._channels))
+
+    def safe(self) -> None:
+        """Send 0 V and switch the enable line off."""
+        self._setpoint = 0.0
+        self._switch_off()
+
+    def close(self) -> None:
+        """Do nothing: there is no line of communication, and the enable line is left to the watchdog."""
+
+    def _send(self, volts: float) -> None:
+        self._instrument.write_value(self._address, self._offset + volts / self._gain)
+
+    def _switch_on(self) -> None:
+        self._setpoint = 0.0
+        self._send(0.0)
+        self._enable.set(1.0)
+        self._enabled = True
+        self.glance()
+
+    def _switch_off(self) -> None:
+        self._enabled = False
+        self._send(0.0)
+        self._enable.safe()
+
+    def _values(self, voltage: float, current: float, status: float) -> dict[str, float]:
+        self._looked = self._clock.now()
+        on = status >= 2.0
+        if on and not self._enabled:
+            raise DeviceError(self.name, "the amplifier reports that it is on although it was switched off")
+        if self._enabled and not on:
+            self._setpoint = 0.0
+            try:
+                self._enable.measure()
+                cause = "its enable line is on: its own protection has tripped"
+            except DeviceError:
+                cause = "its enable line is off: the watchdog has run out"
+            self._switch_off()
+            raise DeviceError(self.name, f"the amplifier went off by itself, while {cause}")
+        volts, amperes = self._scales
+        return {f"{self.name}_voltage": volts * voltage, f"{self.name}_current": amperes * current}
 
 
 class NormalisedPSD:
@@ -934,3 +1219,275 @@ class RatiometricSensor:
     def supply(self) -> float:
         """Return the voltage in V of the supply at this instant."""
         return self.supply_volts
+
+
+class DisplacementSensor:
+    """An optical displacement sensor with a voltage in proportion to the displacement.
+
+    Parameters
+    ----------
+    displacement : callable
+        The displacement in m, from the plant.
+    volts_per_metre : float
+        Sensitivity in V/m.
+    reach : float
+        Displacement of either sign in m beyond which the output stays where it is.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the displacement, in m.
+    rng : numpy.random.Generator
+        Source of the noise.
+    """
+
+    def __init__(
+        self,
+        displacement: Callable[[], float],
+        volts_per_metre: float = 5e4,
+        reach: float = 200e-6,
+        noise: float = 10e-9,
+        resolution: float = 10e-9,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self._displacement = displacement
+        self._volts_per_metre = volts_per_metre
+        self._reach = reach
+        self._noise = noise
+        self._resolution = resolution
+        self._rng = rng
+
+    def __call__(self) -> float:
+        """Return the voltage in V at this instant."""
+        noisy = self._displacement() + self._noise * self._rng.standard_normal()
+        shown = round(noisy / self._resolution) * self._resolution
+        return self._volts_per_metre * min(max(shown, -self._reach), self._reach)
+
+
+class Thermistor:
+    """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
+
+    Assumptions: no self-heating, an exact reference resistor.
+
+    Parameters
+    ----------
+    temperature : callable
+        The temperature in °C, from the plant.
+    reference_ohms : float
+        Reference resistor in Ω.
+    steinhart_hart : tuple of float
+        A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive.
+    excitation_volts : float
+        Excitation in V.
+    excitation_error : float
+        How far the excitation of one instance is from that, in V rms; drawn once.
+    noise : float
+        White noise in K rms, drawn anew for every conversion; zero or positive.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the excitation.
+
+    Attributes
+    ----------
+    excitation_volts : float
+        Voltage of the excitation in V; for faults and drift.
+    open, shorted : bool
+        Whether a wire of the thermistor is broken, or its wires touch; for faults.
+    """
+
+    def __init__(
+        self,
+        temperature: Callable[[], float],
+        reference_ohms: float = 10e3,
+        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
+        excitation_volts: float = 2.5,
+        excitation_error: float = 10e-3,
+        noise: float = 0.02,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self.excitation_volts = excitation_volts + excitation_error * rng.standard_normal()
+        self.open = False
+        self.shorted = False
+        self._temperature = temperature
+        self._reference = reference_ohms
+        self._steinhart_hart = steinhart_hart
+        self._noise = noise
+        self._rng = rng
+
+    def divider(self) -> float:
+        """Return the voltage in V at the input of the divider at this instant."""
+        if self.shorted:
+            return 0.0
+        if self.open:
+            return self.excitation_volts
+        ohms = self._ohms(self._temperature() + self._noise * self._rng.standard_normal())
+        return self.excitation_volts * ohms / (ohms + self._reference)
+
+    def excitation(self) -> float:
+        """Return the voltage in V of the excitation at this instant."""
+        return self.excitation_volts
+
+    def _ohms(self, celsius: float) -> float:
+        """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
+        a, b, c = self._steinhart_hart
+        half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
+        root = math.sqrt((b / (3 * c)) ** 3 + half**2)
+        return math.exp(math.cbrt(root - half) - math.cbrt(root + half))
+
+
+class PiezoLoad(Protocol):
+    """What a high-voltage amplifier drives."""
+
+    def apply(self, voltage: float) -> None:
+        """Apply a voltage, V; held until the next."""
+
+
+class PiezoAmplifier:
+    """A high-voltage amplifier of fixed gain with an enable input, two monitors and a status output; `Timed`.
+
+    The output goes to a new value as a lag of first order does. The monitors show it exactly. The load, which
+    holds a voltage until the next, gets it in even steps of `STEP` or less, each at the instant at which the
+    output passes the middle of the step, so that it is half a step off at most, and arrives. It never goes back on
+    its way, also when the next set-point comes before it arrives. The output is clipped at ±`SATURATION`, and goes
+    to 0 V while the amplifier is off.
+
+    Assumptions: the protection stays tripped until the enable input is taken away; the status output changes at
+    once.
+
+    Parameters
+    ----------
+    world : World
+        The laboratory that the amplifier stands in.
+    load : PiezoLoad
+        What is driven, 0 V at first.
+    gain : float
+        Gain in V/V.
+    offset_volts : float
+        Input in V at which the output is 0 V.
+    settling_time : float
+        Time constant of the output in s.
+    capacitance : float
+        Capacitance of the load in F, for the current.
+    volts_per_volt, amperes_per_volt : float
+        Output voltage and current per volt of their monitors.
+    scale_error : float
+        How far gain and voltage monitor of one instance are from their values, as a share, rms; drawn once.
+    noise_volts : float
+        White noise of either monitor in V rms, drawn anew for every conversion; zero or positive.
+    rng : numpy.random.Generator
+        Source of the noise and of the errors of scale.
+    """
+
+    SATURATION = 45.0
+    STEP = 0.125
+    STATUS = 5.0
+
+    def __init__(
+        self,
+        world: World,
+        load: PiezoLoad,
+        *,
+        gain: float = 20.0,
+        offset_volts: float = 0.0,
+        settling_time: float = 0.2e-3,
+        capacitance: float = 20e-9,
+        volts_per_volt: float = 20.0,
+        amperes_per_volt: float = 0.01,
+        scale_error: float = 1e-3,
+        noise_volts: float = 0.2e-3,
+        rng: np.random.Generator,
+    ) -> None:
+        self._world = world
+        self._load = load
+        self._gain = gain * (1 + scale_error * rng.standard_normal())
+        self._offset = offset_volts
+        self._time_constant = settling_time
+        self._capacitance = capacitance
+        self._volts_per_volt = volts_per_volt * (1 + scale_error * rng.standard_normal())
+        self._amperes_per_volt = amperes_per_volt
+        self._noise = noise_volts
+        self._rng = rng
+        self._input = offset_volts
+        self._enabled = False
+        self._tripped = False
+        self._start = self._target = self._applied = 0.0
+        self._since = world.time
+        self._step = self._steps = 0
+        self._due = math.inf
+        world.add(self)
+
+    @property
+    def on(self) -> bool:
+        """Whether the output follows the input."""
+        return self._enabled and not self._tripped
+
+    @property
+    def voltage(self) -> float:
+        """Voltage of the output in V, where the world stands."""
+        elapsed = self._world.time - self._since
+        return self._target + (self._start - self._target) * math.exp(-elapsed / self._time_constant)
+
+    def drive(self, volts: float, enable: bool) -> None:
+        """Take what is at the inputs: the set-point in V, and whether the amplifier is enabled."""
+        if volts == self._input and enable == self._enabled:
+            return
+        self._input = volts
+        self._enabled = enable
+        self._tripped = self._tripped and enable
+        self._follow()
+
+    def trip(self) -> None:
+        """Have the protection switch the amplifier off, until the enable input is taken away."""
+        with self._world.lock:
+            self._world.advance()
+            self._tripped = self._enabled
+            self._follow()
+
+    def voltage_monitor(self) -> float:
+        """Return the voltage in V of the voltage monitor at this instant."""
+        return self.voltage / self._volts_per_volt + self._noise * self._rng.standard_normal()
+
+    def current_monitor(self) -> float:
+        """Return the voltage in V of the current monitor at this instant."""
+        amperes = self._capacitance * (self._target - self.voltage) / self._time_constant
+        return amperes / self._amperes_per_volt + self._noise * self._rng.standard_normal()
+
+    def status(self) -> float:
+        """Return the voltage in V of the status output: high while the amplifier is on."""
+        return self.STATUS if self.on else 0.0
+
+    def deadline(self) -> float:
+        """Return when the load gets its next step, in laboratory seconds; infinity when the output has settled."""
+        return self._due
+
+    def expire(self) -> None:
+        """Give the load its next step."""
+        self._step += 1
+        share = self._step / self._steps
+        self._apply(self._start + share * (self._target - self._start) if share < 1 else self._target)
+        self._schedule()
+
+    def _follow(self) -> None:
+        output = self._gain * (self._input - self._offset) if self.on else 0.0
+        target = min(max(output, -self.SATURATION), self.SATURATION)
+        if target == self._target:
+            return
+        self._start = self.voltage
+        self._target = target
+        self._since = self._world.time
+        self._apply(self._start)
+        self._step = 0
+        self._steps = math.ceil(abs(target - self._start) / self.STEP)
+        self._schedule()
+
+    def _schedule(self) -> None:
+        left = self._steps - self._step - 0.5
+        self._due = self._since + self._time_constant * math.log(self._steps / left) if left > 0 else math.inf
+
+    def _apply(self, volts: float) -> None:
+        # A load that is ahead of the output waits for it: going back would be a loop of its hysteresis.
+        low, high = (volts, self._target) if volts < self._target else (self._target, volts)
+        volts = min(max(self._applied, low), high)
+        if volts != self._applied:
+            self._applied = volts
+            self._load.apply(volts)

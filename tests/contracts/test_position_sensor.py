@@ -13,6 +13,7 @@ from bench.devices import PositionSensor, role_of
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7PositionSensor
 from sim_devices.instruments.labjack_t7 import (
+    DisplacementSensor,
     EmulatedPositionSensor,
     EmulatedT7,
     NormalisedPSD,
@@ -40,7 +41,7 @@ class Laboratory:
     stage: Stage
     clock: VirtualClock
     spoil: Callable[[], None]
-    transducer: NormalisedPSD | TwoCurrentPSD | RatiometricSensor
+    transducer: NormalisedPSD | TwoCurrentPSD | RatiometricSensor | DisplacementSensor
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Case:
     measured_within: float
     glanced_within: float
     settings: dict[str, object] = field(default_factory=dict)
+    readout: str = ""
 
 
 DETECTOR = {
@@ -74,6 +76,16 @@ CASES = {
         glanced_within=60e-6,
         settings={"zero_position": ZERO, "position_limits": (-15e-3, 15e-3)},
     ),
+    # Noise of 10 nm and steps of 10 nm, and 3 nm of the converter; five sigma of one conversion and of a mean of ten.
+    "displacement": Case(
+        (1,),
+        positions=(-195e-6, -1e-6, 0.0, 12.5e-6, 195e-6),
+        outside=199.5e-6,
+        measured_within=17e-9,
+        glanced_within=54e-9,
+        settings={"volts_per_metre": 5e4, "position_limits": (-199e-6, 199e-6)},
+        readout="voltage",
+    ),
 }
 
 
@@ -87,6 +99,12 @@ def laboratory(kind: str, readout: str, stack: ExitStack, seed: int = 1) -> Labo
 
         def spoil() -> None:
             stage.position = 1.0
+    elif readout == "displacement":
+        transducer = DisplacementSensor(lambda: stage.position, rng=streams[0])
+        inputs = {1: transducer}
+
+        def spoil() -> None:
+            stage.position = 210e-6
     elif readout == "ratiometric":
         transducer = RatiometricSensor(lambda: stage.position + ZERO, rng=streams[0])
         inputs = {4: transducer.output, 5: transducer.supply}
@@ -102,7 +120,7 @@ def laboratory(kind: str, readout: str, stack: ExitStack, seed: int = 1) -> Labo
 
     instrument = EmulatedT7(world, inputs, rng=streams[1])
     case = CASES[readout]
-    said = {"readout": readout, "channels": case.channels} | case.settings
+    said = {"readout": case.readout or readout, "channels": case.channels} | case.settings
     if kind == "emulated":
         sensor: PositionSensor = EmulatedPositionSensor("tip", instrument, **said)
     else:
@@ -205,7 +223,7 @@ def test_safe_and_stop_change_nothing(lab, case):
 def test_a_measurement_takes_the_time_of_its_conversions(lab, readout):
     begin = lab.clock.now()
     lab.sensor.measure()
-    assert lab.clock.now() - begin == pytest.approx(0.010 if readout == "voltage" else 0.020)
+    assert lab.clock.now() - begin == pytest.approx(0.010 * len(CASES[readout].channels))
     begin = lab.clock.now()
     lab.sensor.glance()
     assert lab.clock.now() == begin
@@ -252,6 +270,29 @@ def test_noise_of_a_measurement_is_that_of_the_mean(kind):
     assert np.std(means) == pytest.approx(50e-9 / math.sqrt(10), rel=0.12)
     assert np.std(single) == pytest.approx(50e-9, rel=0.12)
     assert abs(np.mean(means)) < 4 * 50e-9 / math.sqrt(5000)
+
+
+def test_noise_of_a_displacement_sensor_is_not_that_of_the_converter(kind):
+    with ExitStack() as stack:
+        lab = laboratory(kind, "displacement", stack)
+        lab.stage.position = 33.003e-6
+        means = [lab.sensor.measure()["tip_position"] for _ in range(500)]
+        single = [lab.sensor.glance()["tip_position"] for _ in range(1000)]
+    # 10 nm, steps of 10 nm, and 132 µV of the converter at 50 mV/µm, which are 2.6 nm.
+    sigma = math.sqrt(10e-9**2 + 10e-9**2 / 12 + 2.6e-9**2)
+    assert np.std(single) == pytest.approx(sigma, rel=0.07)
+    assert np.std(means) == pytest.approx(sigma / math.sqrt(10), rel=0.1)
+    assert abs(np.mean(means) - 33.003e-6) < 4 * sigma / math.sqrt(5000)
+
+
+@pytest.mark.parametrize("position", [-1e-3, -200e-6, 200e-6, 1e-3])
+def test_a_displacement_beyond_the_reach_is_never_a_position(kind, position):
+    with ExitStack() as stack:
+        lab = laboratory(kind, "displacement", stack)
+        lab.stage.position = position
+        for take in (lab.sensor.measure, lab.sensor.glance) * 20:
+            with pytest.raises(DeviceError, match=r"tip: AIN1 .*is over its range of ±10 V"):
+                take()
 
 
 def test_supply_of_a_ratiometric_sensor_does_not_matter_within_its_range(kind):

@@ -12,14 +12,23 @@ from pydantic import ValidationError
 
 from bench.clock import VirtualClock
 from bench.devices import Identity
-from bench.errors import DeviceConnectionError, DeviceError
-from drivers.labjack_t7 import DigitalOutput, LabJackT7, T7PositionSensor, T7Switch
-from sim_devices.instruments.labjack_t7 import EmulatedT7
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from drivers.labjack_t7 import (
+    DigitalOutput,
+    LabJackT7,
+    T7HighVoltageSupply,
+    T7PositionSensor,
+    T7Switch,
+    T7Thermistor,
+)
+from sim_devices.instruments.labjack_t7 import EmulatedT7, PiezoAmplifier
 from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
 SwitchSettings = T7Switch.Settings
+ThermistorSettings = T7Thermistor.Settings
+SupplySettings = T7HighVoltageSupply.Settings
 
 ALL_LINES = 0x7FFFFF
 RATIOMETRIC = {"readout": "ratiometric", "channels": (2, 3), "position_limits": (0.0, 0.035)}
@@ -27,6 +36,11 @@ RATIOMETRIC = {"readout": "ratiometric", "channels": (2, 3), "position_limits": 
 
 class Still:
     def advance(self, dt: float) -> None:
+        pass
+
+
+class Load:
+    def apply(self, voltage: float) -> None:
         pass
 
 
@@ -40,7 +54,7 @@ class Bench:
         inputs: dict[int, Callable[[], float]] = {channel: lambda c=channel: self.volts[c] for channel in range(14)}
         self.t7 = EmulatedT7(self.world, inputs, rng=np.random.default_rng(3))
         self.server = ModbusTcpServer(self.t7)
-        self.devices: list[T7PositionSensor | T7Switch] = []
+        self.devices: list[T7PositionSensor | T7Switch | T7Thermistor | T7HighVoltageSupply] = []
 
     def sensor(self, **settings) -> T7PositionSensor:
         made = T7PositionSensor.connect("psd", Settings(port=self.server.address, **settings), self.clock)
@@ -52,6 +66,26 @@ class Bench:
         made = T7Switch.connect("fan", SwitchSettings(port=self.server.address, **given), self.clock)
         self.devices.append(made)
         return made
+
+    def thermistor(self, **settings) -> T7Thermistor:
+        made = T7Thermistor.connect("base", ThermistorSettings(port=self.server.address, **settings), self.clock)
+        self.devices.append(made)
+        return made
+
+    def supply(self, **settings) -> T7HighVoltageSupply:
+        """A supply on line 5 whose status output, at AIN2, follows `self.volts`."""
+        given = {"line": 5} | settings
+        made = T7HighVoltageSupply.connect("hv", SupplySettings(port=self.server.address, **given), self.clock)
+        self.devices.append(made)
+        return made
+
+    def wire(self) -> PiezoAmplifier:
+        """Wire an amplifier to TDAC0, to line 5 and to AIN0, 1 and 2."""
+        amplifier = PiezoAmplifier(self.world, Load(), scale_error=0.0, rng=np.random.default_rng(8))
+        t7 = self.t7
+        t7._sources |= {0: amplifier.voltage_monitor, 1: amplifier.current_monitor, 2: amplifier.status}
+        t7.add_follower(lambda: amplifier.drive(t7.tdac_volts(0), t7.dio_level(5, pulled_down=True)))
+        return amplifier
 
     def guarded(self) -> int:
         """The lines that the watchdog drives when it runs out."""
@@ -218,7 +252,87 @@ def test_a_switch_needs_a_line():
         SwitchSettings(port="host")
 
 
-@pytest.mark.parametrize("settings", [Settings, SwitchSettings])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"channels": (2,)}, "channels"),
+        ({"channels": (2, 2)}, r"channels: expected different ones, got \[2, 2\]"),
+        ({"channels": (2, 3, 4)}, "channels"),
+        ({"reference_ohms": 0.0}, "reference_ohms"),
+        ({"excitation_volts": 0.0}, "excitation_volts"),
+        ({"excitation_volts": 9.0}, "excitation_volts"),
+        ({"range": 1.0}, r"range: an excitation of up to 3 V needs more than ±1 V; choose a larger one"),
+        ({"steinhart_hart": (1e-3, 2e-4)}, "steinhart_hart"),
+        ({"steinhart_hart": (1e-3, -2e-4, 0.0)}, r"steinhart_hart: .* fall all the way from 101 to 9\.9e\+05 Ω"),
+        ({"steinhart_hart": (1e-3, 0.0, 0.0)}, "steinhart_hart: the temperature must fall"),
+        ({"steinhart_hart": (1e-3, 2.3e-4, -1e-6)}, "steinhart_hart: the temperature must fall"),
+        ({"steinhart_hart": (4e-3, -1e-5, 1e-7)}, "steinhart_hart: the temperature must fall"),
+        ({"steinhart_hart": (-2e-3, 2.3e-4, 8.8e-8)}, "steinhart_hart: the temperature must fall"),
+        # Falls at both ends, and rises in between, where R is 1 Ω.
+        (
+            {"steinhart_hart": (5e-3, -1e-5, 1e-5), "reference_ohms": 1.0, "temperature_limits": (-100.0, 0.0)},
+            "steinhart_hart: the temperature must fall",
+        ),
+        ({"temperature_limits": (20.0, 20.0)}, "temperature_limits: expected low < high within"),
+        (
+            {"temperature_limits": (-60.0, 20.0)},
+            r"within -\d\d\.\d\d to \d{3}\.\d °C, which the divider .* got -60 and 20 °C",
+        ),
+        ({"temperature_limits": (0.0, 250.0)}, "temperature_limits"),
+        ({"gain": 20.0}, "gain"),
+    ],
+)
+def test_wrong_settings_of_a_thermistor_are_refused(wrong, message):
+    ThermistorSettings(port="host")
+    with pytest.raises(ValidationError, match=message):
+        ThermistorSettings(**{"port": "host"} | wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"line": 23}, "line"),
+        ({"channels": (0, 1)}, "channels"),
+        ({"channels": (0, 1, 1)}, "channels: expected different ones"),
+        ({"range": 1.0}, "range: a status output of 5 V needs 10 V, got 1 V"),
+        ({"analog_output": "dac2"}, "analog_output"),
+        ({"analog_output": "tdac23"}, "analog_output"),
+        ({"analog_output": "xtdac1"}, "analog_output"),
+        ({"gain": 0.0}, "gain"),
+        ({"volts_per_volt": 0.0}, "volts_per_volt"),
+        ({"amperes_per_volt": 0.0}, "amperes_per_volt"),
+        ({"amperes_per_volt": math.inf}, "amperes_per_volt"),
+        ({"watchdog": 0}, "watchdog"),
+        ({"voltage_limits": (1.0, 40.0)}, "voltage_limits: expected low ≤ 0 ≤ high and low < high, got 1 and 40 V"),
+        ({"voltage_limits": (0.0, 0.0)}, "voltage_limits: expected"),
+        ({"gain": 2.0}, r"voltage_limits: -40 V takes -20 V at tdac0, which gives -10 to 10 V"),
+        ({"analog_output": "dac0"}, r"voltage_limits: -40 V takes -2 V at dac0, which gives 0 to 5 V"),
+        ({"analog_output": "dac0", "offset_volts": 3.5}, r"voltage_limits: 40 V takes 5.5 V at dac0"),
+        ({"volts_per_volt": 4.0}, r"volts_per_volt: the voltage monitor would be over its range of ±10 V"),
+        ({"line": 0}, "line: DIO0 is taken by the LJTick-DAC of tdac0"),
+        ({"line": 13, "analog_output": "tdac12"}, "line: DIO13 is taken by the LJTick-DAC of tdac12"),
+    ],
+)
+def test_wrong_settings_of_a_high_voltage_supply_are_refused(wrong, message):
+    with pytest.raises(ValidationError, match=message):
+        SupplySettings(**{"port": "host", "line": 5} | wrong)
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        {},
+        {"analog_output": "dac1", "offset_volts": 2.5, "line": 0},
+        {"analog_output": "tdac22", "gain": -4.0},
+        {"voltage_limits": (-40.0, 0.0)},
+    ],
+)
+def test_settings_of_a_high_voltage_supply(right):
+    made = SupplySettings(**{"port": "host", "line": 5} | right)
+    assert made.sent(0.0) == right.get("offset_volts", 0.0)
+
+
+@pytest.mark.parametrize("settings", [Settings, SwitchSettings, ThermistorSettings, SupplySettings])
 def test_every_setting_is_described(settings):
     assert all(field.description for field in settings.model_fields.values())
 
@@ -307,6 +421,64 @@ def test_byte_vectors_of_a_switch():
         switch.set(1.0)
         assert switch.glance() == {"fan_state": 1.0}
         switch.close()
+    assert len(server.received) == len(exchanges)
+
+
+def test_byte_vectors_of_a_thermistor():
+    exchanges = (
+        ("0001 0000 0006 01 03 0004 0004", "0001 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2 1.25 V, AIN3 2.5 V
+        ("0002 0000 0006 01 03 1b5c 0004", "0002 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2_EF_READ_A ...
+        ("0003 0000 0006 01 03 1c88 0004", "0003 0000 000b 01 03 08 3fb0 0000 4024 0000"),  # AIN2_EF_READ_B ...
+        ("0004 0000 0006 01 03 1db4 0004", "0004 0000 000b 01 03 08 3f90 0000 401c 0000"),  # AIN2_EF_READ_C ...
+    )
+    with Scripted(*exchanges) as server:
+        settings = ThermistorSettings(port=server.address, channels=(2, 3))
+        t7 = LabJackT7("base", server.address, 2.0)
+        sensor = T7Thermistor("base", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        assert sensor.glance() == {"base_temperature": pytest.approx(25.0, abs=2e-3)}  # 10 kΩ
+        assert sensor.measure() == {"base_temperature": pytest.approx(25.0, abs=2e-3)}
+        sensor.close()
+    assert len(server.received) == len(exchanges)
+
+
+def test_byte_vectors_of_a_high_voltage_supply():
+    off, on = "0000 0000 0000 0000 0000 0000", "3f80 0000 3f00 0000 40a0 0000"  # 0, 0, 0 V and 1, 0.5, 5 V
+    exchanges = (
+        ("0001 0000 000b 01 10 7530 0002 04 0000 0000", "0001 0000 0006 01 10 7530 0002"),  # TDAC0 0 V
+        ("0002 0000 0009 01 10 07d5 0001 02 0001", "0002 0000 0006 01 10 07d5 0001"),  # DIO5 high
+        ("0003 0000 0006 01 03 0b22 0002", "0003 0000 0007 01 03 04 0000 0020"),  # DIO_DIRECTION
+        ("0004 0000 0006 01 03 0af0 0002", "0004 0000 0007 01 03 04 007f ffff"),  # DIO_STATE
+        ("0005 0000 0006 01 03 0000 0006", f"0005 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
+        ("0006 0000 000b 01 10 7530 0002 04 3f80 0000", "0006 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
+        ("0007 0000 000b 01 10 7530 0002 04 bf80 0000", "0007 0000 0006 01 10 7530 0002"),  # TDAC0 -1 V
+        ("0008 0000 0006 01 03 0000 0006", f"0008 0000 000f 01 03 0c {on}"),  # glance
+        ("0009 0000 000b 01 10 7530 0002 04 0000 0000", "0009 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
+        ("000a 0000 0009 01 10 07d5 0001 02 0000", "000a 0000 0006 01 10 07d5 0001"),  # DIO5 low
+        ("000b 0000 0006 01 03 0b22 0002", "000b 0000 0007 01 03 04 0000 0020"),
+        ("000c 0000 0006 01 03 0af0 0002", "000c 0000 0007 01 03 04 007f ffdf"),
+        ("000d 0000 0006 01 03 0000 0006", f"000d 0000 000f 01 03 0c {off}"),
+        ("000e 0000 0006 01 03 0af0 0002", "000e 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+    )
+    with Scripted(*exchanges) as server:
+        settings = SupplySettings(port=server.address, line=5)
+        t7 = LabJackT7("hv", server.address, 2.0)
+        supply = T7HighVoltageSupply("hv", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        supply.set(20.0).wait()
+        supply.set(-20.0)
+        assert supply.glance() == {"hv_voltage": 20.0, "hv_current": 5e-3}
+        supply.safe()
+        supply.close()
+    assert len(server.received) == len(exchanges)
+
+
+def test_byte_vectors_of_dac1():
+    exchanges = (("0001 0000 000b 01 10 03ea 0002 04 4060 0000", "0001 0000 0006 01 10 03ea 0002"),)  # DAC1 3.5 V
+    with Scripted(*exchanges) as server:
+        settings = SupplySettings(port=server.address, line=5, analog_output="dac1", offset_volts=2.5)
+        t7 = LabJackT7("hv", server.address, 2.0)
+        supply = T7HighVoltageSupply("hv", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        supply._send(20.0)
+        t7.close()
     assert len(server.received) == len(exchanges)
 
 
@@ -481,7 +653,10 @@ def test_over_range(bench, volts):
     sensor = bench.sensor(position_limits=(-1.0, 1.0))
     bench.volts[0] = volts
     for take in (sensor.measure, sensor.glance):
-        with pytest.raises(DeviceError, match=r"psd: AIN0 reads .* over its range of ±10 V; choose a larger"):
+        with pytest.raises(
+            DeviceError,
+            match=r"^psd: AIN0 reads \S+ V and is over its range of ±10 V; bring what is measured back into it$",
+        ):
             take()
 
 
@@ -490,7 +665,7 @@ def test_over_range_of_a_small_range(bench):
     bench.volts[0] = 0.09
     assert sensor.measure()["psd_position"] == pytest.approx(0.9e-6, rel=1e-3)
     bench.volts[0] = 0.11
-    with pytest.raises(DeviceError, match=r"±0\.1 V"):
+    with pytest.raises(DeviceError, match=r"±0\.1 V; choose a larger `range`, or bring what is measured back"):
         sensor.measure()
 
 
@@ -605,6 +780,372 @@ def test_requests_of_a_ratiometric_sensor(bench):
         sensor.measure()
         assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
         sensor.close()
+
+
+# A thermistor
+
+
+@pytest.mark.parametrize(
+    ("ohms", "celsius"),
+    # The table of a thermistor of 10 kΩ at 25 °C with these coefficients, in steps of 1 Ω or 0.1 %.
+    [(32650.0, 0.0), (10000.0, 25.0), (3603.0, 50.0), (678.3, 100.0)],
+)
+def test_temperature_of_a_thermistor(bench, ohms, celsius):
+    sensor = bench.thermistor(channels=(6, 4), resolution_index=8)
+    for excitation in (2.05, 2.5, 2.95):
+        bench.volts[6], bench.volts[4] = excitation * ohms / (ohms + 10e3), excitation
+        for take in (sensor.measure, sensor.glance):
+            assert take()["base_temperature"] == pytest.approx(celsius, abs=0.05)
+
+
+def test_another_thermistor_and_divider(bench):
+    # Beta 3435 K at 1 kΩ and 25 °C.
+    a, b = 1 / 298.15 - math.log(1e3) / 3435.0, 1 / 3435.0
+    sensor = bench.thermistor(reference_ohms=2e3, excitation_volts=5.0, steinhart_hart=(a, b, 0.0))
+    bench.volts[0], bench.volts[1] = 5.0 / 3, 5.0
+    assert sensor.measure()["base_temperature"] == pytest.approx(25.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("share", "message"),
+    [
+        (
+            1.0,
+            r"^base: thermistor open: the divider at AIN2 is at \d\S* % of its excitation; a wire is broken or not "
+            r"connected$",
+        ),
+        (0.991, r"^base: thermistor open: the divider at AIN2 is at 99\.\d+ %"),
+        (
+            0.0,
+            r"^base: thermistor shorted: the divider at AIN2 is at \S+ % of its excitation; check its wires for a "
+            r"short circuit$",
+        ),
+        (0.009, r"^base: thermistor shorted: the divider at AIN2 is at 0\.\d+ % of"),
+        (
+            0.98,
+            r"^base: temperature -\d\S* °C is outside of -40 to 125 °C; bring it back, or check the thermistor and",
+        ),
+        (0.012, r"^base: temperature 1\d\d\S* °C is outside of -40 to 125 °C"),
+    ],
+)
+def test_a_thermistor_that_is_none_is_named(bench, share, message):
+    sensor = bench.thermistor(channels=(2, 3))
+    bench.volts[2], bench.volts[3] = 2.5 * share, 2.5
+    for take in (sensor.measure, sensor.glance, sensor.read):
+        with pytest.raises(DeviceError, match=message):
+            take()
+    bench.volts[2] = 1.25
+    assert sensor.measure()["base_temperature"] == pytest.approx(25.0, abs=0.05)
+
+
+@pytest.mark.parametrize("excitation", [0.0, 1.9, 3.1, -2.5])
+def test_an_excitation_that_failed_is_named(bench, excitation):
+    sensor = bench.thermistor(channels=(2, 3))
+    bench.volts[2], bench.volts[3] = 0.5 * excitation, excitation
+    message = (
+        r"^base: excitation of the thermistor is \S+ V at AIN3, expected 2 to 3 V; it has failed or is not connected$"
+    )
+    for take in (sensor.measure, sensor.glance):
+        with pytest.raises(DeviceError, match=message):
+            take()
+
+
+def test_requests_of_a_thermistor(bench):
+    bench.volts[2], bench.volts[3] = 1.2, 2.5
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        sensor = T7Thermistor.connect("base", ThermistorSettings(port=server.address, channels=(2, 3)), bench.clock)
+        recorded.requests.clear()
+        sensor.glance()
+        assert recorded.requests == [("read", 4, 4)]
+        recorded.requests.clear()
+        sensor.measure()
+        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
+        sensor.close()
+
+
+# A high-voltage supply
+
+
+def test_requests_of_a_high_voltage_supply(bench):
+    bench.wire()
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+
+        def asked(call: Callable[[], object]) -> list[tuple[str, int, int]]:
+            recorded.requests.clear()
+            call()
+            return list(recorded.requests)
+
+        send, look = ("write", 30000, 2), ("read", 0, 6)
+        enable = [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2)]
+        assert asked(lambda: supply.set(10.0)) == [send, *enable, look, send]
+        assert asked(lambda: supply.set(11.0)) == [send]
+        assert asked(supply.glance) == [look]
+        assert asked(supply.measure) == [("read", 7000, 6), ("read", 7300, 6), ("read", 7600, 6)]
+        bench.clock.sleep(0.099)
+        assert asked(lambda: supply.set(12.0)) == [send]
+        bench.clock.sleep(0.001)
+        assert asked(lambda: supply.set(13.0)) == [look, send]
+        assert asked(lambda: supply.set(0.1)) == [send]
+        bench.clock.sleep(0.05)
+        assert asked(supply.safe) == [send, *enable, look]
+        supply.close()
+
+
+def test_a_loop_that_looks_sends_in_one_request(bench):
+    bench.wire()
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+        supply.set(0.0)
+        recorded.requests.clear()
+        for step in range(200):
+            bench.clock.sleep(0.01)
+            supply.glance()
+            supply.set(0.1 * step)
+        assert len(recorded.requests) == 400
+        supply.close()
+
+
+def test_connect_switches_off_and_guards_the_enable_line(bench):
+    amplifier = bench.wire()
+    bench.t7.write_value(30000, 2.0)
+    bench.t7.write_value(2005, 1)
+    bench.clock.sleep(1.0)
+    bench.world.advance()
+    assert amplifier.voltage == pytest.approx(40.0, abs=0.02)
+    supply = bench.supply(watchdog=2)
+    assert not amplifier.on
+    assert bench.t7.tdac_volts(0) == 0.0
+    assert bench.guarded() == 1 << 5
+    assert not int(bench.t7.read_value(61632)) >> 5 & 1
+    assert bench.t7.read_value(61604) == 2
+    assert math.isnan(supply.setpoint)
+
+
+def test_the_amplifier_is_switched_on_at_zero(bench):
+    bench.wire()
+    seen: list[tuple[float, bool]] = []
+    bench.t7.write_value(30000, 2.0)  # as another program left it
+    supply = bench.supply()
+    bench.t7.write_value(30000, 2.0)
+    bench.t7.add_follower(lambda: seen.append((bench.t7.tdac_volts(0), bench.t7.dio_level(5))))
+    supply.set(20.0)
+    assert [volts for volts, on in seen if on] == [0.0] * (len(seen) - 3) + [pytest.approx(1.0, abs=1e-3)]
+
+
+@pytest.mark.parametrize("looks", [0, 1, 30])
+def test_an_amplifier_may_take_its_time_to_go_on(bench, looks):
+    supply = bench.supply()
+    answers = iter([0.0] * looks)
+    bench.t7._sources[2] = lambda: next(answers, 5.0)
+    supply.set(10.0)
+    assert bench.clock.now() == pytest.approx(0.01 * looks)
+    assert bench.t7.tdac_volts(0) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_an_amplifier_that_does_not_go_on_is_told(bench):
+    supply = bench.supply()
+    with pytest.raises(
+        DeviceError,
+        match=r"^hv: the amplifier does not report that it is on 0\.5 s after DIO5, its enable line, was switched "
+        r"on; check its power, its own protection and interlocks, and the wire from its status output to AIN2$",
+    ):
+        supply.set(10.0)
+    assert supply.setpoint == 0.0
+    assert not bench.t7.dio_level(5)
+    assert bench.t7.tdac_volts(0) == 0.0
+    assert supply.measure()["hv_voltage"] == pytest.approx(0.0, abs=0.02)
+
+
+def test_an_amplifier_that_does_not_go_off_is_told(bench):
+    bench.volts[2] = 5.0
+    with pytest.raises(
+        DeviceError,
+        match=r"^hv: the amplifier reports that it is on although DIO5, its enable line, was switched off; check the "
+        r"wiring, and that no other program uses the line$",
+    ):
+        bench.supply()
+
+
+def test_an_amplifier_that_somebody_else_switches_on_is_told(bench):
+    bench.wire()
+    supply = bench.supply()
+    bench.t7.write_value(2005, 1)
+    for take in (supply.measure, supply.glance):
+        with pytest.raises(
+            DeviceError, match=r"^hv: the amplifier reports that it is on although DIO5, its enable line"
+        ):
+            take()
+    supply.safe()
+    supply.measure()
+
+
+def test_an_output_that_keeps_its_voltage_is_told(bench):
+    bench.wire()
+    supply = bench.supply()
+    supply.set(40.0)
+    bench.t7._sources[0] = lambda: 1.7
+    with pytest.raises(
+        DeviceError,
+        match=r"^hv: the output is at 34 V although it was switched off; keep away from it and switch the amplifier "
+        r"off by hand$",
+    ):
+        supply.safe()
+    assert not bench.t7.dio_level(5)
+    assert bench.t7.tdac_volts(0) == 0.0
+
+
+def test_an_output_may_take_its_time_to_discharge(bench):
+    bench.wire()
+    supply = bench.supply()
+    supply.set(40.0)
+    answers = iter([1.8, 1.0, 0.5, 0.1])
+    bench.t7._sources[0] = lambda: next(answers, 0.0)
+    supply.safe()
+    assert bench.clock.now() == pytest.approx(0.04)
+
+
+CALLS = {
+    "measure": lambda supply: supply.measure(),
+    "glance": lambda supply: supply.glance(),
+    "set": lambda supply: supply.set(5.0),
+}
+WENT_OFF = r"^hv: the amplifier went off by itself, while DIO5, its enable line, "
+SET_AGAIN = r"; the set-point is 0 V now: remove the cause, then set it again$"
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_a_protection_that_tripped_is_named_once(bench, call):
+    amplifier = bench.wire()
+    supply = bench.supply()
+    supply.set(30.0)
+    bench.clock.sleep(0.1)
+    amplifier.trip()
+    with pytest.raises(
+        DeviceError,
+        match=WENT_OFF
+        + r"is on: its own protection has tripped, an interlock is open, or it has lost its power"
+        + SET_AGAIN,
+    ):
+        call(supply)
+    assert supply.setpoint == 0.0
+    assert not bench.t7.dio_level(5)
+    assert bench.t7.tdac_volts(0) == 0.0
+    assert supply.measure()["hv_voltage"] == pytest.approx(0.0, abs=0.02)
+    supply.set(5.0)
+    bench.clock.sleep(0.01)
+    assert supply.measure()["hv_voltage"] == pytest.approx(5.0, abs=0.05)
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_a_watchdog_that_ran_out_is_named_once(bench, call):
+    amplifier = bench.wire()
+    supply = bench.supply(watchdog=3)
+    supply.set(30.0)
+    bench.clock.sleep(3.0)
+    with pytest.raises(
+        DeviceError,
+        match=WENT_OFF
+        + r"is off: the watchdog of the instrument has run out, as nobody talked to it for 3 s, or another "
+        r"program switched the line" + SET_AGAIN,
+    ):
+        call(supply)
+    assert not amplifier.on
+    assert bench.t7.tdac_volts(0) == 0.0
+    supply.measure()
+
+
+def test_a_safe_state_that_cannot_be_confirmed_is_part_of_the_message(bench):
+    amplifier = bench.wire()
+    supply = bench.supply()
+    supply.set(30.0)
+    amplifier.trip()
+    bench.t7._sources[0] = lambda: 1.5
+    with pytest.raises(
+        DeviceError, match=WENT_OFF + r"is on: .*; that it is safe could not be confirmed \(hv: the output"
+    ):
+        supply.measure()
+    assert not bench.t7.dio_level(5)
+
+
+@pytest.mark.parametrize("refused", [30000, 2005, 0])
+def test_safe_tries_everything_and_tells_the_first_failure(bench, refused):
+    amplifier = bench.wire()
+
+    class Refusing(Altered):
+        refusing = False
+
+        def check(self, address: int) -> None:
+            if self.refusing and address == refused:
+                raise RegisterError(DEVICE_FAILURE, "no")
+
+        def write_registers(self, address: int, values: list[int]) -> None:
+            self.check(address)
+            super().write_registers(address, values)
+
+        def read_registers(self, address: int, count: int) -> list[int]:
+            self.check(address)
+            return super().read_registers(address, count)
+
+    instrument = Refusing(bench.t7, lambda _, words: words)
+    with ModbusTcpServer(instrument) as server:
+        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+        supply.set(30.0)
+        bench.clock.sleep(0.1)
+        instrument.refusing = True
+        with pytest.raises(DeviceError, match=rf"hv: Modbus exception 4 .* register {refused}"):
+            supply.safe()
+        bench.clock.sleep(0.1)
+        bench.world.advance()
+        assert amplifier.voltage == pytest.approx(0.0, abs=1e-6)
+        assert supply.setpoint == 0.0
+        instrument.refusing = False
+        supply.safe()
+        supply.close()
+
+
+def test_safe_of_a_high_voltage_supply_that_cannot_be_reached_raises(bench):
+    amplifier = bench.wire()
+    supply = bench.supply(watchdog=3)
+    supply.set(30.0)
+    bench.server.close()
+    with pytest.raises(DeviceConnectionError, match="hv: no reply from"):
+        supply.safe()
+    supply.close()
+    bench.clock.sleep(3.1)
+    bench.world.advance()
+    assert not amplifier.on
+    assert amplifier.voltage == pytest.approx(0.0, abs=1e-6)
+
+
+def test_closing_a_high_voltage_supply(bench):
+    bench.wire()
+    bench.supply(watchdog=2).close()
+    assert bench.guarded() == 0
+    supply = bench.supply(watchdog=2)
+    supply.set(30.0)
+    supply.close()
+    assert bench.t7.dio_level(5)
+    bench.clock.sleep(2.0)
+    bench.world.advance()
+    assert not bench.t7.dio_level(5)
+
+
+@pytest.mark.parametrize("value", [-40.01, 40.01, math.nan, math.inf])
+def test_a_voltage_beyond_the_limits_is_not_sent(bench, value):
+    bench.wire()
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+        recorded.requests.clear()
+        with pytest.raises(LimitError, match=r"^hv: set-point \S+ V is outside of -40 to 40 V$"):
+            supply.set(value)
+        assert recorded.requests == []
+        assert math.isnan(supply.setpoint)
+        supply.close()
 
 
 # A switch

@@ -19,12 +19,19 @@ from bench.clock import VirtualClock
 from bench.errors import DeviceError
 from sim_devices.instruments.labjack_t7 import (
     CONVERSIONS,
+    DAC_STEP,
     RAIL,
+    STEINHART_HART,
+    TDAC_STEP,
+    DisplacementSensor,
+    EmulatedHighVoltageSupply,
     EmulatedPositionSensor,
     EmulatedSwitch,
     EmulatedT7,
     NormalisedPSD,
+    PiezoAmplifier,
     RatiometricSensor,
+    Thermistor,
     TwoCurrentPSD,
 )
 from sim_devices.wire.modbus_tcp import (
@@ -182,6 +189,51 @@ def test_outputs(t7):
     assert t7.tdac_volts(2) == -10.0
 
 
+@pytest.mark.parametrize(("register", "lowest", "highest", "bits"), [(1000, 0.0, 5.0, 12), (30000, -10.0, 10.0, 14)])
+def test_outputs_have_steps(t7, register, lowest, highest, bits):
+    step = (highest - lowest) / 2**bits
+    seen = set()
+    for volts in np.linspace(lowest + 0.5, lowest + 0.5 + 20 * step, 401):
+        t7.write_value(register, volts)
+        out = t7.dac_volts(0) if register == 1000 else t7.tdac_volts(0)
+        assert abs(out - volts) <= step / 2 + 1e-6
+        assert out / step == pytest.approx(round(out / step), abs=1e-9)
+        seen.add(out)
+    assert len(seen) in (20, 21)
+    if register == 1000:
+        assert t7.read_value(1000) == pytest.approx(volts, rel=1e-6)  # what was written
+
+
+def test_followers_are_told_after_requests_and_when_the_watchdog_acts(t7):
+    seen = []
+    arm(t7)
+    t7.add_follower(lambda: seen.append((t7.world.time, t7.dac_volts(0), t7.dio_level(0, pulled_down=True))))
+    assert seen == [(0.0, 0.0, False)]
+    t7.world.clock.sleep(1.0)
+    t7.write_registers(1000, [0x4020, 0])
+    t7.write_value(2000, 1)
+    t7.world.clock.sleep(100.0)
+    t7.world.advance()
+    assert seen[1:] == [(1.0, 2.5, False), (1.0, 2.5, True), (3.0, pytest.approx(0.5, abs=DAC_STEP), False)]
+
+
+def test_followers_are_told_of_what_a_refused_request_has_written(t7):
+    seen = []
+    t7.add_follower(lambda: seen.append(t7.dac_volts(1)))
+    with pytest.raises(RegisterError):
+        t7.write_registers(1002, [0x4020, 0, 0, 0])
+    assert seen == [0.0, 2.5]
+
+
+def test_a_line_that_is_pulled_down(t7):
+    assert t7.dio_level(3)
+    assert not t7.dio_level(3, pulled_down=True)
+    t7.write_value(2003, 1)
+    assert t7.dio_level(3, pulled_down=True)
+    t7.read_value(2003)
+    assert not t7.dio_level(3, pulled_down=True)
+
+
 def test_digital_lines(t7):
     assert t7.dio_level(3)
     t7.write_value(2003, 0)
@@ -331,12 +383,12 @@ def test_watchdog_expires_at_its_instant():
     assert t7.deadline() == 2.0
     clock.sleep_until(math.nextafter(2.0, 0.0))
     t7.world.advance()
-    assert t7.dac_volts(0) == 4.0
+    assert t7.dac_volts(0) == pytest.approx(4.0, abs=DAC_STEP / 2)
     assert not t7.watchdog_expired
     clock.sleep_until(2.0)
     t7.world.advance()
-    assert t7.dac_volts(0) == 0.5
-    assert t7.dac_volts(1) == 3.0  # not enabled
+    assert t7.dac_volts(0) == pytest.approx(0.5, abs=DAC_STEP / 2)
+    assert t7.dac_volts(1) == pytest.approx(3.0, abs=DAC_STEP / 2)  # not enabled
     assert not t7.dio_level(0)
     assert t7.dio_level(1)  # inhibited
     assert t7.watchdog_expired
@@ -356,7 +408,7 @@ def test_the_plant_stands_at_the_instant_of_expiry():
     assert plant.time == 100.0
 
 
-@pytest.mark.parametrize("access", ["read", "write", "refused"])
+@pytest.mark.parametrize("access", ["read", "write", "conversion", "burst", "refused"])
 def test_any_communication_feeds(access):
     t7 = make()
     arm(t7)
@@ -366,6 +418,11 @@ def test_any_communication_feeds(access):
             t7.read_registers(0, 1)
         elif access == "write":
             t7.write_value(1002, 1.0)
+        elif access == "conversion":
+            t7.convert(0)
+        elif access == "burst":
+            with pytest.raises(RegisterError):
+                t7.burst(0)
         else:
             with pytest.raises(RegisterError):
                 t7.read_registers(50000, 1)
@@ -394,11 +451,11 @@ def test_strict_goes_on_after_it_expired():
     arm(t7, strict=True)
     t7.world.clock.sleep(5.0)
     t7.write_value(1000, 4.0)  # lasts until the next timeout, which is at 6 s
-    assert t7.dac_volts(0) == 4.0
+    assert t7.dac_volts(0) == pytest.approx(4.0, abs=DAC_STEP / 2)
     assert t7.deadline() == 6.0
     t7.world.clock.sleep_until(6.0)
     t7.world.advance()
-    assert t7.dac_volts(0) == 0.5
+    assert t7.dac_volts(0) == pytest.approx(0.5, abs=DAC_STEP / 2)
 
 
 def test_watchdog_is_set_up_while_disabled_only(t7):
@@ -483,6 +540,218 @@ def test_supplies_of_ratiometric_sensors_differ_and_stay():
     assert supplies == [sensor.supply() for sensor in sensors]
 
 
+@pytest.mark.parametrize(
+    ("displacement", "shown"),
+    [(0.0, 0.0), (14e-9, 10e-9), (-16e-9, -20e-9), (199.994e-6, 199.99e-6), (200e-6, 200e-6), (1.0, 200e-6)],
+)
+def test_displacement_sensor_without_noise(displacement, shown):
+    sensor = DisplacementSensor(lambda: displacement, noise=0.0, rng=np.random.default_rng(2))
+    assert sensor() == pytest.approx(5e4 * shown, abs=1e-9)
+    displacement = -displacement
+    assert sensor() == pytest.approx(-5e4 * shown, abs=1e-9)
+
+
+def test_noise_of_a_displacement_sensor():
+    sensor = DisplacementSensor(lambda: 50.003e-6, rng=np.random.default_rng(5))
+    shown = np.array([sensor() for _ in range(4000)]) / 5e4
+    assert np.max(np.abs(shown - 10e-9 * np.round(shown / 10e-9))) < 1e-13
+    assert np.std(shown) == pytest.approx(math.hypot(10e-9, 10e-9 / math.sqrt(12)), rel=0.05)
+    assert np.mean(shown) == pytest.approx(50.003e-6, abs=4 * 10.4e-9 / math.sqrt(4000))
+
+
+@pytest.mark.parametrize(
+    ("celsius", "ohms"),
+    # The table of a thermistor of 10 kΩ at 25 °C with these coefficients.
+    [(0.0, 32650.0), (25.0, 10000.0), (50.0, 3603.0), (100.0, 678.3)],
+)
+def test_thermistor_without_noise(celsius, ohms):
+    thermistor = Thermistor(lambda: celsius, excitation_error=0.0, noise=0.0, rng=np.random.default_rng(2))
+    for volts in (2.5, 2.0):
+        thermistor.excitation_volts = volts
+        assert thermistor.excitation() == volts
+        share = thermistor.divider() / volts
+        assert share == pytest.approx(ohms / (ohms + 10e3), rel=2e-3)
+        a, b, c = STEINHART_HART
+        log = math.log(10e3 * share / (1 - share))
+        assert 1 / (a + b * log + c * log**3) - 273.15 == pytest.approx(celsius, abs=1e-9)
+
+
+def test_noise_of_a_thermistor():
+    thermistor = Thermistor(lambda: 30.0, rng=np.random.default_rng(3))
+    shares = np.array([thermistor.divider() for _ in range(4000)]) / thermistor.excitation()
+    logs = np.log(10e3 * shares / (1 - shares))
+    a, b, c = STEINHART_HART
+    temperatures = 1 / (a + b * logs + c * logs**3) - 273.15
+    assert np.std(temperatures) == pytest.approx(0.02, rel=0.05)
+    assert np.mean(temperatures) == pytest.approx(30.0, abs=4 * 0.02 / math.sqrt(4000))
+    assert thermistor.excitation() == pytest.approx(2.5, abs=0.05)
+    assert thermistor.excitation() != 2.5
+
+
+def test_faults_of_a_thermistor():
+    thermistor = Thermistor(lambda: 30.0, rng=np.random.default_rng(3))
+    thermistor.open = True
+    assert thermistor.divider() == thermistor.excitation()
+    thermistor.shorted = True
+    assert thermistor.divider() == 0.0
+
+
+class Capacitor:
+    """A load that notes when which voltage was applied to it, with the voltage integrated over time."""
+
+    def __init__(self) -> None:
+        self.time = self.volts = self.integral = 0.0
+        self.applied: list[tuple[float, float]] = []
+
+    def apply(self, voltage: float) -> None:
+        self.volts = voltage
+        self.applied.append((self.time, voltage))
+
+    def advance(self, dt: float) -> None:
+        self.time += dt
+        self.integral += self.volts * dt
+
+
+def amplifier(**said) -> tuple[PiezoAmplifier, Capacitor, World]:
+    load = Capacitor()
+    world = World(load, VirtualClock())
+    said = {"scale_error": 0.0, "noise_volts": 0.0, "rng": np.random.default_rng(1)} | said
+    return PiezoAmplifier(world, load, **said), load, world
+
+
+def wait(world: World, seconds: float) -> None:
+    world.clock.sleep(seconds)
+    world.advance()
+
+
+def test_amplifier_settles_by_its_time_constant():
+    hv, load, world = amplifier()
+    wait(world, 1.0)
+    hv.drive(1.0, True)
+    assert load.applied == []
+    for _ in range(60):
+        wait(world, 23e-6)
+        exact = 20.0 * (1 - math.exp(-(world.time - 1.0) / 0.2e-3))
+        assert hv.voltage == pytest.approx(exact, abs=1e-9)
+        assert hv.voltage_monitor() == pytest.approx(exact / 20.0, abs=1e-9)
+        assert hv.current_monitor() == pytest.approx(20e-9 * (20.0 - exact) / 0.2e-3 / 0.01, abs=1e-9)
+        assert abs(load.volts - exact) <= hv.STEP / 2 + 1e-9
+    wait(world, 1.0)
+    assert load.volts == 20.0
+    assert hv.deadline() == math.inf
+    volts = [volts for _, volts in load.applied]
+    assert len(volts) == 160
+    assert volts == sorted(volts)
+    # The area that is missing is that of the exponential.
+    assert 20.0 * (world.time - 1.0) - load.integral == pytest.approx(20.0 * 0.2e-3, rel=0.01)
+
+
+@pytest.mark.parametrize("interval", [5e-6, 50e-6, 1e-3])
+def test_amplifier_in_a_fast_loop(interval):
+    hv, load, world = amplifier()
+    output, rng = 0.0, np.random.default_rng(4)
+    for _ in range(1000):
+        target = rng.uniform(-1.0, 1.0)
+        hv.drive(target, True)
+        assert abs(load.volts - output) <= hv.STEP / 2 + 1e-9
+        wait(world, interval)
+        output = 20.0 * target + (output - 20.0 * target) * math.exp(-interval / 0.2e-3)
+        assert hv.voltage == pytest.approx(output, abs=1e-9)
+        assert abs(load.volts - output) <= hv.STEP / 2 + 1e-9
+
+
+@pytest.mark.parametrize("rate", [1e-3, 4e-3, 6e-3, 0.02])
+def test_load_of_an_amplifier_never_goes_back_on_its_way(rate):
+    hv, load, world = amplifier()
+    for step in range(300):
+        hv.drive(min(rate * step, 1.5), True)
+        wait(world, 50e-6)
+    volts = [volts for _, volts in load.applied]
+    assert volts == sorted(volts)
+    wait(world, 1.0)
+    assert load.volts == pytest.approx(20.0 * min(rate * 299, 1.5), abs=1e-9)
+
+
+@pytest.mark.parametrize("offset", [0.0, 2.5])
+def test_amplifier_is_clipped(offset):
+    hv, load, world = amplifier(offset_volts=offset)
+    for volts, kept in ((2.0, 40.0), (2.3, 45.0), (-9.0, -45.0), (0.0, 0.0)):
+        hv.drive(offset + volts, True)
+        wait(world, 0.1)
+        assert load.volts == pytest.approx(kept, abs=1e-9)
+        assert hv.voltage == pytest.approx(kept, abs=1e-9)
+        assert abs(load.volts) <= 45.0
+
+
+def test_amplifier_is_at_zero_while_it_is_disabled():
+    hv, load, world = amplifier()
+    hv.drive(2.0, False)
+    wait(world, 1.0)
+    assert (load.applied, hv.status(), hv.voltage) == ([], 0.0, 0.0)
+    hv.drive(2.0, True)
+    wait(world, 1.0)
+    assert (load.volts, hv.status()) == (40.0, 5.0)
+    hv.drive(2.0, False)
+    assert (hv.status(), load.volts) == (0.0, 40.0)
+    wait(world, 0.2e-3)
+    assert hv.voltage == pytest.approx(40.0 / math.e)
+    wait(world, 1.0)
+    assert load.volts == 0.0
+
+
+def test_protection_of_the_amplifier_stays_until_the_enable_input_is_taken_away():
+    hv, load, world = amplifier()
+    hv.drive(1.0, True)
+    wait(world, 1.0)
+    hv.trip()
+    wait(world, 1.0)
+    hv.drive(1.5, True)
+    wait(world, 1.0)
+    assert (load.volts, hv.on) == (0.0, False)
+    hv.drive(1.5, False)
+    hv.drive(1.5, True)
+    wait(world, 1.0)
+    assert (load.volts, hv.on) == (30.0, True)
+
+
+def test_monitors_of_the_amplifier_have_noise_and_an_error_of_scale():
+    hv, _, world = amplifier(scale_error=1e-3, noise_volts=0.2e-3)
+    hv.drive(1.0, True)
+    wait(world, 1.0)
+    monitored = np.array([hv.voltage_monitor() for _ in range(3000)])
+    assert np.std(monitored) == pytest.approx(0.2e-3, rel=0.06)
+    assert np.std([hv.current_monitor() for _ in range(3000)]) == pytest.approx(0.2e-3, rel=0.06)
+    assert 20.0 * np.mean(monitored) == pytest.approx(20.0, abs=0.2)
+    assert hv.voltage == pytest.approx(20.0, abs=0.1)
+    assert abs(hv.voltage - 20.0) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("output", "register", "offset", "step"),
+    [("tdac5", 30010, 0.0, TDAC_STEP), ("dac1", 1002, 2.5, DAC_STEP)],
+)
+def test_emulated_high_voltage_supply_sends_to_its_output(output, register, offset, step):
+    hv, load, world = amplifier(offset_volts=offset)
+    t7 = EmulatedT7(world, {0: hv.voltage_monitor, 1: hv.current_monitor, 2: hv.status}, rng=Quiet())
+    read = (lambda: t7.tdac_volts(5)) if output == "tdac5" else (lambda: t7.dac_volts(1))
+    t7.add_follower(lambda: hv.drive(read(), t7.dio_level(7, pulled_down=True)))
+    supply = EmulatedHighVoltageSupply("hv", t7, line=7, analog_output=output, offset_volts=offset)
+    assert not hv.on
+    supply.set(12.34)
+    wait(world, 0.01)
+    assert load.volts == pytest.approx(12.34, abs=20.0 * step / 2 + 1e-6)
+    assert load.volts / (20.0 * step) == pytest.approx(round(load.volts / (20.0 * step)), abs=1e-6)
+
+
+def test_emulated_high_voltage_supply_passes_a_refusal_on():
+    hv, _, world = amplifier()
+    t7 = EmulatedT7(world, {2: hv.status}, rng=Quiet())
+    supply = EmulatedHighVoltageSupply("hv", t7, line=7)
+    t7.write_value(9000, 0)
+    with pytest.raises(DeviceError, match="hv: the instrument refuses"):
+        supply.measure()
+
+
 def test_emulated_switch_keeps_what_else_is_under_the_watchdog(t7):
     arm(t7)
     switch = EmulatedSwitch("fan", t7, line=5, watchdog=60)
@@ -493,7 +762,7 @@ def test_emulated_switch_keeps_what_else_is_under_the_watchdog(t7):
     assert t7.read_value(61604) == 2
     t7.world.clock.sleep(2.0)
     t7.world.advance()
-    assert t7.dac_volts(0) == 0.5
+    assert t7.dac_volts(0) == pytest.approx(0.5, abs=DAC_STEP / 2)
     assert not t7.dio_level(0)
     assert not t7.dio_level(5)
     assert t7.dio_level(1)
@@ -683,7 +952,7 @@ def test_pymodbus_as_it_is(served):
         assert volts == pytest.approx([2.5, -0.75], abs=LSB)
         words = client.convert_to_registers(3.25, client.DATATYPE.FLOAT32)
         assert not client.write_registers(1000, words, device_id=9).isError()
-        assert t7.dac_volts(0) == 3.25
+        assert t7.dac_volts(0) == pytest.approx(3.25, abs=DAC_STEP / 2)
         assert not client.write_register(41500, 3, device_id=0).isError()
         refused = client.write_register(41500, 13, device_id=1)
         assert (refused.isError(), refused.exception_code) == (True, 4)
@@ -720,7 +989,7 @@ def test_mbpoll_writes(served):
     t7, server = served
     result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "1002", "127.0.0.1", "1.5")
     assert result.returncode == 0, result.stderr
-    assert t7.dac_volts(1) == 1.5
+    assert t7.dac_volts(1) == pytest.approx(1.5, abs=DAC_STEP / 2)
 
 
 @needs_mbpoll
