@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from bench.control.estimators import DriftEstimator, agility_for, preload
-from bench.control.tracking import Command
+from bench.control.tracking import Command, Trace
 from bench.devices import Actuator
 from bench.errors import (
     AbortError,
@@ -29,9 +29,11 @@ from bench.errors import (
 from bench.interrupts import Interrupts
 from bench.journal import Event, Journal, StepRecord
 from bench.protocol import (
+    LATENESS,
     TRACES,
     Control,
     Dwell,
+    FastLoop,
     Note,
     Phase,
     Plan,
@@ -46,6 +48,7 @@ from bench.rig import Rig
 from bench.safety import SAFE, InterlockWatch, make_safe
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
+_NOT_AT_WORK = dict.fromkeys((*TRACE_NAMES, LATENESS.name), math.nan)
 
 RESUME = "resume"
 ABORT = "abort"
@@ -133,7 +136,7 @@ class Engine:
         self._interrupts = interrupts
         self._ask = ask
         self._names = tuple(signal.name for signal in journal.signals)
-        self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
+        self._trace = _NOT_AT_WORK
         self._period = rig.file.telemetry.period
         self._watch = InterlockWatch(rig.file.interlocks, {signal.name: signal.unit for signal in rig.signals})
         self._phase = ""
@@ -180,6 +183,9 @@ class Engine:
                 elif isinstance(message, Control):
                     self._pause_if_asked()
                     reading = self._control(message)
+                elif isinstance(message, FastLoop):
+                    self._pause_if_asked()
+                    reading = self._fast_loop(message)
                 elif isinstance(message, Prompt):
                     self._pause_if_asked()
                     reading = self._prompt(message)
@@ -191,7 +197,7 @@ class Engine:
                 else:
                     raise ConfigurationError(
                         f"protocol {definition.name} yielded {message!r}; "
-                        "expected a Step, a Control, a Prompt, a Phase or a Note"
+                        "expected a Step, a Control, a FastLoop, a Prompt, a Phase or a Note"
                     )
         finally:
             # What a protocol does or raises while it is closed must not hide why the run ends.
@@ -228,13 +234,7 @@ class Engine:
                 ask = message.loop.begin if command is None else message.loop.update
                 command = ask(now, *(values[name] for name in wanted))
                 trace = message.loop.trace
-                self._trace = dict(
-                    zip(
-                        TRACE_NAMES,
-                        (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty),
-                        strict=True,
-                    )
-                )
+                self._trace = _traced(trace)
                 values |= self._trace
                 self._record_tick(now, values)
                 if command.done:
@@ -256,7 +256,59 @@ class Engine:
                     )
                 self._hold_until(end, asked)
         finally:
-            self._trace = dict.fromkeys(TRACE_NAMES, math.nan)
+            self._trace = _NOT_AT_WORK
+
+    def _fast_loop(self, message: FastLoop) -> Reading:
+        for name in message.inputs:
+            if name not in self._names:
+                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+        actuators = [self._actuator(name) for name in message.actuators]
+        setpoints = [f"{name}_setpoint" for name in message.actuators]
+        read = self._rig.quick_reader(message.inputs)
+        update, inputs = message.controller.update, message.inputs
+        period, samples = 1.0 / message.rate, max(1, round(message.duration * message.rate))
+        started = self._clock.now()
+        values = self._tick()
+        start = self._clock.now()
+        next_tick = start + self._period
+        k = taken = 0
+        lateness = latest = 0.0
+        try:
+            while k < samples:
+                due = start + k * period
+                self._sleep_until(due)
+                now = self._clock.now()
+                values.update(read())
+                commands = update(now - start, tuple([values[name] for name in inputs]))
+                for actuator, name, command in zip(actuators, setpoints, commands, strict=True):
+                    if command != actuator.setpoint:
+                        actuator.set(command)
+                    values[name] = command
+                late = now - due
+                lateness, latest = lateness + late, max(latest, late)
+                if taken % message.record_every == 0:
+                    self._trace = {**_traced(message.controller.trace), LATENESS.name: late}
+                    values.update(self._trace)
+                    self._record_tick(now, values)
+                taken += 1
+                if now >= next_tick:
+                    # Everything else: what its watchdogs wait for, and what interlocks look at.
+                    values = self._values(self._rig.glance)
+                    self._watch.check(self._clock.now(), values)
+                    next_tick += self._period
+                k = max(k + 1, math.floor((self._clock.now() - start) / period))
+            self._sleep_until(start + samples * period)
+        finally:
+            self._trace = _NOT_AT_WORK
+        self._event(
+            "INFO",
+            "loop",
+            f"{taken} samples at {message.rate:g} Hz, {samples - taken} left out; late by "
+            f"{1e3 * lateness / taken:.3g} ms on average, {1e3 * latest:.3g} ms at most",
+        )
+        values = self._values(self._rig.measure)
+        self._watch.check(self._clock.now(), values)
+        return self._finish_step(started, message.label, dict(zip(message.actuators, commands, strict=True)), values)
 
     def _prompt(self, message: Prompt) -> Reading:
         self._event("INFO", "prompt", message.text)
@@ -461,3 +513,9 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan
                 f"protocol {definition.name} would set {device} to between {low:g} and {high:g} {limits.unit}; "
                 f"rig {rig.file.name} allows {limits}"
             )
+
+
+def _traced(trace: Trace) -> dict[str, float]:
+    """Return what a controller thinks, for the record."""
+    thoughts = (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty)
+    return dict(zip(TRACE_NAMES, thoughts, strict=True)) | {LATENESS.name: math.nan}

@@ -35,7 +35,7 @@ from typing import Any, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.control.loops import Loop
+from bench.control.loops import Loop, SampledController
 from bench.devices import Signal
 from bench.errors import BenchError, ConfigurationError
 
@@ -158,6 +158,47 @@ class Control:
 
 
 @dataclass(frozen=True)
+class FastLoop:
+    """Let a controller move one or several actuators at a fixed rate, from quick readings; then take a reading.
+
+    Sample k is due k periods after the beginning. One that is more than a period late is left out, and how late the
+    others were is in the record, as the signal `lateness`.
+
+    Attributes
+    ----------
+    controller : SampledController
+        The controller at work; it sees numbers only.
+    rate : float
+        Samples in a second, Hz.
+    duration : float
+        How long it goes on, s.
+    inputs : tuple of str
+        Signals that the controller sees, in its order.
+    actuators : tuple of str
+        Devices that take its set-points, in its order.
+    record_every : int
+        Of so many samples one is recorded.
+    label : str
+        A few words for the record.
+    """
+
+    controller: SampledController
+    rate: float
+    duration: float
+    inputs: tuple[str, ...]
+    actuators: tuple[str, ...]
+    record_every: int = 1
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.rate < math.inf and 0 < self.duration < math.inf and self.record_every >= 1):
+            raise ValueError(
+                "FastLoop: expected rate, duration > 0 and record_every ≥ 1, got "
+                f"rate={self.rate}, duration={self.duration}, record_every={self.record_every}"
+            )
+
+
+@dataclass(frozen=True)
 class Prompt:
     """Ask the operator to do something by hand, let the rig settle, and see by a reading that it was done.
 
@@ -206,7 +247,7 @@ class Note:
     text: str
 
 
-Message = Step | Control | Prompt | Phase | Note
+Message = Step | Control | FastLoop | Prompt | Phase | Note
 
 
 @dataclass(frozen=True)
@@ -243,6 +284,9 @@ TRACES = (
     Signal("disturbance_uncertainty", "", "standard deviation of the estimated disturbance", 2),
 )
 """What is recorded of a controller, in the unit of the signal that it controls; nan while none is at work."""
+
+LATENESS = Signal("lateness", "s", "time by which a sample of a fast loop came too late", 6)
+"""Recorded beside them; nan where no fast loop is at work."""
 
 
 class ProtocolParameters(BaseModel):
@@ -411,7 +455,7 @@ class Plan:
     steps : int
         Number of steps.
     seconds : float
-        Laboratory time in s, steps that settle until steady counted with their minimum, controllers not at all.
+        Laboratory time in s, steps that settle until steady counted with their minimum, a `Control` not at all.
     at_most : float
         The same, counted with their timeouts.
     extremes : mapping of str to (float, float)
@@ -477,6 +521,14 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                 if steps > _LONGEST_PLAN:
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
+            elif isinstance(message, FastLoop):
+                watched |= {*message.inputs, *(f"{name}_setpoint" for name in message.actuators)}
+                seconds, at_most = seconds + message.duration, at_most + message.duration
+                reading = Reading(steps, seconds, True, echo)
+                steps += 1
+                if steps > _LONGEST_PLAN:
+                    raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
+                message = messages.send(reading)
             elif isinstance(message, Prompt):
                 watched.add(message.signal)
                 if isinstance(message.settle, UntilSteady):
@@ -496,7 +548,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
             else:
                 raise ConfigurationError(
                     f"protocol {definition.name} yielded {message!r}; "
-                    "expected a Step, a Control, a Prompt, a Phase or a Note"
+                    "expected a Step, a Control, a FastLoop, a Prompt, a Phase or a Note"
                 )
     except StopIteration:
         return Plan(steps, seconds, at_most, extremes, frozenset(watched), prompts)

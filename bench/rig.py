@@ -286,16 +286,44 @@ class Rig:
 
     def sample(self, wanted: Collection[str]) -> dict[str, float]:
         """Take the best reading of the signals that are wanted, and a quick one of all others."""
-        sources = {*wanted}
-        # Each derived signal comes from what stands before it.
-        for name, derived in reversed(list(self.file.derived.items())):
-            if name in sources:
-                sources.add(derived.source)
+        sources = self._sources(wanted)
         return self._collect(
             lambda device: (
                 device.measure() if any(signal.name in sources for signal in device.signals) else device.glance()
             )
         )
+
+    def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
+        """Return a function that takes a quick reading of the devices that some signals come from, and of no other.
+
+        It returns what these devices deliver and the derived ones of the signals; set-points are not among them.
+        """
+        sources = self._sources(wanted)
+        readers = [
+            device.glance
+            for device in self.devices.values()
+            if any(signal.name in sources for signal in device.signals)
+        ]
+        derived = [(name, each) for name, each in self.file.derived.items() if name in sources]
+
+        def read() -> dict[str, float]:
+            values: dict[str, float] = {}
+            for reader in readers:
+                values.update(reader())
+            for name, each in derived:
+                values[name] = each.compute(name, values)
+            return values
+
+        return read
+
+    def _sources(self, wanted: Collection[str]) -> set[str]:
+        """Return signals, and those that the derived ones among them come from."""
+        sources = {*wanted}
+        # Each derived signal comes from what stands before it.
+        for name, derived in reversed(list(self.file.derived.items())):
+            if name in sources:
+                sources.add(derived.source)
+        return sources
 
     def check_needs(self, protocol: str, needs: Sequence[str]) -> None:
         """Check that everything a protocol needs is there.

@@ -24,7 +24,7 @@ from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
-from bench.protocol import TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, load_rig
 from bench.terminal import ProgressDisplay, ask_operator
 
@@ -193,7 +193,7 @@ def trace_signals(protocol: ProtocolDefinition, rig: Rig) -> tuple[Signal, ...]:
         return ()
     rig.check_needs(protocol.name, [protocol.controls])
     unit = next(signal.unit for signal in rig.signals if signal.name == protocol.controls)
-    return tuple(replace(signal, unit=unit) for signal in TRACES)
+    return (*(replace(signal, unit=unit) for signal in TRACES), LATENESS)
 
 
 def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:

@@ -29,6 +29,20 @@ class Loop(Protocol):
         """What the controller thinks."""
 
 
+class SampledController(Protocol):
+    """A controller of one or several actuators that is called at a fixed rate."""
+
+    def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, ...]:
+        """Take a reading, one value a signal, at t s from the beginning; return a set-point for each actuator.
+
+        A set-point that is the same as before is not sent again.
+        """
+
+    @property
+    def trace(self) -> Trace:
+        """What the controller thinks."""
+
+
 class ReachTarget:
     """Bring the output to one target.
 

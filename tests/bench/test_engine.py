@@ -402,7 +402,7 @@ class TestFaults:
         b = bench()
         outcome = b.run(define(go))
         assert isinstance(outcome.error, ConfigurationError)
-        assert "expected a Step, a Control, a Prompt, a Phase or a Note" in outcome.reason
+        assert "expected a Step, a Control, a FastLoop, a Prompt, a Phase or a Note" in outcome.reason
         b.assert_safe()
 
     def test_a_protocol_that_goes_on_when_it_is_closed(self, bench):
