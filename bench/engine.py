@@ -259,12 +259,12 @@ class Engine:
             self._trace = _NOT_AT_WORK
 
     def _fast_loop(self, message: FastLoop) -> Reading:
-        for name in message.inputs:
+        for name in (*message.inputs, *message.watched):
             if name not in self._names:
                 raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
         actuators = [self._actuator(name) for name in message.actuators]
         setpoints = [f"{name}_setpoint" for name in message.actuators]
-        read = self._rig.quick_reader(message.inputs)
+        read = self._rig.quick_reader((*message.inputs, *message.watched))
         update, inputs = message.controller.update, message.inputs
         period, samples = 1.0 / message.rate, max(1, round(message.duration * message.rate))
         started = self._clock.now()

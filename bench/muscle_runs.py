@@ -7,7 +7,7 @@ Everything is in V, N and m.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -38,6 +38,9 @@ SAMPLE = "sample"
 
 UNITS = ("V", "N", "m")
 
+RESTING_PROTOCOLS = ("force-voltage",)
+LENGTH_PROTOCOLS = ("length-voltage", "length-force", "length-verification")
+
 ModelName = Literal["two-stage", "two-stage-prandtl-ishlinskii", "summed", "linear"]
 MODELS: tuple[ModelName, ...] = ("two-stage", "two-stage-prandtl-ishlinskii", "summed", "linear")
 
@@ -63,10 +66,8 @@ def read_resting(run: Path) -> Resting:
     DataError
         If it is no such run, or was not completed.
     """
-    groups = _samples(run)
-    if len(groups) != 1:
-        raise DataError(f"{run}: expected one series of readings, as of force-voltage, found {len(groups)}")
-    return Resting(groups[0][:, 0], groups[0][:, 1])
+    voltages, forces, _ = np.concatenate(_samples(run, RESTING_PROTOCOLS)).T
+    return Resting(voltages, forces)
 
 
 def read_series(run: Path) -> list[Series]:
@@ -78,10 +79,10 @@ def read_series(run: Path) -> list[Series]:
     Raises
     ------
     DataError
-        If the run was not completed or has no such readings.
+        If it is no such run, or was not completed.
     """
     series = []
-    for group in _samples(run):
+    for group in _samples(run, LENGTH_PROTOCOLS):
         voltages, forces, lengths = group.T
         if np.ptp(voltages) == 0.0 and len(voltages) > 1:
             series.append(Series.at_voltage(float(voltages[0]), forces, lengths))
@@ -110,7 +111,7 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
     """
     highest = float(resting.voltages.max())
     pretension = float(resting.forces[0])
-    force_limit = max(float(resting.forces.max()), *(float(s.forces.max()) for s in series))
+    force_limit = max(float(forces.max()) for forces in (resting.forces, *(s.forces for s in series)))
     weights = np.ones(resting.voltages.size)
     weights[0] = _COLD_WEIGHT
     try:
@@ -164,9 +165,12 @@ def errors_json(errors: Errors) -> dict[str, float]:
     return {"average": errors.average_percent, "rms": errors.rms_percent}
 
 
-def _samples(run: Path) -> list[Floats]:
-    """Return voltages, forces and lengths of each series of a run, each of shape (N, 3)."""
+def _samples(run: Path, protocols: Collection[str]) -> list[Floats]:
+    """Return voltages, forces and lengths of each series of a run of one of some protocols, each of shape (N, 3)."""
     with Record(run) as record:
+        protocol = record.meta.get("protocol")
+        if protocol not in protocols:
+            raise DataError(f"{run}: is a run of {protocol}; expected one of {' or '.join(protocols)}")
         if record.status != "completed":
             raise DataError(f"{run}: the run is {record.status}; a model needs a completed one")
         names = [signal.name for signal in record.signals]
@@ -174,12 +178,15 @@ def _samples(run: Path) -> list[Floats]:
         if missing:
             raise DataError(f"{run}: has no signal {', '.join(missing)}; it has: {', '.join(names)}")
         places = [names.index(name) for name in (VOLTAGE, FORCE, LENGTH)]
-        rows = [
-            (step.phase, [step.values[i] for i in places]) for step in record.step_records() if step.label == SAMPLE
+        # A reset, a phase of its own, stands between any two series, also of the same load.
+        groups = [
+            [[step.values[i] for i in places] for step in steps if step.label == SAMPLE]
+            for _, steps in groupby(record.step_records(), key=lambda step: step.phase)
         ]
-    if not rows:
+    series = [np.array(group) for group in groups if group]
+    if not series:
         raise DataError(f"{run}: has no readings with the label {SAMPLE!r}")
-    return [np.array([values for _, values in group]) for _, group in groupby(rows, key=lambda row: row[0])]
+    return series
 
 
 def _plays(force_limit: float) -> PrandtlIshlinskii:

@@ -176,6 +176,8 @@ class FastLoop:
         Signals that the controller sees, in its order.
     actuators : tuple of str
         Devices that take its set-points, in its order.
+    watched : tuple of str
+        Further signals that are read with each sample, for the record alone.
     record_every : int
         Of so many samples one is recorded.
     label : str
@@ -187,6 +189,7 @@ class FastLoop:
     duration: float
     inputs: tuple[str, ...]
     actuators: tuple[str, ...]
+    watched: tuple[str, ...] = ()
     record_every: int = 1
     label: str = ""
 
@@ -522,7 +525,8 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
             elif isinstance(message, FastLoop):
-                watched |= {*message.inputs, *(f"{name}_setpoint" for name in message.actuators)}
+                setpoints = (f"{name}_setpoint" for name in message.actuators)
+                watched |= {*message.inputs, *message.watched, *setpoints}
                 seconds, at_most = seconds + message.duration, at_most + message.duration
                 reading = Reading(steps, seconds, True, echo)
                 steps += 1

@@ -63,7 +63,10 @@ def length_verification(parameters: RandomParameters) -> Messages:
 
 
 def _under_loads(parameters: Loaded, voltages: Sequence[float]) -> Messages:
-    for load in parse_numbers("loads", parameters.loads):
+    loads = parse_numbers("loads", parameters.loads)
+    if min(loads) <= 0:
+        raise ValueError(f"loads = {parameters.loads!r}: expected positive loads")
+    for load in loads:
         yield from reset_under_weights(parameters)
         yield from hang(load)
         yield Phase(f"length over voltage at {load:g} N")

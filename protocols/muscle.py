@@ -8,6 +8,7 @@ Application to Shape Memory Alloy Actuators", Robotics: Science and Systems, 201
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Sequence
 from typing import TypeAlias, TypeVar
 
@@ -63,14 +64,14 @@ def parse_numbers(name: str, text: str) -> tuple[float, ...]:
     Raises
     ------
     ValueError
-        If one of them is none, or there is none at all.
+        If one of them is no finite number, or there is none at all.
     """
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(
-            f"{name} = {text!r}: expected numbers with commas between them, such as 0.98, 2.94"
-        ) from None
+        values = ()
+    if not values or not all(map(math.isfinite, values)):
+        raise ValueError(f"{name} = {text!r}: expected numbers with commas between them, such as 0.98, 2.94")
     return values
 
 
@@ -127,7 +128,7 @@ def stretch(force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> 
         "stage_position",
         FORCE,
         None,
-        _STRETCH_TIMEOUT,
+        duration + _STRETCH_TIMEOUT,
         label="stretch",
     )
     return reading

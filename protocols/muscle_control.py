@@ -142,6 +142,8 @@ def _range(
             value = state.force
         values.append(value)
     low, high = min(values), max(values)
+    if not low < high:
+        raise ValueError(f"highest: up to {highest:g} V the model's {output} does not change; choose a higher one")
     return low + _MARGIN * (high - low), high - _MARGIN * (high - low)
 
 

@@ -43,6 +43,24 @@ class SampledController(Protocol):
         """What the controller thinks."""
 
 
+class Playback:
+    """Set-points as functions of time, without feedback: a `SampledController`.
+
+    Parameters
+    ----------
+    setpoints : callable
+        One for each actuator: its set-point at a time in s from the beginning.
+    """
+
+    def __init__(self, *setpoints: Callable[[float], float]) -> None:
+        self._setpoints = setpoints
+        self.trace = Trace()
+
+    def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, ...]:  # noqa: ARG002
+        """Return the set-points of the moment."""
+        return tuple(setpoint(t) for setpoint in self._setpoints)
+
+
 class ReachTarget:
     """Bring the output to one target.
 

@@ -11,7 +11,8 @@ class Stretch:
     Input is the position of the end, m, positive when the muscle is longer; output the force, N. Each step is half
     of the lacking force over the stiffness that the step before it showed. So the force comes to its target from
     one side, and the memory of the muscle sees no reversal that is not asked for, unless the stiffness doubles
-    within one step.
+    within one step. It does where a slack muscle becomes taut: there a small target may be passed, by less than
+    what the greatest stiffness makes of `largest_step`.
 
     Parameters
     ----------

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
+from rich.table import Table
 
 from bench.clock import Stopwatch
 from bench.errors import DataError
@@ -269,7 +270,7 @@ def reproduce_sma(*, rig: str, seed: int, out: Path, live: bool, console: Consol
 
 def errors_table(
     measured: Characterization, paper: Mapping[str, Mapping[ModelName, tuple[float, float]]], title: str = ""
-) -> Any:  # noqa: ANN401 - a rich table
+) -> Table:
     """Return the table of errors, average / RMS in percent of the range, beside those of the paper."""
     rows = []
     for key, kind in KINDS.items():
@@ -297,7 +298,7 @@ def _control_json(results: TargetResults, scale: float) -> dict[str, float]:
     return {key: summary[key] * scale for key in ("max", "rms", "median")}
 
 
-def _control_table(result: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a rich table
+def _control_table(result: Mapping[str, Any]) -> Table:
     rows = []
     for session in CONTROL:
         title = f"{session.title}, {session.unit}"
