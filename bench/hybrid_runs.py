@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import DataError
-from bench.hysteresis import PrandtlIshlinskii
-from bench.identification import Errors, measure_errors
-from bench.identification.hybrid_model import identify_pi
+from bench.hysteresis import Polynomial, PrandtlIshlinskii
+from bench.identification import Errors, Identification
+from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
+from bench.identification.hybrid_model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
+from bench.identification.thermal_network import NetworkIdentification, identify_network
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
 
@@ -24,8 +26,51 @@ Floats = npt.NDArray[np.float64]
 CURRENT, VOLTAGE = "tec_setpoint", "piezo_setpoint"
 DEFLECTION = "displacement_position"
 BASE, TIP = "base_temperature", "tip_temperature"
+WITNESS = "witness_position"
+"""The deflection by a sensor beside the loop, where the rig has one, m."""
+
+REFERENCE = 22.0
+"""Temperature of the tip from which the polynomial counts, °C: the room's, as far as it is known."""
 
 _DRIFT_PASSES = 4
+
+
+@dataclass(frozen=True)
+class HybridIdentification:
+    """The model of a hybrid, part by part from a run each, and what speaks for it.
+
+    Attributes
+    ----------
+    model : HybridModel
+        The whole.
+    network : NetworkIdentification
+        From the steps of the current.
+    order : OrderChoice
+        RMS of the polynomial of each order, and which was chosen.
+    polynomial : Identification
+        From the static curve.
+    piezo : PiezoIdentification
+        From the slow loops of the voltage.
+    dynamics : DynamicsIdentification
+        From the fast step.
+    """
+
+    model: HybridModel
+    network: NetworkIdentification
+    order: OrderChoice
+    polynomial: Identification
+    piezo: PiezoIdentification
+    dynamics: DynamicsIdentification
+
+
+@dataclass(frozen=True)
+class PiezoIdentification:
+    """The operator of the piezo, its errors, and the voltages (V) and deflections (m) that it is from."""
+
+    operator: PrandtlIshlinskii
+    errors: Errors
+    voltages: Floats
+    deflections: Floats
 
 
 @dataclass(frozen=True)
@@ -118,23 +163,64 @@ def bandwidth_of(frequencies: Floats, gains: Floats) -> float:
     )
 
 
-def identify_piezo(samples: Samples, plays: int = 15) -> tuple[PrandtlIshlinskii, Errors, Floats]:
-    """Return the Prandtl-Ishlinskii operator of a slow loop, its errors, and the deflection without drift (m).
+def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays: int = 15) -> HybridIdentification:
+    """Return the model of a hybrid from its four runs.
+
+    Parameters
+    ----------
+    steps, static, loops, step : Path
+        Runs of `current-steps`, `thermomechanical`, `piezo-loops` and `piezo-step`.
+    plays : int
+        Number of play operators.
+
+    Raises
+    ------
+    DataError
+        If a run is of another kind or was not completed, or a part cannot be identified.
+    """
+    currents = _only_loop(steps)
+    with Record(static) as record:
+        if record.status != "completed":
+            raise DataError(f"{static}: the run is {record.status}; a model needs a completed one")
+        curve = record.steps()
+    fast = _only_loop(step)
+    try:
+        network = identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
+        rises = curve[TIP] - REFERENCE
+        order = choose_order(rises, curve[DEFLECTION])
+        polynomial = identify_polynomial(rises, curve[DEFLECTION], order.order)
+        piezo = identify_piezo(_only_loop(loops), plays)
+        dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
+        if not isinstance(polynomial.model, Polynomial):
+            raise TypeError("expected a polynomial")
+        model = HybridModel(network.network, polynomial.model, piezo.operator, dynamics.model, REFERENCE)
+    except ValueError as error:
+        raise DataError(f"the hybrid cannot be identified: {error}") from error
+    return HybridIdentification(model, network, order, polynomial, piezo, dynamics)
+
+
+def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
+    """Return the Prandtl-Ishlinskii operator of slow loops.
 
     What the room's temperature bends the beam meanwhile is taken for a parabola in time and taken off.
     """
-    voltages, deflections = samples[VOLTAGE], samples[DEFLECTION]
     # A sample is read before its set-point is sent.
-    applied = np.append(0.0, voltages[:-1])
+    applied = np.append(0.0, samples[VOLTAGE][:-1])
+    deflections = samples[DEFLECTION]
     middle = samples.times - samples.times.mean()
     columns = np.column_stack([middle, middle**2])
     drift = np.zeros_like(deflections)
     for _ in range(_DRIFT_PASSES):
         found = identify_pi(applied, deflections - drift, plays=plays, maximum=float(np.abs(applied).max()))
-        rest = deflections - drift - (deflections - drift - found.residuals)
-        drift = drift + columns @ np.linalg.lstsq(columns, rest - rest.mean(), rcond=None)[0]
-    operator = found.model
-    if not isinstance(operator, PrandtlIshlinskii):
+        rest = found.residuals - found.residuals.mean()
+        drift = drift + columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
+    if not isinstance(found.model, PrandtlIshlinskii):
         raise TypeError("expected a Prandtl-Ishlinskii operator")
-    clean = deflections - drift
-    return operator, measure_errors(clean, clean - found.residuals), clean
+    return PiezoIdentification(found.model, found.errors, applied, deflections - drift)
+
+
+def _only_loop(run: Path) -> Samples:
+    loops = read_loops(run)
+    if len(loops) != 1:
+        raise DataError(f"{run}: expected one fast loop, found {len(loops)}")
+    return next(iter(loops.values()))

@@ -15,8 +15,8 @@ The file of an operator, version 1, is an object with these keys:
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
 
-The file of a model among voltage, force and length has the format `bench-coupled-model`, and `model` in place of
-`operator` and `memory`.
+The file of a model among voltage, force and length has the format `bench-coupled-model`, that of the whole of a
+thermo-piezoelectric actuator `bench-hybrid-model`; both have `model` in place of `operator` and `memory`.
 """
 
 from __future__ import annotations
@@ -40,9 +40,11 @@ from bench.hysteresis import (
     coupled_from_json,
     operator_from_json,
 )
+from bench.identification.hybrid_model import HybridModel
 
 FORMAT = "bench-model"
 COUPLED_FORMAT = "bench-coupled-model"
+HYBRID_FORMAT = "bench-hybrid-model"
 VERSION = 1
 
 
@@ -113,13 +115,37 @@ class CoupledFile:
 
     def to_json(self) -> dict[str, Any]:
         """Return the file's content."""
-        return {
-            "format": COUPLED_FORMAT,
-            "version": VERSION,
-            "name": self.name,
-            "model": self.model.to_json(),
-            "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
-        }
+        return _content(COUPLED_FORMAT, self.name, self.model.to_json(), self.provenance)
+
+    def save(self, path: Path) -> None:
+        """Write the file.
+
+        Raises
+        ------
+        DataError
+            If it cannot be written.
+        """
+        _write(path, self.to_json())
+
+
+@dataclass(frozen=True)
+class HybridFile:
+    """The content of the file of a model of a thermo-piezoelectric actuator.
+
+    Attributes
+    ----------
+    model : HybridModel
+        The model.
+    provenance : mapping
+        Where it comes from.
+    """
+
+    model: HybridModel
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the file's content."""
+        return _content(HYBRID_FORMAT, "hybrid", self.model.to_json(), self.provenance)
 
     def save(self, path: Path) -> None:
         """Write the file.
@@ -163,9 +189,31 @@ def parse_coupled_model(content: object, source: str) -> CoupledFile:
         raise DataError(f"model file {source} is damaged: {error}") from None
 
 
+def load_hybrid_model(path: Path) -> HybridFile:
+    """Read the file of a model of a thermo-piezoelectric actuator; see `load_model`."""
+    source = str(path)
+    document = _checked(_read(path), source, HYBRID_FORMAT)
+    try:
+        return HybridFile(HybridModel.from_json(document["model"]), dict(document["provenance"]))
+    except KeyError as error:
+        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise DataError(f"model file {source} is damaged: {error}") from None
+
+
 def is_coupled_model(content: object) -> bool:
     """Return whether the content of a model file is that of a model among voltage, force and length."""
     return isinstance(content, dict) and content.get("format") == COUPLED_FORMAT
+
+
+def _content(format_: str, name: str, model: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "format": format_,
+        "version": VERSION,
+        "name": name,
+        "model": model,
+        "provenance": {"bench": importlib.metadata.version("actuator-bench"), **provenance},
+    }
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Literal, Protocol
 
 import numpy as np
@@ -103,9 +104,8 @@ class MuscleLaboratorySettings(LaboratorySettings):
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
     fault: FaultName = Field(
         default="none",
-        description="what goes wrong at `fault_time`: silent-supply, missing-heartbeat, servo-overload, "
-        "broken-load-cell, unplugged-sensor; or from then on: forgotten-load (the operator hangs nothing), "
-        "heavy-load (twice the weight)",
+        description="what goes wrong at `fault_time`; forgotten-load (the operator hangs nothing) and heavy-load "
+        "(twice the weight) from then on",
     )
     fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
 
@@ -200,6 +200,7 @@ class MuscleLaboratory:
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
         self.frame.t7 = self.t7
         self._t7_server = ModbusTcpServer(self.t7)
+        self._servers = ExitStack()
         if settings.fault != "none":
             self.world.add(_Fault(self, settings.fault_time))
 
@@ -208,20 +209,26 @@ class MuscleLaboratory:
         raise NotImplementedError
 
     def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name."""
+        """Switch the instruments on; return the port of each by name.
+
+        Raises
+        ------
+        ValueError
+            If another laboratory of this process has the same ports open; it keeps them.
+        """
         servers: dict[str, WireServer] = {
             "supply": CanopenSlcanServer(self.supply),
             "load_cell": ModbusRtuServer(self.load_cell),
             "stage": Dynamixel2Server([self.servo]),
         }
-        self._t7_server.start()
-        ports = {"t7": self._t7_server.address}
-        try:
+        with ExitStack() as started:
+            self._t7_server.start()
+            started.callback(self._t7_server.close)
+            ports = {"t7": self._t7_server.address}
             for name, server in servers.items():
                 ports[name] = protocol_emulated.register(name, server, self._clock)
-        except ValueError:
-            self.close()
-            raise
+                started.callback(protocol_emulated.unregister, name)
+            self._servers = started.pop_all()
         return ports
 
     def operate(self, task: str, value: float) -> None:
@@ -230,7 +237,7 @@ class MuscleLaboratory:
         Raises
         ------
         ConfigurationError
-            If it is another task.
+            If it is another task, or the muscle does not bear the load.
         """
         if task not in (LOAD, STAGE):
             raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
@@ -240,13 +247,15 @@ class MuscleLaboratory:
             if task == STAGE:
                 self.frame.fasten()
             elif fault != "forgotten-load":
-                self.frame.hang(2.0 * value if fault == "heavy-load" else value)
+                load = 2.0 * value if fault == "heavy-load" else value
+                try:
+                    self.frame.hang(load)
+                except ValueError as error:
+                    raise ConfigurationError(f"a load of {load:g} N cannot be hung on the muscle: {error}") from None
 
     def close(self) -> None:
         """Switch the instruments off."""
-        for name in ("supply", "load_cell", "stage"):
-            protocol_emulated.unregister(name)
-        self._t7_server.close()
+        self._servers.close()
 
     def go_wrong(self) -> None:
         """Have the fault of the settings happen, if it is one that happens at an instant."""

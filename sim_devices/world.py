@@ -77,10 +77,14 @@ class World:
                 self._advancing = False
 
     def _advance_to(self, target: float) -> None:
-        while self._timed:
-            first = min(self._timed, key=lambda timed: timed.deadline())
-            due = first.deadline()
-            if not math.isfinite(due) or due > target:
+        while True:
+            # A plain loop: this is asked some ten times for each sample of a fast loop.
+            due, first = math.inf, None
+            for timed in self._timed:
+                deadline = timed.deadline()
+                if deadline < due:
+                    due, first = deadline, timed
+            if first is None or due > target:
                 break
             self._advance_plant(max(due, self._time))
             first.expire()

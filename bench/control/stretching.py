@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from bench.control.tracking import Command, Trace
 
 
@@ -45,6 +47,8 @@ class Stretch:
         period: float = 0.5,
         duration: float = 0.0,
     ) -> None:
+        if not math.isfinite(force):
+            raise ValueError(f"force: expected a finite number, got {force}")
         if not 0.0 < stiffnesses[0] <= stiffnesses[1]:
             raise ValueError(f"stiffnesses: expected two positive numbers, the lower one first, got {stiffnesses}")
         if not (largest_step > 0 and tolerance > 0 and period > 0 and duration >= 0):

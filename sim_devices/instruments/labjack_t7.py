@@ -409,7 +409,9 @@ class EmulatedT7:
 
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
-        with self._request():
+        # Nothing that a follower looks at changes, and nothing is refused.
+        with self.world.lock:
+            self._attend()
             return self._convert(channel, self._inputs[channel].resolution_index or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
