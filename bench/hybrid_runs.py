@@ -178,18 +178,18 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
     DataError
         If a run is of another kind or was not completed, or a part cannot be identified.
     """
-    currents = _only_loop(steps)
+    currents = read_loop(steps)
     with Record(static) as record:
         if record.status != "completed":
             raise DataError(f"{static}: the run is {record.status}; a model needs a completed one")
         curve = record.steps()
-    fast = _only_loop(step)
+    fast = read_loop(step)
     try:
         network = identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
         rises = curve[TIP] - REFERENCE
         order = choose_order(rises, curve[DEFLECTION])
         polynomial = identify_polynomial(rises, curve[DEFLECTION], order.order)
-        piezo = identify_piezo(_only_loop(loops), plays)
+        piezo = identify_piezo(read_loop(loops), plays)
         dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
         if not isinstance(polynomial.model, Polynomial):
             raise TypeError("expected a polynomial")
@@ -219,7 +219,14 @@ def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
     return PiezoIdentification(found.model, found.errors, applied, deflections - drift)
 
 
-def _only_loop(run: Path) -> Samples:
+def read_loop(run: Path) -> Samples:
+    """Return the samples of the one fast loop of a run.
+
+    Raises
+    ------
+    DataError
+        As `read_loops`, or if there are several.
+    """
     loops = read_loops(run)
     if len(loops) != 1:
         raise DataError(f"{run}: expected one fast loop, found {len(loops)}")

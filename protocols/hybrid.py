@@ -159,5 +159,36 @@ def piezo_step(parameters: PiezoStepParameters) -> Messages:
     )
 
 
+class ExcitationParameters(ProtocolParameters):
+    """What can be set."""
+
+    current: float = parameter(0.08, unit="A", low=0, high=1, help="amplitude of the current")
+    current_frequency: float = parameter(1e-3, unit="Hz", low=1e-5, high=1, help="frequency of the current")
+    voltage: float = parameter(30.0, unit="V", low=0, high=1000, help="amplitude of the voltage")
+    voltage_frequency: float = parameter(0.05, unit="Hz", low=1e-4, high=10, help="frequency of the voltage")
+    duration: float = parameter(2000.0, unit="s", low=1, high=36000, help="how long")
+    rate: float = parameter(2.0, unit="Hz", low=0.01, high=1000, help="samples in a second")
+
+
+@protocol(needs=("tec", "piezo", *SENSORS), controls=DEFLECTION)
+def hybrid_excitation(parameters: ExcitationParameters) -> Messages:
+    """Drive heat and voltage at once, a sine each, to try a model of the whole on it.
+
+    Rakotondrabe and Ivan 2010, eq. 22, has both parts.
+    """
+    yield Phase("both at once")
+    yield FastLoop(
+        Playback(
+            _sine(parameters.current, parameters.current_frequency),
+            _sine(parameters.voltage, parameters.voltage_frequency),
+        ),
+        parameters.rate,
+        parameters.duration,
+        SENSORS,
+        ("tec", "piezo"),
+        label="both at once",
+    )
+
+
 def _sine(amplitude: float, frequency: float) -> Callable[[float], float]:
     return lambda t: amplitude * math.sin(2.0 * math.pi * frequency * t)

@@ -26,7 +26,7 @@ from protocols.muscle import parse_numbers
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
 
-_REST = 5.0
+REST = 5.0
 """Time at the start before the reference begins to move, s."""
 
 
@@ -47,6 +47,7 @@ class Parameters(ProtocolParameters):
     amplitude: float = parameter(1e-6, unit="m", low=0, high=9e-6, help="amplitude of the sine on a ramp")
     frequency: float = parameter(1.0, unit="Hz", low=1e-3, high=20, help="frequency of the sine on a ramp")
     rate: float = parameter(200.0, unit="Hz", low=50, high=1000, help="samples in a second")
+    record_rate: float = parameter(50.0, unit="Hz", low=0.01, high=1000, help="recorded samples in a second")
     witness: bool = parameter(False, unit="", help="whether a sensor `witness` beside the loop is recorded as well")
 
 
@@ -79,11 +80,12 @@ def hybrid_control(parameters: Parameters) -> Messages:
         (DEFLECTION, BASE, TIP),
         ("tec", "piezo"),
         watched=(WITNESS,) if parameters.witness else (),
+        record_every=max(1, round(parameters.rate / parameters.record_rate)),
         label=parameters.reference,
     )
 
 
-class FineParametersOfProtocol(ProtocolParameters):
+class StepParameters(ProtocolParameters):
     """What can be set."""
 
     model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
@@ -95,7 +97,7 @@ class FineParametersOfProtocol(ProtocolParameters):
 
 
 @protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
-def fine_step(parameters: FineParametersOfProtocol) -> Messages:
+def fine_step(parameters: StepParameters) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 
     The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
@@ -134,10 +136,10 @@ def moves_of(parameters: Parameters) -> SmoothMoves:
 def _reference(parameters: Parameters) -> tuple[Reference, float]:
     """Return the reference and its duration, s."""
     moves = moves_of(parameters)
-    duration = _REST + moves.duration
+    duration = REST + moves.duration
 
     def delayed(t: float) -> float:
-        return moves(t - _REST)
+        return moves(t - REST)
 
     if parameters.reference == "sine-on-ramp":
         return AddedSine(delayed, parameters.amplitude, parameters.frequency), duration

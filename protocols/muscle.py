@@ -26,8 +26,8 @@ from bench.protocol import (
     parameter,
 )
 
-ON_WEIGHTS = ("supply", "fan", FORCE, LENGTH)
-ON_STAGE = (*ON_WEIGHTS, "stage", "stage_position")
+ON_WEIGHTS = ("supply", FORCE, LENGTH, "fan")
+ON_STAGE = ("supply", FORCE, LENGTH, "stage", "stage_position")
 """What a protocol needs of the rig where the muscle carries weights, and where the stage holds it."""
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)

@@ -63,9 +63,9 @@ def length_control(parameters: LengthParameters) -> Messages:
     """Bring the length of a muscle under a weight to one target after another.
 
     The memory is reset, the weight is hung on, and targets are drawn at random from the range that the model says
-    it can reach. After its time at each target, `readings` readings are taken: their mean less the target is the
-    error that counts. With `change` the operator hangs more on after every five targets, and takes it off again
-    after the next five; the controller learns of it by the load cell alone.
+    it can reach. After its time at each target the length is read several times (`readings`): the mean less the
+    target is the error that counts. With `change` the operator hangs more on after every five targets, and takes it
+    off again after the next five; the controller learns of it by the load cell alone.
     """
     model = load_two_stage_model(parameters.model)
     state = model.initial_state()
@@ -134,6 +134,7 @@ def _range(
 ) -> tuple[float, float]:
     """Return the outputs (m or N) between the ends of a full cycle of the voltage, less a margin at either end."""
     values = []
+    under = f" under {state.force:g} N" if output == "length" else ""
     for voltage in (highest, 0.0):
         if output == "length":
             state, value = model.step(state, voltage, state.force)
@@ -143,7 +144,7 @@ def _range(
         values.append(value)
     low, high = min(values), max(values)
     if not low < high:
-        raise ValueError(f"highest: up to {highest:g} V the model's {output} does not change; choose a higher one")
+        raise ValueError(f"highest: up to {highest:g} V the model's {output} does not change{under}")
     return low + _MARGIN * (high - low), high - _MARGIN * (high - low)
 
 

@@ -49,9 +49,14 @@ class Campaign:
         self._seeds = (2 * self.seed + k % 2 + 100_000 * (k // 2) for k in itertools.count())
 
     def run(
-        self, protocol: str, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
+        self,
+        protocol: str,
+        settings: Mapping[str, str],
+        overrides: Mapping[str, str] | None = None,
+        *,
+        rig: str | None = None,
     ) -> RunResult:
-        """Carry out one protocol.
+        """Carry out one protocol, on another rig than the campaign's if one is given.
 
         Raises
         ------
@@ -63,7 +68,7 @@ class Campaign:
             Run(
                 protocol=definition,
                 parameters=definition.parse(settings),
-                rig=self.rig,
+                rig=rig or self.rig,
                 overrides=overrides or {},
                 seed=next(self._seeds),
                 clock="virtual",

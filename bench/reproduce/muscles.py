@@ -21,7 +21,7 @@ from bench.reproduce.sma import Characterization, characterize, errors_table
 
 @dataclass(frozen=True)
 class Muscle:
-    """One muscle: its key in the JSON, its name in tables, its rig, and the parameters that every protocol takes."""
+    """One muscle: its key in the JSON, its name in tables, its rig, and parameters by protocol."""
 
     key: str
     title: str
