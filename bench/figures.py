@@ -34,6 +34,10 @@ _STYLE: dict[Any, Any] = {
 _COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
 
 
+_MARKED = 200
+"""Most samples of a curve that are marked one by one."""
+
+
 class Curve(NamedTuple):
     """One curve: its name in the legend (empty for none) and its points, each of shape (N,)."""
 
@@ -193,7 +197,8 @@ def plot_panels(
                 axes.plot(
                     curve.horizontal,
                     curve.vertical,
-                    ".-",
+                    # Where samples are dense, their marks would hide what is behind.
+                    ".-" if curve.horizontal.size <= _MARKED else "-",
                     color=f"C{k}",
                     linewidth=0.7,
                     markersize=2.5,

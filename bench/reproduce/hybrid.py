@@ -336,8 +336,9 @@ def _draw(
         return paths[-1]
 
     def simulated(samples: Samples) -> Floats:
+        """Return the temperature of the base by the network, with the room as it was in the identification."""
         network = found.network.network
-        return network.simulate(samples[CURRENT], samples.period, float(samples[BASE][0]))[:, 2]
+        return network.simulate(samples[CURRENT], samples.period, found.network.ambient)[:, 2]
 
     around, stepped = read_loop(sine.folder), read_loop(steps.folder)
     second = slice(len(around.table) // 2, None)
@@ -416,11 +417,13 @@ def _draw(
         columns=1,
     )
     for name, tracking in tracked.items():
+        # Without the first seconds, in which the controller finds its way to the beginning.
+        shown = tracking.times > SETTLING
         plot_tracking(
             path(f"control-moves-{name}"),
-            tracking.reference * 1e6,
-            {name: tracking.deflection * 1e6},
-            horizontal=tracking.times,
+            tracking.reference[shown] * 1e6,
+            {name: tracking.deflection[shown] * 1e6},
+            horizontal=tracking.times[shown],
             horizontal_label="time / s",
             output_label="deflection / µm",
             error_label="error / µm",
