@@ -212,7 +212,9 @@ def run(
     )
     for name, state in outcome.safe_state.items():
         if state != SAFE:
-            _errors.print(f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False)
+            _errors.print(
+                f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False, soft_wrap=True
+            )
     if outcome.error is not None:
         if not isinstance(outcome.error, BenchError):
             raise outcome.error
@@ -341,7 +343,15 @@ def identify_muscle_(
     if out is not None:
         muscle_file(model, found, [force_run, *length_runs]).save(out)
         console.print(f"model: {out}", highlight=False, soft_wrap=True)
-    write_json(json_file, {"model": model, "errors": {kind: errors_json(e) for kind, e in errors.items()}})
+    write_json(
+        json_file,
+        {
+            "model": model,
+            "series": len(series),
+            "errors": {kind: errors_json(e) for kind, e in errors.items()},
+            "kkt": {stage: fit.kkt_residual for stage, fit in found.certificates.items()},
+        },
+    )
 
 
 @app.command("identify-hybrid")

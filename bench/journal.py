@@ -163,7 +163,8 @@ class Journal:
             for key, value in {"schema": SCHEMA, **meta}.items():
                 self._put_meta(key, value)
         marks = ", ?" * len(self.signals)
-        self._since_commit = Stopwatch()
+        self._waiting: list[tuple[float, ...]] = []
+        self._since_write = Stopwatch()
         self._insert_step = f"INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?, ?{marks})"  # noqa: S608 - marks only
         self._insert_tick = f"INSERT INTO telemetry VALUES (NULL, ?, ?{marks})"  # noqa: S608 - marks only
 
@@ -173,11 +174,9 @@ class Journal:
         A tick that comes less than 0.1 s of the room after the last write, as they do on the virtual clock, waits
         for the next tick, step or event to be written with it.
         """
-        if not self._db.in_transaction:
-            self._db.execute("BEGIN IMMEDIATE")
-        self._db.execute(self._insert_tick, (t, step, *map(float, values)))
-        if self._since_commit.seconds() >= _LONGEST_UNWRITTEN:
-            self._commit()
+        self._waiting.append((t, step, *map(float, values)))
+        if self._since_write.seconds() >= _LONGEST_UNWRITTEN:
+            self._write_waiting()
 
     def step(self, record: StepRecord) -> None:
         """Record a finished step."""
@@ -201,7 +200,7 @@ class Journal:
 
     def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
         """Record how the run ended: status, reason, laboratory time in s, safe state by device."""
-        self._commit()
+        self._write_waiting()
         with self._transaction():
             self._put_meta("status", status)
             self._put_meta("reason", reason)
@@ -211,7 +210,7 @@ class Journal:
     def close(self) -> None:
         """Close the file; what was recorded stays."""
         with suppress(sqlite3.OperationalError):
-            self._commit()
+            self._write_waiting()
         # Out of WAL mode, as a reader of a WAL file leaves companions beside it; while one reads, it cannot be.
         with suppress(sqlite3.OperationalError):
             self._db.execute("PRAGMA busy_timeout=0")
@@ -219,14 +218,22 @@ class Journal:
         self._db.close()
 
     def _write(self, statement: str, values: Sequence[object]) -> None:
-        """Write one row, and whatever waits, for good."""
-        self._db.execute(statement, values)
-        self._commit()
+        """Write one row for good, after whatever waits."""
+        if not self._waiting:
+            self._db.execute(statement, values)
+        else:
+            with self._transaction():
+                self._db.executemany(self._insert_tick, self._waiting)
+                self._db.execute(statement, values)
+            self._waiting.clear()
+        self._since_write = Stopwatch()
 
-    def _commit(self) -> None:
-        if self._db.in_transaction:
-            self._db.execute("COMMIT")
-        self._since_commit = Stopwatch()
+    def _write_waiting(self) -> None:
+        if self._waiting:
+            with self._transaction():
+                self._db.executemany(self._insert_tick, self._waiting)
+            self._waiting.clear()
+        self._since_write = Stopwatch()
 
     def _put_meta(self, key: str, value: object) -> None:
         text = json.dumps(value, ensure_ascii=False, default=str)

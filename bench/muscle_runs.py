@@ -52,10 +52,11 @@ _PLAYS = 15
 
 
 class Resting(NamedTuple):
-    """Force over the voltage with the ends held: V and N, each of shape (N,)."""
+    """Force over the voltage with the ends held: V and N, each of shape (N,), and the force of the resets, N."""
 
     voltages: Floats
     forces: Floats
+    pretension: float
 
 
 def read_resting(run: Path) -> Resting:
@@ -67,7 +68,8 @@ def read_resting(run: Path) -> Resting:
         If it is no such run, or was not completed.
     """
     voltages, forces, _ = np.concatenate(_samples(run, RESTING_PROTOCOLS)).T
-    return Resting(voltages, forces)
+    with Record(run) as record:
+        return Resting(voltages, forces, float(record.meta["parameters"]["pretension"]))
 
 
 def read_series(run: Path) -> list[Series]:
@@ -109,10 +111,10 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
     DataError
         If the data do not determine the model.
     """
-    highest = float(resting.voltages.max())
-    pretension = float(resting.forces[0])
-    force_limit = max(float(forces.max()) for forces in (resting.forces, *(s.forces for s in series)))
-    weights = np.ones(resting.voltages.size)
+    voltages, forces, pretension = resting
+    highest = float(voltages.max())
+    force_limit = max(float(each.max()) for each in (forces, *(s.forces for s in series)))
+    weights = np.ones(voltages.size)
     weights[0] = _COLD_WEIGHT
     try:
         if name == "summed":
@@ -125,7 +127,8 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
             )
         if name == "linear":
             return identify_linear(
-                *resting,
+                voltages,
+                forces,
                 series,
                 voltage_range=(0.0, highest),
                 force_limit=force_limit,
@@ -133,7 +136,8 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
                 units=UNITS,
             )
         return identify_two_stage(
-            *resting,
+            voltages,
+            forces,
             series,
             weights=weights,
             second=_plays(force_limit) if name == "two-stage-prandtl-ishlinskii" else None,

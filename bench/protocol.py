@@ -30,7 +30,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticUndefined
@@ -374,8 +374,12 @@ class ProtocolDefinition:
             allowed = f"≥ {low:g}"
         elif high is not None:
             allowed = f"≤ {high:g}"
+        elif get_origin(info.annotation) is Literal:
+            allowed = ", ".join(map(str, get_args(info.annotation)))
+        elif info.annotation is bool:
+            allowed = "true, false"
         else:
-            allowed = "any " + getattr(info.annotation, "__name__", "value")
+            allowed = "any text" if info.annotation is str else "any number"
         default = "must be given" if info.default is PydanticUndefined else str(info.default)
         return ParameterHelp(name, default, unit, allowed, info.description or "")
 

@@ -95,7 +95,7 @@ class ProgressDisplay:
         """Show the phase beside the bar, and print what the operator should know."""
         if event.kind == "phase":
             self._progress.update(self._task, phase=event.text)
-        elif event.level != "INFO" or event.kind in ("note", "prompt", "resume"):
+        elif event.level != "INFO" or event.kind in ("note", "resume"):
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
                 f"{_duration(event.t):>10}  {event.kind}: {event.text}", style=style, highlight=False, markup=False

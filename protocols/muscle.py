@@ -91,8 +91,13 @@ def hang(load: float) -> Part[Reading]:
 
 
 def reset_under_weights(parameters: MuscleParameters) -> Part[Reading]:
-    """Reset the memory: drive the muscle to its highest voltage and back to 0 V under the pretension."""
+    """Reset the memory: drive the muscle to its highest voltage and back to 0 V under the pretension.
+
+    Nobody shall touch a hot muscle: it cools before the weight is changed.
+    """
     yield Phase("reset")
+    yield Step({"supply": 0.0, "fan": 1.0}, Dwell(_COOL_SECONDS), label="reset")
+    yield Step({"fan": 0.0}, Dwell(0.5), label="reset")
     yield from hang(parameters.pretension)
     yield Step({"supply": parameters.highest}, Dwell(parameters.dwell), label="reset")
     return (yield from cool(parameters))

@@ -39,8 +39,6 @@ LOAD, STAGE = "load", "stage"
 FAN_LINE = 0
 """Digital line of the T7 that switches the fan: FIO0, on when high."""
 
-_FINEST = 0.1
-"""Longest piece of time, s, in which a moving stage pulls the muscle along."""
 _HEARTBEAT_TIME = 0x1017
 """Object of the supply with the period of its heartbeat, ms; 0 for none."""
 _BROKEN_CELL = -1e3
@@ -145,13 +143,10 @@ class Frame:
         """Integrate over `dt` seconds, with the end following the stage."""
         if self.t7 is not None:
             self.muscle.blow(self.t7.dio_level(FAN_LINE))
-        if not self._fastened or self.drum is None:
-            self.muscle.advance(dt)
-            return
-        pieces = 1 if self.drum.position_after(dt) == self.drum.position else max(1, math.ceil(dt / _FINEST))
-        for i in range(pieces):
-            self.muscle.clamp(self.drum.position_after(dt * (i + 1) / pieces))
-            self.muscle.advance(dt / pieces)
+        if self._fastened and self.drum is not None:
+            # A servo on its way is due every 20 ms, so that the world advances in pieces as short as that.
+            self.muscle.clamp(self.drum.position_after(dt))
+        self.muscle.advance(dt)
 
 
 class MuscleLaboratory:
@@ -200,7 +195,7 @@ class MuscleLaboratory:
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
         self.frame.t7 = self.t7
         self._t7_server = ModbusTcpServer(self.t7)
-        self._servers = ExitStack()
+        self._opened = ExitStack()
         if settings.fault != "none":
             self.world.add(_Fault(self, settings.fault_time))
 
@@ -228,7 +223,7 @@ class MuscleLaboratory:
             for name, server in servers.items():
                 ports[name] = protocol_emulated.register(name, server, self._clock)
                 started.callback(protocol_emulated.unregister, name)
-            self._servers = started.pop_all()
+            self._opened = started.pop_all()
         return ports
 
     def operate(self, task: str, value: float) -> None:
@@ -255,7 +250,7 @@ class MuscleLaboratory:
 
     def close(self) -> None:
         """Switch the instruments off."""
-        self._servers.close()
+        self._opened.close()
 
     def go_wrong(self) -> None:
         """Have the fault of the settings happen, if it is one that happens at an instant."""

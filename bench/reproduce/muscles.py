@@ -104,7 +104,7 @@ def reproduce_muscles(*, seed: int, out: Path, live: bool, console: Console) -> 
 
 def _draw(measured: Characterization, folder: Path) -> list[Path]:
     """Draw the three hysteresis relationships as they were measured."""
-    voltages, forces = measured.resting
+    voltages, forces, _ = measured.resting
     paths = [folder / f"{name}.png" for name in ("force-voltage", "length-voltage", "length-force")]
     plot_panels(
         paths[0],

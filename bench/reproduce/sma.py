@@ -57,11 +57,12 @@ TITLES: Mapping[ModelName, str] = {
     "two-stage-prandtl-ishlinskii": "two-stage, second one of 15 plays",
 }
 KINDS = {
-    "fv": "F–V, ends held (Fig. 6)",
-    "lv": "L–V, five loads (Figs. 7 and 10)",
-    "lf": "L–F, six voltages (Figs. 8 and 10)",
-    "verification": "verification, random voltages (Fig. 11)",
+    "fv": ("F–V, ends held", "Fig. 6"),
+    "lv": ("L–V, five loads", "Figs. 7 and 10"),
+    "lf": ("L–F, six voltages", "Figs. 8 and 10"),
+    "verification": ("verification, random voltages", "Fig. 11"),
 }
+"""The kinds of series by their keys in the JSON: what was varied, and the paper's figures of it."""
 _RESIDUALS = {"fv": "force-voltage", "lv": "length-voltage", "lf": "length-force"}
 """The keys of the result, and those of an identification."""
 
@@ -272,15 +273,17 @@ def errors_table(
     measured: Characterization, paper: Mapping[str, Mapping[ModelName, tuple[float, float]]], title: str = ""
 ) -> Table:
     """Return the table of errors, average / RMS in percent of the range, beside those of the paper."""
+    found = {name: measured.errors(name) for name in TITLES}
     rows = []
-    for key, kind in KINDS.items():
-        for name, title_of in TITLES.items():
-            errors = measured.errors(name).get(key)
-            if errors is not None:
+    for key, (kind, figures) in KINDS.items():
+        first = f"{kind} ({figures})" if paper else kind
+        for name, model in TITLES.items():
+            if key in found[name]:
+                errors = found[name][key]
                 stated = paper.get(key, {}).get(name)
                 beside = [f"{stated[0]:.1f} / {stated[1]:.1f}" if stated else "–"] if paper else []
-                rows.append((kind, title_of, *beside, f"{errors.average_percent:.1f} / {errors.rms_percent:.1f}"))
-                kind = ""
+                rows.append((first, model, *beside, f"{errors.average_percent:.1f} / {errors.rms_percent:.1f}"))
+                first = ""
     columns = ("", "model", *(["paper"] if paper else []), "bench")
     return make_table(title or "errors, average / RMS in % of the range", columns, rows)
 
@@ -312,7 +315,7 @@ def _control_table(result: Mapping[str, Any]) -> Table:
 
 
 def _draw(measured: Characterization, folder: Path) -> list[Path]:
-    voltages, forces = measured.resting
+    voltages, forces, _ = measured.resting
     models = {name: found.model for name, found in measured.models.items() if name in PAPER["lv"]}
     paths = []
 

@@ -60,12 +60,64 @@ def write_loop(path, rows=400):
 class TestHelp:
     @pytest.mark.parametrize(
         "command",
-        ["", "list", "run", "identify", "predict", "invert", "compare", "design", "report", "export", "reproduce"],
+        [
+            "",
+            "list",
+            "run",
+            "identify",
+            "identify-muscle",
+            "predict",
+            "invert",
+            "compare",
+            "design",
+            "report",
+            "export",
+            "reproduce",
+            "reproduce vo2",
+            "reproduce sma",
+            "reproduce muscles",
+        ],
     )
     def test_every_command_has_help(self, bench, command):
         code, out, _ = bench(*command.split(), "--help")
         assert code == 0
         assert "Usage" in out
+
+    @pytest.mark.parametrize(
+        ("command", "words"),
+        [
+            ("identify-muscle", ["FORCE_RUN", "LENGTH_RUN", "two-stage-prandtl-ishlinskii", "--verify", "--json"]),
+            ("reproduce", ["vo2", "sma", "muscles"]),
+            ("reproduce sma", ["Zhang and Yip", "--seed", "--out", "--live", "--json"]),
+            ("reproduce muscles", ["McKibben", "--seed", "--out", "--live", "--json"]),
+        ],
+    )
+    def test_help_of_the_muscles_commands(self, bench, command, words):
+        code, out, _ = bench(*command.split(), "--help")
+        assert code == 0
+        for word in words:
+            assert word in out
+
+    @pytest.mark.parametrize(
+        ("protocol", "parameters"),
+        [
+            ("force-voltage", {"points": ("37", "1"), "pretension": ("0.3", "N"), "slack": ("-0.006", "m")}),
+            ("length-voltage", {"points": ("37", "1"), "loads": ("0.98, 2.94, 4.9, 6.86, 8.82", "N")}),
+            ("length-force", {"voltages": ("0, 0.6, 1.2, 1.8, 2.4, 3", "V"), "largest_force": ("10.5", "N")}),
+            ("length-verification", {"points": ("18", "1"), "sequence_seed": ("1", "1")}),
+            ("length-control", {"model": ("must be given", ""), "controller": ("closed-loop-inverse", "")}),
+            ("force-control", {"model": ("must be given", ""), "conditioning": ("2", "1")}),
+        ],
+    )
+    def test_parameters_of_the_muscles_protocols(self, bench, tmp_path, protocol, parameters):
+        code, out, _ = bench("run", protocol, "--help")
+        assert code == 0
+        bench("list", protocol, "--json", tmp_path / "list.json")
+        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
+        for name, (default, unit) in parameters.items():
+            assert name in out
+            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
+            assert shown[name]["text"]
 
     def test_help_says_what_exit_codes_mean(self, bench):
         _, out, _ = bench("--help")
@@ -483,6 +535,107 @@ def replace_cell(text, row, value):
     lines = text.splitlines()
     lines[row] = f"{value},{lines[row].partition(',')[2]}"
     return "\n".join(lines) + "\n"
+
+
+@pytest.fixture(scope="module")
+def muscle_runs(tmp_path_factory):
+    """Folders of short runs of a muscle by protocol, and `failed` for one that was not completed."""
+    folder = tmp_path_factory.mktemp("muscle")
+    runs = {}
+    for name, protocol, *options in (
+        ("force-voltage", "force-voltage", "points=13", "conditioning=1", "dwell=15"),
+        ("length-voltage", "length-voltage", "points=13", "loads=2.94, 6.86", "dwell=8"),
+        ("length-force", "length-force", "points=4", "voltages=0, 3", "dwell=8"),
+        ("length-verification", "length-verification", "points=6", "loads=4.9", "dwell=8"),
+        ("failed", "length-voltage", "points=11", "loads=20", "dwell=2"),
+    ):
+        result = folder / "run.json"
+        settings = [part for option in options for part in ("--set", option)]
+        with pytest.raises(SystemExit) as stopped:
+            main(
+                ["run", protocol, "--rig", "sma", "--clock", "virtual", *settings, "--out", str(folder),
+                 "--json", str(result)]
+            )  # fmt: skip
+        assert bool(stopped.value.code) == (name == "failed")
+        runs[name] = json.loads(result.read_text())["folder"]
+    return runs
+
+
+class TestIdentifyMuscle:
+    KINDS = ("force-voltage", "length-voltage", "length-force")
+
+    def identify(self, bench, runs, *options):
+        return bench("identify-muscle", *(runs[kind] for kind in self.KINDS), *options)
+
+    def test_a_model_with_its_errors(self, bench, muscle_runs, tmp_path):
+        code, out, err = self.identify(
+            bench, muscle_runs, "--verify", muscle_runs["length-verification"],
+            "--out", tmp_path / "model.json", "--json", tmp_path / "result.json",
+        )  # fmt: skip
+        assert (code, err) == (0, "")
+        text = re.sub(r"\s+", " ", out)
+        assert "two-stage from 4 series of lengths" in text
+        assert "KKT residual, first" in text
+        assert "KKT residual, second" in text
+        result = json.loads((tmp_path / "result.json").read_text())
+        assert result["model"] == "two-stage"
+        assert list(result["errors"]) == [*self.KINDS, "verification"]
+        for kind, errors in result["errors"].items():
+            assert set(errors) == {"average", "rms"}
+            assert 0 < errors["average"] <= errors["rms"] < 20
+            assert f"{kind} average {errors['average']:.2f} %, RMS {errors['rms']:.2f} %" in text
+        model = json.loads((tmp_path / "model.json").read_text())
+        assert model["format"] == "bench-coupled-model"
+        assert model["provenance"]["sources"] == [Path(muscle_runs[kind]).name for kind in self.KINDS]
+        assert all(residual < 1e-10 for residual in model["provenance"]["kkt"].values())
+
+    @pytest.mark.parametrize("name", ["two-stage-prandtl-ishlinskii", "summed", "linear"])
+    def test_each_other_model(self, bench, muscle_runs, tmp_path, name):
+        code, out, _ = self.identify(
+            bench, muscle_runs, "--model", name, "--out", tmp_path / "model.json", "--json", tmp_path / "result.json"
+        )
+        assert code == 0
+        assert f"{name} from 4 series" in re.sub(r"\s+", " ", out)
+        result = json.loads((tmp_path / "result.json").read_text())
+        assert result["model"] == json.loads((tmp_path / "model.json").read_text())["name"] == name
+        assert set(self.KINDS) - set(result["errors"]) == ({"force-voltage"} if name == "summed" else set())
+
+    @pytest.mark.parametrize(
+        ("names", "words"),
+        [
+            (["length-voltage", "length-force"], ["is a run of length-voltage; expected one of force-voltage"]),
+            (["force-voltage", "force-voltage"], ["is a run of force-voltage; expected", "length-verification"]),
+            (["force-voltage", "failed"], ["the run is failed; a model needs a completed one"]),
+            (["force-voltage", "none"], ["is not a run"]),
+        ],
+    )
+    def test_runs_that_do_not_fit_are_one_message(self, bench, muscle_runs, tmp_path, names, words):
+        places = {**muscle_runs, "none": tmp_path / "none"}
+        code, _, err = bench("identify-muscle", *(places[name] for name in names), "--out", tmp_path / "model.json")
+        assert code == 3
+        assert err.count("error:") == 1
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
+        assert not list(tmp_path.iterdir())
+
+    def test_wrong_commands_are_refused(self, bench, muscle_runs, tmp_path):
+        assert bench("identify-muscle", muscle_runs["force-voltage"])[0] == 2
+        code, _, err = self.identify(bench, muscle_runs, "--model", "cubic")
+        assert code == 2
+        assert "cubic" in err
+        code, _, err = self.identify(bench, muscle_runs, "--out", tmp_path / "none" / "model.json")
+        assert code == 3
+        assert "cannot be written" in err
+
+    def test_what_it_writes_is_no_model_of_one_input(self, bench, muscle_runs, tmp_path):
+        self.identify(bench, muscle_runs, "--out", tmp_path / "model.json")
+        code, _, err = bench(
+            "predict", tmp_path / "model.json", muscle_runs["force-voltage"], "--input", "supply_voltage",
+            "--out", tmp_path / "out.csv",
+        )  # fmt: skip
+        assert code == 3
+        assert err.count("error:") == 1
+        assert "is not a model file" in re.sub(r"\s+", " ", err)
 
 
 class TestReportAndExport:

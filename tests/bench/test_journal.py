@@ -5,6 +5,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, SCHEMA, Event, Journal, Record, StepRecord, add_model
@@ -251,6 +253,69 @@ class TestDurability:
             (tmp_path / name).mkdir()
             write(tmp_path / name / FILE_NAME)
         assert digest(tmp_path / "a") == digest(tmp_path / "b")
+
+
+class TestTelemetryThatWaits:
+    """Ticks that come one right after another are written together; nothing else that is written waits."""
+
+    @pytest.fixture
+    def journal(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        yield journal
+        with suppress(sqlite3.ProgrammingError):  # closed already
+            journal.close()
+
+    def record_until_some_wait(self, journal):
+        """Record ticks, the force of each its number; return how many there are, some of them not yet written."""
+        for tick in range(1000):
+            journal.telemetry(0.1 * tick, 0, (1.0, float(tick)))
+            if journal._waiting:
+                return tick + 1
+        raise AssertionError("no tick ever waited")
+
+    @pytest.mark.parametrize(
+        "write",
+        [
+            lambda journal: journal.step(record(0, 1.0, 2.0)),
+            lambda journal: journal.event(Event(1.0, "INFO", "note", "something")),
+            lambda journal: journal.finish(status="completed", reason="", finished=1.0, safe_state={}),
+            lambda journal: journal.close(),
+        ],
+        ids=["step", "event", "finish", "close"],
+    )
+    def test_are_written_with_what_comes_next(self, journal, tmp_path, write):
+        count = self.record_until_some_wait(journal)
+        with Record(tmp_path) as run:
+            assert len(run.telemetry()) < count
+        write(journal)
+        with Record(tmp_path) as run:
+            ticks = run.telemetry()
+        np.testing.assert_array_equal(ticks["force"], np.arange(count))
+
+    def test_do_not_wait_for_ever(self, journal, tmp_path):
+        # More ticks alone bring them into the file, as soon as a tenth of a second of the room is over.
+        waited = Stopwatch()
+        with Record(tmp_path) as run:
+            count = 0
+            while len(run.telemetry()) == 0:
+                assert waited.seconds() < 60.0
+                journal.telemetry(0.1 * count, 0, (1.0, float(count)))
+                count += 1
+            ticks = run.telemetry()
+        np.testing.assert_array_equal(ticks["force"], np.arange(len(ticks)))
+
+    def test_a_step_and_the_ticks_before_it_survive_together(self, journal, tmp_path):
+        count = self.record_until_some_wait(journal)
+        journal.step(record(0, 1.0, 2.0))
+        # A copy of the files is what another process would find if this one died now.
+        copy = tmp_path / "copy"
+        copy.mkdir()
+        for path in tmp_path.glob(FILE_NAME + "*"):
+            (copy / path.name).write_bytes(path.read_bytes())
+        with Record(copy) as run:
+            assert run.status == "unfinished"
+            assert len(run.telemetry()) == count
+            assert len(run.steps()) == 1
 
 
 class TestUnusable:

@@ -78,8 +78,8 @@ class TestParse:
             ("count", "2.5", "≥ 1"),
             ("slow", "61", "≤ 60 s"),
             ("slow", "-inf", "≤ 60 s"),
-            ("free", "nan", "any float V"),
-            ("free", "inf", "any float V"),
+            ("free", "nan", "any number V"),
+            ("free", "inf", "any number V"),
             ("needed", "-1", "0 to 4 A"),
         ],
     )

@@ -1,0 +1,56 @@
+"""The muscles of the paper's outlook: the protocols and models of the wire on two more rigs."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench.cli import main
+from bench.journal import Record
+from bench.muscle_runs import MODELS, SAMPLE
+
+MUSCLES = ("mckibben", "coiled_polymer")
+SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "length-verification": 90}
+
+
+def test_campaign(tmp_path, capsys):
+    result = tmp_path / "result.json"
+    with pytest.raises(SystemExit) as stopped:
+        main(["reproduce", "muscles", "--seed", "1", "--out", str(tmp_path), "--json", str(result)])
+    assert not stopped.value.code
+    out, err = capsys.readouterr()
+    assert "McKibben muscle" in out
+    assert "super-coiled polymer muscle" in out
+    assert err == ""
+    campaign = json.loads(result.read_text())
+    assert campaign["seed"] == 1
+    assert campaign["laboratory_seconds"] > 8 * 3600
+    for muscle in MUSCLES:
+        errors = campaign[muscle]
+        assert errors["fv"]["two_stage"]["rms"] < 1.0
+        for kind in ("lv", "lf", "verification"):
+            # What the paper reaches on its wire.
+            assert errors[kind]["two_stage"]["rms"] < 4.9, (muscle, kind)
+            assert set(errors[kind]) == {name.replace("-", "_") for name in MODELS}
+        assert errors["fv"]["two_stage"]["rms"] < 0.5 * errors["fv"]["linear"]["rms"]
+        for kind in ("lv", "verification"):
+            others = [model for model in errors[kind] if model != "two_stage"]
+            assert all(errors[kind]["two_stage"]["rms"] < errors[kind][model]["rms"] for model in others), muscle
+        folder = Path(campaign["folder"]) / muscle
+        assert {path.stem for path in folder.glob("*.json")} == set(MODELS)
+        runs = sorted(folder.glob("*/journal.sqlite"))
+        counts = {}
+        for run in runs:
+            with Record(run) as record:
+                assert record.status == "completed"
+                assert set(record.meta["safe_state"].values()) == {"safe"}
+                assert "two-stage" in record.models()
+                counts[record.meta["protocol"]] = sum(step.label == SAMPLE for step in record.step_records())
+        assert counts == SAMPLES
+    assert [Path(path).stem for path in campaign["figures"]] == 2 * [
+        "force-voltage",
+        "length-voltage",
+        "length-force",
+    ]
+    assert len(campaign["recordings"]) == 8
+    assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
