@@ -5,11 +5,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
 
-.PHONY: demo test check benchmark clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test check benchmark clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
 	$(BIN)/bench reproduce vo2 --out recordings
+
+# The other laboratories likewise.
+demo-sma demo-muscles demo-hybrid: demo-%: $(SETUP)
+	$(BIN)/bench reproduce $* --out recordings
 
 test: check
 	$(BIN)/python -m pytest --numprocesses auto

@@ -274,30 +274,47 @@ class Engine:
         k = taken = 0
         lateness = latest = 0.0
         try:
-            while k < samples:
+            while True:
                 due = start + k * period
+                # Between the samples of a slow loop interlocks and watchdogs do not wait for the next one.
+                while period > self._period and next_tick < due - 1e-6 * self._period:
+                    self._sleep_until(next_tick)
+                    values = self._tick()
+                    next_tick = self._tick_after(next_tick)
                 self._sleep_until(due)
+                if k == samples:
+                    break
                 now = self._clock.now()
                 values.update(read())
                 commands = update(now - start, tuple([values[name] for name in inputs]))
-                for actuator, name, command in zip(actuators, setpoints, commands, strict=True):
-                    if command != actuator.setpoint:
-                        actuator.set(command)
-                    values[name] = command
+                if len(commands) != len(actuators):
+                    raise ConfigurationError(
+                        f"the controller of {', '.join(message.actuators)} gave {len(commands)} set-points; "
+                        f"expected {len(actuators)}"
+                    )
+                changed = [each for each in zip(actuators, commands, strict=True) if each[1] != each[0].setpoint]
+                # None is sent when another is wrong.
+                if len(changed) > 1:
+                    for actuator, command in changed:
+                        actuator.check(command)
+                for actuator, command in changed:
+                    actuator.set(command)
+                values.update(zip(setpoints, commands, strict=True))
                 late = now - due
                 lateness, latest = lateness + late, max(latest, late)
                 if taken % message.record_every == 0:
-                    self._trace = {**_traced(message.controller.trace), LATENESS.name: late}
+                    # Without the lateness, which tells the samples from the ticks.
+                    self._trace = _traced(message.controller.trace)
                     values.update(self._trace)
+                    values[LATENESS.name] = late
                     self._record_tick(now, values)
                 taken += 1
                 if now >= next_tick:
                     # Everything else: what its watchdogs wait for, and what interlocks look at.
                     values = self._values(self._rig.glance)
                     self._watch.check(self._clock.now(), values)
-                    next_tick += self._period
-                k = max(k + 1, math.floor((self._clock.now() - start) / period))
-            self._sleep_until(start + samples * period)
+                    next_tick = self._tick_after(next_tick)
+                k = min(samples, max(k + 1, math.floor((self._clock.now() - start) / period)))
         finally:
             self._trace = _NOT_AT_WORK
         self._event(
@@ -409,6 +426,10 @@ class Engine:
         values = self._values(self._rig.glance)
         self._record_tick(self._clock.now(), values)
         return values
+
+    def _tick_after(self, tick: float) -> float:
+        """Return when the tick after one is due; those that were missed meanwhile are not made up for."""
+        return tick + self._period * (1 + max(0, math.floor((self._clock.now() - tick) / self._period)))
 
     def _values(self, ask: Callable[[], dict[str, float]]) -> dict[str, float]:
         return ask() | self._trace

@@ -6,6 +6,7 @@ Everything is in SI units; temperatures are in °C and a positive current heats.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +33,8 @@ WITNESS = "witness_position"
 REFERENCE = 22.0
 """Temperature of the tip from which the polynomial counts, °C: the room's, as far as it is known."""
 
-_DRIFT_PASSES = 4
+_DRIFT_PASSES = 64
+"""Operator and parabola are fitted in turn; more passes than these change nothing beyond the sensor's noise."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def read_loops(run: Path) -> dict[str, Samples]:
     Raises
     ------
     DataError
-        If the run was not completed, has no fast loop, or left samples out.
+        If the run was not completed, has no fast loop or two of one label, or left samples out.
     """
     with Record(run) as record:
         if record.status != "completed":
@@ -118,6 +120,8 @@ def read_loops(run: Path) -> dict[str, Samples]:
         rows = taken & (ticks["step"] == step)
         table = Table({name: values[rows] for name, values in ticks.columns.items()})
         times = table["t"] - table[LATENESS.name]
+        if labels[step] in loops:
+            raise DataError(f"{run}: has two loops {labels[step]!r}; expected one of each label")
         if len(table) < 2 or np.ptp(steps := np.diff(times)) > 1e-3 * steps.mean():
             raise DataError(f"{run}: the loop {labels[step]!r} left samples out; a model needs all of them")
         loops[labels[step]] = Samples(table, float(steps.mean()))
@@ -131,11 +135,12 @@ def sine_at(samples: Samples, signal: str, frequency: float) -> complex:
 
     The first period is left out, as the transient is in it.
     """
-    count = round(1.0 / (frequency * samples.period))
-    periods = len(samples.table) // count - 1
+    period = 1.0 / (frequency * samples.period)
+    # A period need not be a whole number of samples.
+    periods = math.floor((len(samples.table) + 1) / period) - 1
     if periods < 1:
         raise DataError(f"a sine of {frequency:g} Hz takes two periods at least, the first of which does not count")
-    last = slice(len(samples.table) - periods * count, None)
+    last = slice(len(samples.table) - round(periods * period), None)
     times, values = samples.times[last], samples[signal][last]
     # With what drifts from period to period as further columns.
     angle = 2.0 * np.pi * frequency * times
@@ -178,6 +183,15 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
     DataError
         If a run is of another kind or was not completed, or a part cannot be identified.
     """
+    for run, protocol in (
+        (steps, "current-steps"),
+        (static, "thermomechanical"),
+        (loops, "piezo-loops"),
+        (step, "piezo-step"),
+    ):
+        with Record(run) as record:
+            if record.meta.get("protocol") != protocol:
+                raise DataError(f"{run}: is a run of {record.meta.get('protocol')}; expected one of {protocol}")
     currents = read_loop(steps)
     with Record(static) as record:
         if record.status != "completed":

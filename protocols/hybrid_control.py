@@ -28,6 +28,8 @@ ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
 
 REST = 5.0
 """Time at the start before the reference begins to move, s."""
+REACH = 199e-6
+"""Farthest position of either sign, m; the displacement sensor sees no farther."""
 
 
 class Parameters(ProtocolParameters):
@@ -39,8 +41,8 @@ class Parameters(ProtocolParameters):
     positions: str = parameter(
         "60e-6, -50e-6, 90e-6, 85e-6, -120e-6, 0", unit="m", help="of moves: positions, with commas between them"
     )
-    low: float = parameter(-50e-6, unit="m", low=-199e-6, high=199e-6, help="lowest position of the others")
-    high: float = parameter(50e-6, unit="m", low=-199e-6, high=199e-6, help="highest position of the others")
+    low: float = parameter(-50e-6, unit="m", low=-REACH, high=REACH, help="lowest position of the others")
+    high: float = parameter(50e-6, unit="m", low=-REACH, high=REACH, help="highest position of the others")
     steps: int = parameter(5, unit="1", low=1, high=1000, help="steps of a staircase each way")
     speed: float = parameter(3e-6, unit="m/s", low=1e-9, high=1e-4, help="greatest speed of the reference")
     hold: float = parameter(60.0, unit="s", low=0, high=36000, help="time at each position")
@@ -125,7 +127,10 @@ def moves_of(parameters: Parameters) -> SmoothMoves:
     """Return the moves that a reference consists of, without its sine."""
     p = parameters
     if p.reference == "moves":
-        return SmoothMoves([0.0, *parse_numbers("positions", p.positions)], p.speed, hold=p.hold)
+        positions = parse_numbers("positions", p.positions)
+        if max(map(abs, positions)) > REACH:
+            raise ValueError(f"positions = {p.positions!r}: expected numbers from {-REACH:g} to {REACH:g} m")
+        return SmoothMoves([0.0, *positions], p.speed, hold=p.hold)
     if p.reference == "staircase":
         return staircase(p.low, p.high, p.steps, p.speed, hold=p.hold)
     if p.reference == "hold":

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -43,7 +44,7 @@ BASE_INPUTS, TIP_INPUTS = (1, 2), (3, 4)
 AMPLIFIER_INPUTS = (5, 6, 7)
 """Voltage monitor, current monitor and status of the amplifier."""
 ENABLE_LINE = 4
-"""Digital line of the amplifier's enable input: EIO-side of the T7, free of the LJTick-DAC on FIO0 and FIO1."""
+"""Digital line of the amplifier's enable input, FIO4 of the T7; the LJTick-DAC is on FIO0 and FIO1."""
 GAIN = 4.0
 """Of the amplifier, V/V: the LJTick-DAC's 14 bits over ±10 V then make steps of 4.9 mV, 1.4 nm of deflection."""
 SETTLING_TIME = 20e-6
@@ -83,14 +84,16 @@ class HybridLaboratorySettings(LaboratorySettings):
     resonance_offset: float = Field(
         default=0.0, ge=-0.1, le=0.1, description="how far the resonance is from the paper's, as a share"
     )
-    current_limit: float = Field(default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A")
+    current_limit: float = Field(
+        default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
+    )
     direct: bool = Field(
         default=False, description="whether the instruments are called directly, by the Direct classes of this module"
     )
     fault: FaultName = Field(
         default="none",
         description="what goes wrong at `fault_time`: open-thermistor, shorted-thermistor, out-of-range (of the "
-        "displacement sensor), tec-over-current, tec-over-temperature, amplifier-trips",
+        "displacement sensor), tec-over-current, tec-over-temperature, amplifier-trips (if it is on then)",
     )
     fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
 
@@ -144,22 +147,34 @@ class HybridLaboratory:
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )
         self._t7_server = ModbusTcpServer(self.t7)
+        self._opened = ExitStack()
         if settings.ambient_step:
             self.world.add(_Event(settings.ambient_step_time, self._step_room))
         if settings.fault != "none":
             self.world.add(_Event(settings.fault_time, self._go_wrong))
 
     def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name."""
-        if self._settings.direct:
-            return self._open_directly()
-        self._t7_server.start()
-        try:
-            port = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
-        except ValueError:
-            self._t7_server.close()
-            raise
-        return {"tec": port, "t7": self._t7_server.address}
+        """Switch the instruments on; return the port of each by name.
+
+        Raises
+        ------
+        ValueError
+            If another laboratory of this process has the port of the TEC controller; it keeps it.
+        ConfigurationError
+            If another one with `direct` is open in this process.
+        """
+        with ExitStack() as opened:
+            if self._settings.direct:
+                ports = self._open_directly()
+                opened.callback(_direct.clear)
+            else:
+                self._t7_server.start()
+                opened.callback(self._t7_server.close)
+                ports = {"t7": self._t7_server.address}
+                ports["tec"] = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
+                opened.callback(protocol_emulated.unregister, "tec")
+            self._opened = opened.pop_all()
+        return ports
 
     def operate(self, task: str, value: float) -> None:  # noqa: ARG002 - nothing is done by hand here
         """Refuse: nothing is to be done by hand.
@@ -172,12 +187,8 @@ class HybridLaboratory:
         raise ConfigurationError(f"the hybrid laboratory cannot carry out {task!r}; nothing is done by hand there")
 
     def close(self) -> None:
-        """Switch the instruments off."""
-        if self._settings.direct:
-            _direct.clear()
-            return
-        protocol_emulated.unregister("tec")
-        self._t7_server.close()
+        """Switch the instruments off; those of another laboratory stay as they are."""
+        self._opened.close()
 
     def _open_directly(self) -> dict[str, str]:
         # A rig has its own laboratory, and a process one rig at a time.
@@ -249,8 +260,15 @@ class DirectSettings(DriverSettings):
 def _connected(name: str, settings: DirectSettings, kind: type[D]) -> D:
     device = _direct.get(settings.port)
     if not isinstance(device, kind):
-        known = ", ".join(_direct) or "none: the laboratory has not `direct`"
-        raise DeviceConnectionError(name, f"no such instrument at {settings.port}; there are: {known}")
+        known = ", ".join(port for port, each in _direct.items() if isinstance(each, kind))
+        raise DeviceConnectionError(
+            name,
+            f"no such instrument at {settings.port}; "
+            f"there are: {known or 'none: the table [emulation] needs direct = true'}",
+        )
+    # Its signals are named after it, and the rig would look for them under its own name.
+    if name != device.name:
+        raise DeviceConnectionError(name, f"is called directly and has to be named {device.name}, as it is there")
     return device
 
 

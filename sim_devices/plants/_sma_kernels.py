@@ -13,14 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
+
 # Continuous state: wire temperature, ambient deviation (K), stress, position of the moving end (mm),
 # number of martensite grains and of oriented martensite grains.
 TEMPERATURE, AMBIENT_OFFSET, STRESS, POSITION, MARTENSITE, ORIENTED = range(6)
 STATE_SIZE = 6
-
-# Command: heating voltage (V), fan (1 on), length imposed (1) or force imposed (0), load (N), position (mm).
-VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
-COMMAND_SIZE = 5
 
 # Rows of the grain table: austenite finish (°C) and width (K) of the transformation, Clausius-Clapeyron
 # slope (MPa/K), detwinning stress, orientation stress on cooling, re-twinning stress (MPa).

@@ -22,7 +22,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import MILLIMETRE, FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.muscle import MILLIMETRE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,16 +167,6 @@ class CoiledPolymerMuscle(FrictionMuscle):
     A contact moves with x and, by a share of its own, against a(T): the thread untwists even where the length is
     held. The contacts do not depend on the rate; temperature and Maxwell arm need some 60 s to settle.
 
-    The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
-    servo (`clamp`: the length is imposed, the force follows). Changing between them keeps contacts, force and
-    position. Frame and load cell are in series with the muscle, so `position`, which is what `clamp` imposes,
-    exceeds `length` by the force over their stiffness.
-
-    Time runs on a fixed grid of ``parameters.step`` seconds from construction. A command acts from the next grid
-    step on, at once for load and position, before the muscle is heated; outputs stay constant between grid points.
-    So neither the number nor the size of the calls of `advance` changes the trajectory, the noise included.
-    There is no sensor noise here and no protection either.
-
     At the start the muscle is cold and hangs without load, after it was heated under the pretension and went twice
     through 0 V, rated voltage, 0 V at constant position; `length` counts from there.
 
@@ -200,16 +191,6 @@ class CoiledPolymerMuscle(FrictionMuscle):
         """The numbers of this plant."""
         return self._parameters
 
-    def blow(self, on: bool) -> None:
-        """Switch the fan, which shortens the time constant and lowers the steady rise alike.
-
-        Parameters
-        ----------
-        on : bool
-            Whether the fan runs; it does not at the start.
-        """
-        self._command[kernels.FAN] = float(on)
-
     @property
     def temperature(self) -> float:
         """Temperature of the muscle, °C; 120 °C at 3 V."""
@@ -228,15 +209,7 @@ class CoiledPolymerMuscle(FrictionMuscle):
         CoiledPolymerSnapshot
             The outputs.
         """
-        return CoiledPolymerSnapshot(
-            temperature=self.temperature,
-            ambient_temperature=self.ambient_temperature,
-            voltage=self.voltage,
-            current=self.current,
-            force=self.force,
-            length=self.length,
-            position=self.position,
-        )
+        return CoiledPolymerSnapshot._make(getattr(self, name) for name in CoiledPolymerSnapshot._fields)
 
 
 def _coefficients(parameters: CoiledPolymerParameters) -> dict[int, float]:

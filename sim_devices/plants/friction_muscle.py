@@ -17,9 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim_devices.plants.grid import GridPlant
-
-MILLIMETRE = 1e-3
+from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, MILLIMETRE, PLACE, VOLTAGE, Muscle
 
 # What drives the muscle.
 PNEUMATIC, THERMAL = range(2)
@@ -29,10 +27,6 @@ PNEUMATIC, THERMAL = range(2)
 # the Maxwell arm.
 DRIVE, FREED, SETTING, OFFSET, FORCE, LENGTH, POSITION, RELAXING = range(8)
 STATE_SIZE = 8
-
-# Command: voltage (V), fan or exhaust (1 on), length imposed (1) or force imposed (0), load (N), position (mm).
-VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
-COMMAND_SIZE = 5
 
 # Rows of the contact table: stiffness (N/mm), share of the yield force, share of the free displacement.
 STIFFNESS, WEIGHT, SHARE = range(3)
@@ -605,7 +599,7 @@ def shared_coefficients(parameters: MuscleParameters) -> dict[int, float]:
     return values
 
 
-class FrictionMuscle(GridPlant):
+class FrictionMuscle(Muscle):
     """A muscle with dry contacts, driven by pressure or temperature, that carries a load or is held.
 
     Each contact is a spring behind a slider (Iwan, Journal of Applied Mechanics 33, 1966): its force follows the
@@ -633,83 +627,20 @@ class FrictionMuscle(GridPlant):
         rated: float,
         rng: np.random.Generator,
     ) -> None:
-        super().__init__(parameters.step, rng)
-        self._common = parameters
+        super().__init__(
+            parameters.step,
+            rng,
+            maximum_voltage=parameters.maximum_voltage,
+            resistance=parameters.resistance,
+            largest_load=parameters.force_limit,
+            reach=0.5 * parameters.rest_length,
+        )
         self._coefficients = np.array([coefficients[place] for place in range(COEFFICIENT_SIZE)])
         self._contacts = contact_table(parameters)
         self._forces = np.zeros(parameters.contact_count)
         self._law = np.zeros(LAW_SIZE)
         self._state = np.zeros(STATE_SIZE)
-        self._command = np.zeros(COMMAND_SIZE)
-        self._condition(cold, rated)
-
-    def apply(self, voltage: float) -> None:
-        """Apply a voltage.
-
-        Parameters
-        ----------
-        voltage : float
-            Effective (root mean square) voltage, V, from 0 to ``parameters.maximum_voltage``.
-
-        Raises
-        ------
-        ValueError
-            If the voltage is out of range.
-        """
-        highest = self._common.maximum_voltage
-        if not 0.0 <= voltage <= highest:
-            raise ValueError(f"voltage must lie within 0 and {highest} V, not {voltage} V")
-        self._command[VOLTAGE] = voltage
-
-    def hang(self, load_newton: float) -> None:
-        """Hang a dead load on the muscle: force imposed, length follows.
-
-        Parameters
-        ----------
-        load_newton : float
-            Load, N, from 0 to ``parameters.force_limit``.
-
-        Raises
-        ------
-        ValueError
-            If the load is out of range.
-        """
-        largest = self._common.force_limit
-        if not 0.0 <= load_newton <= largest:
-            raise ValueError(f"load_newton must lie within 0 and {largest:.4g} N, not {load_newton} N")
-        self._command[CLAMPED] = 0.0
-        self._command[LOAD] = load_newton
-
-    def clamp(self, length_metre: float) -> None:
-        """Hold the muscle's end by the servo: length imposed, force follows.
-
-        Parameters
-        ----------
-        length_metre : float
-            Position of the moving end, m, positive when the muscle is elongated; within half of `rest_length` to
-            either side. It is the elongation of the muscle with frame and load cell. A muscle that is longer is
-            slack, at 0 N.
-
-        Raises
-        ------
-        ValueError
-            If the position is out of range.
-        """
-        longest = 0.5 * self._common.rest_length
-        if not abs(length_metre) <= longest:
-            raise ValueError(f"length_metre must lie within ±{longest} m, not {length_metre} m")
-        self._command[CLAMPED] = 1.0
-        self._command[PLACE] = length_metre / MILLIMETRE
-
-    @property
-    def voltage(self) -> float:
-        """Effective voltage, V."""
-        return float(self._command[VOLTAGE])
-
-    @property
-    def current(self) -> float:
-        """Current from the supply, A: the voltage over the (constant) resistance, without delay."""
-        return self.voltage / self._common.resistance
+        self._condition(parameters.pretension, cold, rated)
 
     @property
     def force(self) -> float:
@@ -742,12 +673,12 @@ class FrictionMuscle(GridPlant):
     def _load(self, newton: float) -> None:
         load_to(newton, self._state, self._coefficients, self._law, self._contacts, self._forces)
 
-    def _condition(self, cold: float, rated: float) -> None:
+    def _condition(self, pretension: float, cold: float, rated: float) -> None:
         """Train the muscle and find its resting length, outside time."""
         self._state[DRIVE] = cold
         law_at(cold, self._coefficients, self._law)
         self._state[FREED] = self._law[FREE]
-        self._load(self._common.pretension)
+        self._load(pretension)
         self._drive(rated, clamped=False)
         self._drive(cold, clamped=False)
         for _ in range(2):

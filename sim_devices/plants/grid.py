@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,3 +70,29 @@ class GridPlant(ABC):
     @abstractmethod
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
         """Take as many grid steps as there are rows of noise."""
+
+
+def check_numbers(parameters: object, positive: Iterable[str], not_negative: Iterable[str]) -> None:
+    """Check that a plant's parameters are finite and of the sign that they must have.
+
+    Parameters
+    ----------
+    parameters : object
+        A dataclass of numbers.
+    positive, not_negative : iterable of str
+        Names of those that must be above zero, and of those that may be zero.
+
+    Raises
+    ------
+    ValueError
+        If one is not.
+    """
+    for name, value in vars(parameters).items():
+        if not math.isfinite(value):
+            raise ValueError(f"{name} must be finite, not {value}")
+    for name in positive:
+        if not getattr(parameters, name) > 0:
+            raise ValueError(f"{name} must be positive, not {getattr(parameters, name)}")
+    for name in not_negative:
+        if not getattr(parameters, name) >= 0:
+            raise ValueError(f"{name} must not be negative, not {getattr(parameters, name)}")

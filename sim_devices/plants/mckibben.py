@@ -23,7 +23,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import MILLIMETRE, FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.muscle import MILLIMETRE
 
 _BAR = 1e5
 # One bar, N/mm².
@@ -170,16 +171,6 @@ class McKibbenMuscle(FrictionMuscle):
     L and, by a share of its own, with the pressure at constant length. The bladder does not creep, so the loops
     do not depend on the rate once the pressure has settled, which takes some 3 s.
 
-    The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
-    servo (`clamp`: the length is imposed, the force follows). Changing between them keeps contacts, force and
-    position. Frame and load cell are in series with the muscle, so `position`, which is what `clamp` imposes,
-    exceeds `length` by the force over their stiffness.
-
-    Time runs on a fixed grid of ``parameters.step`` seconds from construction. A command acts from the next grid
-    step on, at once for load and position, before the pressure moves; outputs stay constant between grid points.
-    So neither the number nor the size of the calls of `advance` changes the trajectory, the noise included.
-    There is no sensor noise here and no protection either.
-
     At the start the muscle is empty and hangs without load, after it was inflated under the pretension and went
     twice through 0 V, rated voltage, 0 V at constant position; `length` counts from there.
 
@@ -202,16 +193,6 @@ class McKibbenMuscle(FrictionMuscle):
         """The numbers of this plant."""
         return self._parameters
 
-    def blow(self, on: bool) -> None:
-        """Open the quick exhaust, which shortens the time constant of a falling pressure.
-
-        Parameters
-        ----------
-        on : bool
-            Whether it is open; it is not at the start. The steady pressure is the same.
-        """
-        self._command[kernels.FAN] = float(on)
-
     @property
     def pressure(self) -> float:
         """Gauge pressure in the muscle, Pa; 1.5 bar at 3 V."""
@@ -225,14 +206,7 @@ class McKibbenMuscle(FrictionMuscle):
         McKibbenSnapshot
             The outputs.
         """
-        return McKibbenSnapshot(
-            pressure=self.pressure,
-            voltage=self.voltage,
-            current=self.current,
-            force=self.force,
-            length=self.length,
-            position=self.position,
-        )
+        return McKibbenSnapshot._make(getattr(self, name) for name in McKibbenSnapshot._fields)
 
 
 def _coefficients(parameters: McKibbenParameters) -> dict[int, float]:

@@ -15,16 +15,16 @@ Numbers marked *assumed* are ours, chosen so that the plant behaves as the paper
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.plants import _sma_kernels as kernels
-from sim_devices.plants.grid import GridPlant
+from sim_devices.plants.grid import check_numbers
+from sim_devices.plants.muscle import MILLIMETRE, Muscle
 
-_MILLIMETRE = 1e-3
 _MEGAPASCAL = 1e6
 
 # The smallest transformation width (K), Clausius-Clapeyron slope (MPa/K) and detwinning stress (MPa) of a
@@ -187,15 +187,7 @@ class SMAParameters:
     ambient_gain: float = 0.004
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not math.isfinite(getattr(self, field.name)):
-                raise ValueError(f"{field.name} must be finite, not {getattr(self, field.name)}")
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        for name in _NOT_NEGATIVE:
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+        check_numbers(self, _POSITIVE, _NOT_NEGATIVE)
         if not self.unoriented_share <= 1.0:
             raise ValueError(f"unoriented_share must lie in (0, 1], not {self.unoriented_share}")
         if not -1.0 <= self.orient_correlation <= 1.0:
@@ -284,7 +276,7 @@ def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
     )
 
 
-class SMAWire(GridPlant):
+class SMAWire(Muscle):
     """Length and force of a shape-memory-alloy wire, advanced in time.
 
     Each grain follows, at temperature T and tensile stress s::
@@ -297,20 +289,6 @@ class SMAWire(GridPlant):
     An unoriented martensite grain that would have to turn to austenite and at once back stays as it
     is: so a constant temperature and stress hold every grain, and a trial's strain never falls with
     stress.
-
-    The wire's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is
-    held by a servo (`clamp`: the length is imposed, the force follows). Changing between them keeps
-    grains, force and position: clamping starts from where the end hangs, hanging from the force it has.
-    Only a slack wire's end has a position of the servo's alone; it comes back to the wire when a load
-    is hung on. Frame and load cell are in series with the wire, so `position`, which is what `clamp`
-    imposes, exceeds `length` by the force over their stiffness.
-
-    Time runs on a fixed grid of ``parameters.step`` seconds from construction. `advance` carries out
-    the grid steps that have become due and holds the remainder, and outputs stay constant between
-    grid points. A command acts from the next grid step on, at once: first the load or the position is
-    moved there, at the temperature of the step before, then the wire is heated. So neither the number
-    nor the size of the calls of `advance` changes the trajectory, the noise included. There is no
-    sensor noise here and no protection either.
 
     At the start the wire is cold and hangs without load, after it was cooled from austenite under the
     pretension and went twice through 0 V, rated voltage, 0 V at constant position; `length` counts from
@@ -326,7 +304,14 @@ class SMAWire(GridPlant):
     """
 
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
-        super().__init__(parameters.step, rng)
+        super().__init__(
+            parameters.step,
+            rng,
+            maximum_voltage=parameters.maximum_voltage,
+            resistance=parameters.resistance,
+            largest_load=parameters.largest_load,
+            reach=parameters.rest_length,
+        )
         self._parameters = parameters
         self._coefficients = _coefficients(parameters)
         self._grains = grain_table(parameters)
@@ -334,7 +319,6 @@ class SMAWire(GridPlant):
         self._oriented = np.zeros(parameters.grain_count, dtype=np.bool_)
         self._scratch = np.empty((2, parameters.grain_count))
         self._state = np.zeros(kernels.STATE_SIZE)
-        self._command = np.zeros(kernels.COMMAND_SIZE)
         self._condition()
 
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
@@ -345,75 +329,6 @@ class SMAWire(GridPlant):
     def parameters(self) -> SMAParameters:
         """The numbers of this plant."""
         return self._parameters
-
-    def apply(self, voltage: float) -> None:
-        """Apply a heating voltage.
-
-        Parameters
-        ----------
-        voltage : float
-            Effective (root mean square) voltage, V, from 0 to ``parameters.maximum_voltage``. The wire
-            settles at 25 + 85 (voltage / 3 V)² °C.
-
-        Raises
-        ------
-        ValueError
-            If the voltage is out of range.
-        """
-        highest = self._parameters.maximum_voltage
-        if not 0.0 <= voltage <= highest:
-            raise ValueError(f"voltage must lie within 0 and {highest} V, not {voltage} V")
-        self._command[kernels.VOLTAGE] = voltage
-
-    def blow(self, on: bool) -> None:
-        """Switch the fan, which shortens the time constant and lowers the steady rise alike.
-
-        Parameters
-        ----------
-        on : bool
-            Whether the fan runs; it does not at the start.
-        """
-        self._command[kernels.FAN] = float(on)
-
-    def hang(self, load_newton: float) -> None:
-        """Hang a dead load on the wire: force imposed, length follows.
-
-        Parameters
-        ----------
-        load_newton : float
-            Load, N, from 0 to ``parameters.largest_load`` (18.85 N).
-
-        Raises
-        ------
-        ValueError
-            If the load is out of range.
-        """
-        largest = self._parameters.largest_load
-        if not 0.0 <= load_newton <= largest:
-            raise ValueError(f"load_newton must lie within 0 and {largest:.4g} N, not {load_newton} N")
-        self._command[kernels.CLAMPED] = 0.0
-        self._command[kernels.LOAD] = load_newton
-
-    def clamp(self, length_metre: float) -> None:
-        """Hold the wire's end by the servo: length imposed, force follows.
-
-        Parameters
-        ----------
-        length_metre : float
-            Position of the moving end, m, positive when the wire is elongated; within ±`rest_length`.
-            It is the elongation of the wire with frame and load cell. A wire that is longer is slack,
-            at 0 N.
-
-        Raises
-        ------
-        ValueError
-            If the position is out of range.
-        """
-        longest = self._parameters.rest_length
-        if not abs(length_metre) <= longest:
-            raise ValueError(f"length_metre must lie within ±{longest} m, not {length_metre} m")
-        self._command[kernels.CLAMPED] = 1.0
-        self._command[kernels.PLACE] = length_metre / _MILLIMETRE
 
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
         kernels.advance_steps(
@@ -438,16 +353,6 @@ class SMAWire(GridPlant):
         return float(self._parameters.ambient_temperature + self._state[kernels.AMBIENT_OFFSET])
 
     @property
-    def voltage(self) -> float:
-        """Effective heating voltage, V."""
-        return float(self._command[kernels.VOLTAGE])
-
-    @property
-    def current(self) -> float:
-        """Current through the wire, A: the voltage over the (constant) resistance, without delay."""
-        return self.voltage / self._parameters.resistance
-
-    @property
     def force(self) -> float:
         """Tension of the wire, N; 0 to about 11.3 N at constant length between 0 and 3 V."""
         return float(self._state[kernels.STRESS] * self._coefficients[kernels.AREA])
@@ -468,12 +373,12 @@ class SMAWire(GridPlant):
             self._parameters.grain_count,
             self._coefficients,
         )
-        return float(length * _MILLIMETRE)
+        return float(length * MILLIMETRE)
 
     @property
     def position(self) -> float:
         """Position of the moving end, m: the elongation of wire, frame and load cell; a servo imposes it."""
-        return float(self._state[kernels.POSITION] * _MILLIMETRE)
+        return float(self._state[kernels.POSITION] * MILLIMETRE)
 
     @property
     def martensite_fraction(self) -> float:
@@ -493,17 +398,7 @@ class SMAWire(GridPlant):
         SMASnapshot
             The outputs.
         """
-        return SMASnapshot(
-            temperature=self.temperature,
-            ambient_temperature=self.ambient_temperature,
-            voltage=self.voltage,
-            current=self.current,
-            force=self.force,
-            length=self.length,
-            position=self.position,
-            martensite_fraction=self.martensite_fraction,
-            oriented_fraction=self.oriented_fraction,
-        )
+        return SMASnapshot._make(getattr(self, name) for name in SMASnapshot._fields)
 
     def _condition(self) -> None:
         """Erase the memory, train the wire and find its resting length, outside time."""
@@ -556,9 +451,9 @@ def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
         kernels.AMBIENT_DECAY: ambient_decay,
         kernels.AMBIENT_KICK: p.ambient_sd * math.sqrt(1.0 - ambient_decay**2),
         kernels.AMBIENT_GAIN: p.ambient_gain,
-        kernels.AREA: p.area / _MILLIMETRE**2,
-        kernels.REST_LENGTH: p.rest_length / _MILLIMETRE,
-        kernels.SERIES_COMPLIANCE: 1.0 / (p.series_stiffness * _MILLIMETRE),
+        kernels.AREA: p.area / MILLIMETRE**2,
+        kernels.REST_LENGTH: p.rest_length / MILLIMETRE,
+        kernels.SERIES_COMPLIANCE: 1.0 / (p.series_stiffness * MILLIMETRE),
         kernels.MARTENSITE_MODULUS: p.martensite_modulus / _MEGAPASCAL,
         kernels.AUSTENITE_MODULUS: p.austenite_modulus / _MEGAPASCAL,
         kernels.EXPANSION: p.expansion,
@@ -569,6 +464,6 @@ def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
         kernels.STRESS_LIMIT: p.stress_limit / _MEGAPASCAL,
         kernels.TEMPERATURE_STEP: p.temperature_step,
         kernels.STRESS_STEP: p.stress_step / _MEGAPASCAL,
-        kernels.LENGTH_STEP: p.length_step / _MILLIMETRE,
+        kernels.LENGTH_STEP: p.length_step / MILLIMETRE,
     }
     return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])

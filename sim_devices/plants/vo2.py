@@ -15,7 +15,7 @@ specimen does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
-from sim_devices.plants.grid import GridPlant
+from sim_devices.plants.grid import GridPlant, check_numbers
 
 _POSITIVE = (
     "relay_count",
@@ -185,15 +185,7 @@ class VO2Parameters:
     session_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not math.isfinite(getattr(self, field.name)):
-                raise ValueError(f"{field.name} must be finite, not {getattr(self, field.name)}")
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        for name in _NOT_NEGATIVE:
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+        check_numbers(self, _POSITIVE, _NOT_NEGATIVE)
         if not 0.0 < self.loop_damping < 1.0:
             raise ValueError(f"loop_damping must lie in (0, 1), not {self.loop_damping}")
         if not -1.0 < self.correlation < 1.0:
@@ -487,17 +479,7 @@ class VO2Cantilever(GridPlant):
         VO2Snapshot
             The outputs.
         """
-        return VO2Snapshot(
-            plate_temperature=self.plate_temperature,
-            film_temperature=self.film_temperature,
-            sink_temperature=self.sink_temperature,
-            plate_rate=self.plate_rate,
-            current=self.current,
-            voltage=self.voltage,
-            r_fraction=self.r_fraction,
-            curvature=self.curvature,
-            tip_deflection=self.tip_deflection,
-        )
+        return VO2Snapshot._make(getattr(self, name) for name in VO2Snapshot._fields)
 
 
 def arc_deflection(curvature: float, length: float) -> float:

@@ -697,3 +697,157 @@ def test_the_environment_has_no_say_in_the_exit_code():
         [sys.executable, "-m", "bench", "--help"], env=environment, capture_output=True, check=False
     )
     assert done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def hybrid_runs(tmp_path_factory):
+    """Folders of short runs of the hybrid by protocol, and `failed` for one that was not completed."""
+    folder = tmp_path_factory.mktemp("hybrid")
+    runs = {}
+    for name, protocol, *options in (
+        ("current-steps", "current-steps", "levels=-0.1, 0.1", "on=300", "off=300"),
+        ("thermomechanical", "thermomechanical", "levels=4", "dwell=150"),
+        ("piezo-loops", "piezo-loops", "amplitudes=40, 20"),
+        ("piezo-step", "piezo-step", "duration=0.15"),
+        ("flat", "piezo-loops", "amplitudes=0"),
+        ("failed", "piezo-loops", "amplitudes=60"),
+    ):
+        result = folder / "run.json"
+        settings = [part for option in options for part in ("--set", option)]
+        with pytest.raises(SystemExit) as stopped:
+            main(
+                ["run", protocol, "--rig", "hybrid", "--clock", "virtual", *settings, "--out", str(folder),
+                 "--json", str(result)]
+            )  # fmt: skip
+        assert bool(stopped.value.code) == (name == "failed")
+        runs[name] = json.loads(result.read_text())["folder"]
+    return runs
+
+
+class TestIdentifyHybrid:
+    PARTS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
+
+    def identify(self, bench, runs, *options, **others):
+        return bench(
+            "identify-hybrid", *(runs[others.get(part.replace("-", "_"), part)] for part in self.PARTS), *options
+        )
+
+    def test_a_model_part_by_part(self, bench, hybrid_runs, tmp_path):
+        code, out, err = self.identify(
+            bench, hybrid_runs, "--out", tmp_path / "model.json", "--json", tmp_path / "result.json"
+        )
+        assert (code, err) == (0, "")
+        text = re.sub(r"\s+", " ", out)
+        result = json.loads((tmp_path / "result.json").read_text())
+        assert set(result) == {
+            "network_rms_K", "polynomial_order", "polynomial_rms_um", "prandtl_ishlinskii_rms_percent", "poles_rad_s",
+            "damping",
+        }  # fmt: skip
+        assert 0 < result["network_rms_K"]["base"] < 0.15
+        assert 0 < result["network_rms_K"]["tip"] < 0.15
+        assert 0 < result["prandtl_ishlinskii_rms_percent"] <= 1
+        assert result["poles_rad_s"]["resonance"] == pytest.approx(2 * np.pi * 693.7, rel=2e-3)
+        assert f"polynomial of order {result['polynomial_order']}, RMS {result['polynomial_rms_um']:.3f} µm" in text
+        assert f"15 plays, RMS {result['prandtl_ishlinskii_rms_percent']:.2f} % of" in text
+        for name in ("seebeck", "electrical_resistance", "real pole", "frequency", "damping"):
+            assert name in text
+        model = json.loads((tmp_path / "model.json").read_text())
+        assert model["format"] == "bench-hybrid-model"
+        assert model["provenance"]["sources"] == [Path(hybrid_runs[part]).name for part in self.PARTS]
+        assert model["model"]["dynamics"]["frequency"] == result["poles_rad_s"]["resonance"]
+
+    def test_a_protocol_can_use_what_it_writes(self, bench, hybrid_runs, tmp_path):
+        model = tmp_path / "model.json"
+        self.identify(bench, hybrid_runs, "--plays", "6", "--out", model)
+        assert len(json.loads(model.read_text())["model"]["hysteresis"]["weights"]) == 6
+        code, _, err = bench(
+            "run", "fine-step", "--rig", "hybrid-direct", "--clock", "virtual", "--set", f"model={model}",
+            "--out", tmp_path, "--json", tmp_path / "run.json",
+        )  # fmt: skip
+        assert (code, err) == (0, "")
+        assert json.loads((tmp_path / "run.json").read_text())["is_safe"]
+
+    @pytest.mark.parametrize(
+        ("others", "words"),
+        [
+            ({"current_steps": "piezo-loops"}, ["is a run of piezo-loops; expected one of current-steps"]),
+            ({"thermomechanical": "current-steps"}, ["is a run of current-steps; expected one of thermomechanical"]),
+            ({"piezo_loops": "failed"}, ["the run is failed; a model needs a completed one"]),
+            ({"piezo_loops": "flat"}, ["the hybrid cannot be identified: voltages: expected values that vary"]),
+            ({"piezo_step": "none"}, ["is not a run"]),
+        ],
+    )
+    def test_runs_that_do_not_fit_are_one_message(self, bench, hybrid_runs, tmp_path, others, words):
+        places = {**hybrid_runs, "none": tmp_path / "none"}
+        code, _, err = self.identify(bench, places, "--out", tmp_path / "model.json", **others)
+        assert code == 3
+        assert err.count("error:") == 1
+        for word in words:
+            assert word in re.sub(r"\s+", " ", err)
+        assert not list(tmp_path.iterdir())
+
+    def test_wrong_commands_are_refused(self, bench, hybrid_runs, tmp_path):
+        assert bench("identify-hybrid", hybrid_runs["current-steps"])[0] == 2
+        for plays in ("0", "201", "some"):
+            code, _, err = self.identify(bench, hybrid_runs, "--plays", plays)
+            assert code == 2
+            assert "--plays" in err
+        code, _, err = self.identify(bench, hybrid_runs, "--out", tmp_path / "none" / "model.json")
+        assert code == 3
+        assert "cannot be written" in err
+
+    def test_what_it_writes_is_no_model_of_one_input(self, bench, hybrid_runs, tmp_path):
+        self.identify(bench, hybrid_runs, "--out", tmp_path / "model.json")
+        code, _, err = bench(
+            "predict", tmp_path / "model.json", hybrid_runs["piezo-loops"], "--input", "piezo_voltage",
+            "--out", tmp_path / "out.csv",
+        )  # fmt: skip
+        assert code == 3
+        assert err.count("error:") == 1
+        assert "is not a model file" in re.sub(r"\s+", " ", err)
+
+
+class TestHelpOfTheHybrid:
+    @pytest.mark.parametrize(
+        ("command", "words"),
+        [
+            ("identify-hybrid", ["STEPS_RUN", "STATIC_RUN", "LOOPS_RUN", "STEP_RUN", "--plays", "--out", "--json"]),
+            ("reproduce", ["hybrid"]),
+            ("reproduce hybrid", ["Rakotondrabe and Ivan", "2010", "--seed", "--out", "--live", "--json"]),
+        ],
+    )
+    def test_of_the_commands(self, bench, command, words):
+        code, out, _ = bench(*command.split(), "--help")
+        assert code == 0
+        assert "Usage" in out
+        for word in words:
+            assert word in out
+
+    @pytest.mark.parametrize(
+        ("protocol", "parameters"),
+        [
+            ("current-sine", {"amplitude": ("0.1", "A"), "frequencies": ("0.001", "Hz"), "periods": ("2", "1")}),
+            ("current-steps", {"levels": ("-0.1, -0.05, -0.025, 0.1", "A"), "on": ("600.0", "s")}),
+            ("thermomechanical", {"coldest": ("-0.15", "A"), "levels": ("9", "1"), "dwell": ("240.0", "s")}),
+            ("piezo-loops", {"amplitudes": ("40, 40, 30, 20, 10", "V"), "frequency": ("0.1", "Hz")}),
+            ("piezo-step", {"voltage": ("40.0", "V"), "rate": ("20000.0", "Hz")}),
+            ("hybrid-excitation", {"current": ("0.08", "A"), "voltage": ("30.0", "V")}),
+            ("hybrid-control", {"model": ("must be given", ""), "speed": ("3e-06", "m/s"), "witness": ("False", "")}),
+            ("fine-step", {"model": ("must be given", ""), "step": ("5e-06", "m")}),
+        ],
+    )
+    def test_of_the_protocols(self, bench, tmp_path, protocol, parameters):
+        code, out, _ = bench("run", protocol, "--help")
+        assert code == 0
+        bench("list", protocol, "--json", tmp_path / "list.json")
+        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
+        for name, (default, unit) in parameters.items():
+            assert name in out
+            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
+            assert shown[name]["text"]
+
+    def test_rigs_and_protocols_are_listed(self, bench):
+        code, out, _ = bench("list")
+        assert code == 0
+        for name in ("hybrid", "hybrid-direct", "hybrid-hardware", "hybrid-control", "thermomechanical"):
+            assert name in out

@@ -12,6 +12,7 @@ from bench.hysteresis import (
     Linear,
     MemoryCurve,
     Polynomial,
+    PrandtlIshlinskii,
     Preisach,
     QuadraticTerm,
     Summed,
@@ -19,14 +20,20 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
+from bench.identification.dynamics import PUBLISHED_DYNAMICS
+from bench.identification.hybrid_model import HybridModel
+from bench.identification.thermal_network import Design
 from bench.model_file import (
     COUPLED_FORMAT,
     FORMAT,
+    HYBRID_FORMAT,
     VERSION,
     CoupledFile,
+    HybridFile,
     ModelFile,
     is_coupled_model,
     load_coupled_model,
+    load_hybrid_model,
     load_model,
     parse_coupled_model,
     parse_model,
@@ -292,3 +299,170 @@ class TestCoupled:
         del document[key]
         with pytest.raises(DataError, match=f"key '{key}' is missing"):
             parse_coupled_model(document, "m.json")
+
+
+HYBRID = HybridModel(
+    Design().network(),
+    Polynomial([-150e-6, -10e-6, 1.6e-6], (-19.2, 19.7), -12e-6, "K", "m"),
+    PrandtlIshlinskii(
+        np.arange(4) * 10.0, np.array([0.15, 0.03, 0.02, 0.01]) * 1e-6, 2e-7, input_range=(-40.0, 40.0)
+    ),
+    PUBLISHED_DYNAMICS,
+    21.5,
+)
+
+
+@pytest.fixture
+def hybrid_file(tmp_path):
+    """Write the content of the file of a hybrid model, with values at some paths replaced or taken away."""
+
+    def write(changes=(), missing=()):
+        document = json.loads(json.dumps(HybridFile(HYBRID, {"sources": ["a", "b"]}).to_json()))
+        for path, value in changes:
+            *parents, key = path
+            node = document
+            for part in parents:
+                node = node[part]
+            node[key] = value
+        for *parents, key in missing:
+            node = document
+            for part in parents:
+                node = node[part]
+            del node[key]
+        path = tmp_path / "m.json"
+        path.write_text(json.dumps(document), encoding="utf-8")
+        return path
+
+    return write
+
+
+class TestHybrid:
+    def test_round_trip(self, tmp_path):
+        path = tmp_path / "model.json"
+        HybridFile(HYBRID, {"sources": ["µ", "b"], "rms": 0.1 + 0.2}).save(path)
+        loaded = load_hybrid_model(path)
+        assert loaded.provenance["sources"] == ["µ", "b"]
+        assert loaded.provenance["rms"] == 0.1 + 0.2
+        assert loaded.provenance["bench"]
+        assert loaded.to_json() == json.loads(path.read_text(encoding="utf-8"))
+        assert loaded.to_json()["format"] == HYBRID_FORMAT
+        assert loaded.to_json()["name"] == "hybrid"
+
+    def test_what_was_loaded_simulates_the_same(self, tmp_path):
+        HybridFile(HYBRID).save(tmp_path / "model.json")
+        model = load_hybrid_model(tmp_path / "model.json").model
+        assert (model.reference, model.network, model.dynamics) == (21.5, HYBRID.network, PUBLISHED_DYNAMICS)
+        assert model.bandwidth() == HYBRID.bandwidth()
+        t = np.arange(200.0)
+        currents, voltages = 0.05 * np.sin(0.03 * t), 30.0 * np.sin(0.4 * t)
+        for name in ("deflections", "thermal", "piezo", "temperatures"):
+            np.testing.assert_array_equal(
+                getattr(model.simulate(currents, voltages, 1.0), name),
+                getattr(HYBRID.simulate(currents, voltages, 1.0), name),
+            )
+
+    def test_saving_what_was_loaded_gives_the_same_file(self, tmp_path):
+        HybridFile(HYBRID).save(tmp_path / "a.json")
+        load_hybrid_model(tmp_path / "a.json").save(tmp_path / "b.json")
+        assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+    def test_saving_where_it_cannot(self, tmp_path):
+        with pytest.raises(DataError, match="cannot be written"):
+            HybridFile(HYBRID).save(tmp_path / "absent" / "m.json")
+
+    def test_no_kind_passes_for_another(self, tmp_path):
+        hybrid, coupled = HybridFile(HYBRID).to_json(), CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
+        assert not is_coupled_model(hybrid)
+        for parse, format_ in ((parse_model, FORMAT), (parse_coupled_model, COUPLED_FORMAT)):
+            with pytest.raises(DataError, match=f"its `format` is not '{format_}'"):
+                parse(hybrid, "m.json")
+        for document in (content(), coupled, [], None, "x"):
+            (tmp_path / "m.json").write_text(json.dumps(document))
+            with pytest.raises(
+                DataError, match=rf"m\.json is not a model file: its `format` is not '{HYBRID_FORMAT}'"
+            ):
+                load_hybrid_model(tmp_path / "m.json")
+
+    def test_no_file_and_no_json(self, tmp_path):
+        with pytest.raises(DataError, match=r"absent\.json cannot be read: No such file"):
+            load_hybrid_model(tmp_path / "absent.json")
+        for text in (b"", b"{", b"\xff\xfe", b"[" * 100_000):
+            (tmp_path / "m.json").write_bytes(text)
+            with pytest.raises(DataError, match=r"m\.json"):
+                load_hybrid_model(tmp_path / "m.json")
+
+    @pytest.mark.parametrize("version", [0, 2, "1", None])
+    def test_another_version(self, hybrid_file, version):
+        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
+            load_hybrid_model(hybrid_file([(("version",), version)]))
+
+    @pytest.mark.parametrize(
+        "path",
+        [
+            ("model",),
+            ("provenance",),
+            *(("model", part) for part in ("network", "polynomial", "hysteresis", "dynamics", "reference")),
+            ("model", "network", "seebeck"),
+            ("model", "polynomial", "series"),
+            ("model", "hysteresis", "weights"),
+            ("model", "dynamics", "damping"),
+        ],
+    )
+    def test_a_missing_key_is_named(self, hybrid_file, path):
+        with pytest.raises(DataError, match=rf"m\.json is damaged: .*{path[-1]}"):
+            load_hybrid_model(hybrid_file(missing=[path]))
+
+    @pytest.mark.parametrize(
+        ("path", "value"),
+        [
+            (("model",), None),
+            (("model",), []),
+            (("provenance",), 5),
+            (("model", "network"), "x"),
+            (("model", "network", "seebeck"), -1.0),
+            (("model", "network", "seebeck"), math.nan),
+            (("model", "network", "tec_capacity"), "much"),
+            (("model", "network", "tec_capacity"), 10**400),
+            (("model", "polynomial", "series"), [math.inf]),
+            (("model", "polynomial", "series"), "abc"),
+            (("model", "polynomial", "input_range"), [5.0, 10.0]),
+            (("model", "polynomial", "input_range"), [1.0]),
+            (("model", "hysteresis", "weights"), [1.0]),
+            (("model", "hysteresis", "weights"), [-1.0] * 4),
+            (("model", "hysteresis", "thresholds"), [3.0, 2.0, 1.0, 0.0]),
+            (("model", "hysteresis", "bias"), None),
+            (("model", "dynamics", "gain"), 0.0),
+            (("model", "dynamics", "damping"), 1.5),
+            (("model", "dynamics", "frequency"), -4e3),
+            (("model", "dynamics", "numerator"), [1.0]),
+            (("model", "reference"), "warm"),
+            (("model", "reference"), math.inf),
+        ],
+    )
+    def test_wrong_values(self, hybrid_file, path, value):
+        with pytest.raises(DataError, match=r"m\.json is damaged: "):
+            load_hybrid_model(hybrid_file([(path, value)]))
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_any_mutation_of_a_hybrid_model_is_usable_or_a_data_error(tmp_path_factory, data):
+    document = json.loads(json.dumps(HybridFile(HYBRID).to_json()))
+    *parents, key = data.draw(st.sampled_from(list(_paths(document))))
+    node = document
+    for part in parents:
+        node = node[part]
+    if data.draw(st.booleans()):
+        node[key] = data.draw(values)
+    else:
+        del node[key]
+    path = tmp_path_factory.getbasetemp() / "mutated-hybrid.json"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    try:
+        file = load_hybrid_model(path)
+    except DataError as error:
+        assert "mutated-hybrid.json" in str(error)  # noqa: PT017 - either way is right
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert file.model.thermal_deflection([0.0]).shape == (1,)
+    json.dumps(file.to_json())

@@ -156,7 +156,7 @@ class TestPlan:
         [
             # Fastening 10, reset 5 + 30 + 0.1, 2 cycles of 2 · 30, 37 samples of 30.
             ("force-voltage", 10 + 35.1 + 120 + 37 * 30, 1),
-            # For each load: two loads of 5, reset 30 + 20 + 30, 37 samples of 30.
+            # For each load: cooling 20.5, two loads of 5, reset 30 + 20 + 30, 37 samples of 30.
             ("length-voltage", 5 * (20.5 + 10 + 80 + 37 * 30), 10),
             # Fastening 10; for each voltage: reset 35.1, slack 5, voltage 30, 23 samples of 30.
             ("length-force", 10 + 6 * (35.1 + 35 + 23 * 30), 1),

@@ -4,9 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.control.loops import Playback
 from bench.errors import ConfigurationError
 from bench.protocol import (
     Dwell,
+    FastLoop,
     Messages,
     Note,
     Phase,
@@ -483,3 +485,98 @@ class TestPackaged:
         else:
             for low, high in expected.extremes.values():
                 assert -20.0 <= low <= high <= 150.0
+
+
+def fast_loop(**keys):
+    return FastLoop(
+        **{
+            "controller": Playback(lambda t: 30.0 + t),
+            "rate": 100.0,
+            "duration": 12.0,
+            "inputs": ("probe_temperature",),
+            "actuators": ("tec",),
+            **keys,
+        }
+    )
+
+
+class TestFastLoop:
+    def test_the_dry_run_counts_its_duration_and_watches_its_signals(self):
+        def go(parameters):
+            yield Step({"tec": 20.0}, Dwell(3.0))
+            yield fast_loop()
+            yield fast_loop(duration=0.5, inputs=("a", "b"), actuators=("tec", "supply"), watched=("c",))
+
+        expected = plan(define(go), Nothing())
+        assert expected.steps == 3
+        assert expected.seconds == expected.at_most == 15.5
+        assert expected.watched == {"probe_temperature", "tec_setpoint", "a", "b", "c", "supply_setpoint"}
+        # What a controller will ask for is not known beforehand.
+        assert expected.extremes == {"tec": (20.0, 20.0)}
+
+    def test_it_is_not_carried_out(self):
+        class Untouched:
+            def update(self, _, __):
+                raise AssertionError("was asked")
+
+        def go(parameters):
+            yield fast_loop(controller=Untouched())
+
+        assert plan(define(go), Nothing()).steps == 1
+
+    def test_its_reading_echoes_the_setpoints_before(self):
+        seen = []
+
+        def go(parameters):
+            yield Step({"tec": 40.0}, Dwell(1.0))
+            reading = yield fast_loop()
+            seen.extend((reading.step, reading.time, reading["tec_setpoint"], reading["probe_temperature"]))
+
+        plan(define(go), Nothing())
+        assert seen == [1, 13.0, 40.0, 0.0]
+
+    @pytest.mark.timeout(60)
+    def test_a_protocol_that_loops_for_ever_is_refused(self):
+        def endless(parameters):
+            message = fast_loop()
+            while True:
+                yield message
+
+        with pytest.raises(ConfigurationError, match="endless does not end within 1000000 steps"):
+            plan(define(endless), Nothing())
+
+    @pytest.mark.parametrize(
+        "keys",
+        [
+            {"rate": 0.0},
+            {"rate": -1.0},
+            {"rate": math.nan},
+            {"rate": math.inf},
+            {"duration": 0.0},
+            {"duration": -1.0},
+            {"duration": math.nan},
+            {"duration": math.inf},
+            {"record_every": 0},
+            {"record_every": -1},
+        ],
+    )
+    def test_nonsense_is_refused(self, keys):
+        with pytest.raises(ValueError, match="FastLoop: expected rate, duration > 0 and record_every ≥ 1, got rate="):
+            fast_loop(**keys)
+
+        def go(parameters):
+            yield fast_loop(**keys)
+
+        with pytest.raises(ConfigurationError, match="protocol go: FastLoop: expected rate, duration > 0"):
+            plan(define(go), Nothing())
+
+
+class TestPlayback:
+    def test_setpoints_are_functions_of_time(self):
+        playback = Playback(lambda t: 2.0 * t, lambda t: -t)
+        assert [playback.update(t, (5.0, 6.0)) for t in (0.0, 1.5)] == [(0.0, 0.0), (3.0, -1.5)]
+
+    def test_it_thinks_nothing(self):
+        playback = Playback()
+        assert playback.update(0.0, ()) == ()
+        assert math.isnan(playback.trace.reference)

