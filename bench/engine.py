@@ -292,6 +292,9 @@ class Engine:
                         f"the controller of {', '.join(message.actuators)} gave {len(commands)} set-points; "
                         f"expected {len(actuators)}"
                     )
+                for name, (low, high), command in zip(message.actuators, message.limits, commands, strict=False):
+                    if not low <= command <= high:
+                        raise LimitError(name, f"the controller asked for {command:g}, beyond {low:g} to {high:g}")
                 changed = [each for each in zip(actuators, commands, strict=True) if each[1] != each[0].setpoint]
                 # None is sent when another is wrong.
                 if len(changed) > 1:

@@ -176,6 +176,8 @@ class FastLoop:
         Signals that the controller sees, in its order.
     actuators : tuple of str
         Devices that take its set-points, in its order.
+    limits : tuple of (float, float)
+        Set-points that the controller may ask for, for each actuator, in its unit; empty for all that they take.
     watched : tuple of str
         Further signals that are read with each sample, for the record alone.
     record_every : int
@@ -189,6 +191,7 @@ class FastLoop:
     duration: float
     inputs: tuple[str, ...]
     actuators: tuple[str, ...]
+    limits: tuple[tuple[float, float], ...] = ()
     watched: tuple[str, ...] = ()
     record_every: int = 1
     label: str = ""
@@ -198,6 +201,10 @@ class FastLoop:
             raise ValueError(
                 "FastLoop: expected rate, duration > 0 and record_every ≥ 1, got "
                 f"rate={self.rate}, duration={self.duration}, record_every={self.record_every}"
+            )
+        if self.limits and len(self.limits) != len(self.actuators):
+            raise ValueError(
+                f"FastLoop: expected limits for each of {len(self.actuators)} actuators, got {len(self.limits)}"
             )
 
 
@@ -529,6 +536,9 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters) -> Plan
                     raise ConfigurationError(f"protocol {definition.name} does not end within {_LONGEST_PLAN} steps")
                 message = messages.send(reading)
             elif isinstance(message, FastLoop):
+                for name, (least, most) in zip(message.actuators, message.limits, strict=False):
+                    low, high = extremes.get(name, (least, most))
+                    extremes[name] = (min(low, least), max(high, most))
                 setpoints = (f"{name}_setpoint" for name in message.actuators)
                 watched |= {*message.inputs, *message.watched, *setpoints}
                 seconds, at_most = seconds + message.duration, at_most + message.duration

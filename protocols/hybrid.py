@@ -47,6 +47,7 @@ def current_sine(parameters: CurrentSineParameters) -> Messages:
             parameters.periods / frequency,
             SENSORS,
             ("tec",),
+            ((-parameters.amplitude, parameters.amplitude),),
             label=f"{frequency:g} Hz",
         )
 
@@ -75,7 +76,15 @@ def current_steps(parameters: CurrentStepsParameters) -> Messages:
         return levels[min(int(number), len(levels) - 1)] if within < parameters.on else 0.0
 
     yield Phase("steps of the current")
-    yield FastLoop(Playback(current), parameters.rate, len(levels) * cycle, SENSORS, ("tec",), label="current steps")
+    yield FastLoop(
+        Playback(current),
+        parameters.rate,
+        len(levels) * cycle,
+        SENSORS,
+        ("tec",),
+        ((min(0.0, *levels), max(0.0, *levels)),),
+        label="current steps",
+    )
 
 
 class ThermomechanicalParameters(ProtocolParameters):
@@ -116,6 +125,7 @@ def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
     Rakotondrabe and Ivan 2010, section V-D, Fig. 15: 40 V, 0.1 Hz.
     """
     amplitudes = parse_numbers("amplitudes", parameters.amplitudes)
+    largest = max(map(abs, amplitudes))
 
     def voltage(t: float) -> float:
         cycle = min(int(t * parameters.frequency), len(amplitudes) - 1)
@@ -128,6 +138,7 @@ def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
         len(amplitudes) / parameters.frequency,
         SENSORS,
         ("piezo",),
+        ((-largest, largest),),
         label="piezo loops",
     )
 
@@ -155,6 +166,7 @@ def piezo_step(parameters: PiezoStepParameters) -> Messages:
         parameters.rest + parameters.duration,
         (DEFLECTION,),
         ("piezo",),
+        ((min(0.0, parameters.voltage), max(0.0, parameters.voltage)),),
         label="piezo step",
     )
 
@@ -186,6 +198,7 @@ def hybrid_excitation(parameters: ExcitationParameters) -> Messages:
         parameters.duration,
         SENSORS,
         ("tec", "piezo"),
+        ((-parameters.current, parameters.current), (-parameters.voltage, parameters.voltage)),
         label="both at once",
     )
 

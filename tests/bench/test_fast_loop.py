@@ -289,6 +289,14 @@ class TestSetpoints:
         assert len(b.samples()["t"]) == 6
         assert [event.kind for event in b.watcher.events].count("error") == 1
 
+    def test_beyond_its_own_limits_too(self, bench):
+        b = bench()
+        outcome = b.run(loop(Playback(lambda t: 30.0 if t < 0.55 else 41.0), limits=((20.0, 40.0),)))
+        assert isinstance(outcome.error, LimitError)
+        assert outcome.reason == "tec: the controller asked for 41, beyond 20 to 40"
+        assert b.sent == [30.0]
+        b.assert_safe()
+
     def test_none_is_sent_when_another_is_wrong(self, bench):
         b = bench(append=SECOND)
         outcome = b.run(loop(Controller(60.0, 60.0), actuators=("tec", "other")))

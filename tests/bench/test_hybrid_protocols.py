@@ -119,6 +119,15 @@ DEFAULTS = (
     ("fine-step", 1, 0.25, {DEFLECTION, "piezo_setpoint"}),
 )
 
+EXTREMES = {
+    "current-sine": {"tec": (-0.1, 0.1)},
+    "current-steps": {"tec": (-0.1, 0.1)},
+    "thermomechanical": {"tec": (-0.15, 0.1)},
+    "piezo-loops": {"piezo": (-40.0, 40.0)},
+    "piezo-step": {"piezo": (0.0, 40.0)},
+    "hybrid-excitation": {"tec": (-0.08, 0.08), "piezo": (-30.0, 30.0)},
+}
+
 
 class TestPlan:
     @pytest.mark.parametrize(("protocol", "steps", "seconds", "watched"), DEFAULTS)
@@ -129,7 +138,7 @@ class TestPlan:
         assert expected.seconds == expected.at_most == pytest.approx(seconds, rel=1e-9)
         assert expected.watched == watched
         assert expected.prompts == 0
-        assert expected.extremes == ({"tec": (-0.15, 0.1)} if protocol == "thermomechanical" else {})
+        assert expected.extremes == EXTREMES.get(protocol, {})
 
     @pytest.mark.parametrize("protocol", [entry[0] for entry in DEFAULTS])
     @pytest.mark.parametrize("rig", [WIRED, DIRECT])
@@ -543,25 +552,24 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("protocol", "settings", "words"),
         [
-            ("piezo-loops", {"amplitudes": "10, 60"}, "error: piezo: set-point 40."),
-            ("current-sine", {"amplitude": "0.3"}, "error: tec: set-point 0.15"),
-            ("piezo-step", {"voltage": "-41"}, "error: piezo: set-point -41 V is outside of -40 to 40 V"),
+            ("piezo-loops", {"amplitudes": "10, 60"}, "would set piezo to between -60 and 60 V"),
+            ("current-sine", {"amplitude": "0.3"}, "would set tec to between -0.3 and 0.3 A"),
+            ("current-steps", {"levels": "0.1, -0.2"}, "would set tec to between -0.2 and 0.1 A"),
+            ("hybrid-excitation", {"voltage": "45"}, "would set piezo to between -45 and 45 V"),
+            ("piezo-step", {"voltage": "-41"}, "would set piezo to between -41 and 0 V"),
         ],
     )
-    def test_a_setpoint_beyond_the_limits_is_not_sent(self, bench, laboratories, tmp_path, protocol, settings, words):
+    def test_a_setpoint_beyond_the_limits_is_found_before_anything_moves(
+        self, bench, tmp_path, protocol, settings, words
+    ):
         code, _, err = bench(
             "run", protocol, "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
-            "--json", tmp_path / "run.json", *assignments("--set", settings),
+            *assignments("--set", settings),
         )  # fmt: skip
-        assert code == 4
+        assert code == 2
         assert err.count("error:") == 1
         assert words in flat(err)
-        assert "outside of -" in flat(err)
-        (laboratory,) = laboratories
-        laboratory.world.clock.sleep(0.02)
-        laboratory.world.advance()
-        assert (laboratory.plant.current, laboratory.plant.piezo_voltage) == (0.0, 0.0)
-        assert json.loads((tmp_path / "run.json").read_text())["is_safe"]
+        assert list(tmp_path.iterdir()) == []
 
     def test_a_room_that_steps_is_no_fault(self, bench, tmp_path):
         code, _, err = bench(

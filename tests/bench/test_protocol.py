@@ -514,6 +514,18 @@ class TestFastLoop:
         # What a controller will ask for is not known beforehand.
         assert expected.extremes == {"tec": (20.0, 20.0)}
 
+    def test_what_it_may_ask_for_is_among_the_extremes(self):
+        def go(parameters):
+            yield Step({"tec": 20.0}, Dwell(3.0))
+            yield fast_loop(limits=((15.0, 18.0),))
+            yield fast_loop(actuators=("tec", "supply"), limits=((16.0, 40.0), (-1.0, 1.0)))
+
+        assert plan(define(go), Nothing()).extremes == {"tec": (15.0, 40.0), "supply": (-1.0, 1.0)}
+
+    def test_limits_are_for_each_actuator(self):
+        with pytest.raises(ValueError, match="limits for each of 1 actuators, got 2"):
+            fast_loop(limits=((0.0, 1.0), (0.0, 1.0)))
+
     def test_it_is_not_carried_out(self):
         class Untouched:
             def update(self, _, __):
