@@ -8,6 +8,7 @@ muscle, a fan blows at it.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Literal, Protocol
@@ -149,7 +150,7 @@ class Frame:
         self.muscle.advance(dt)
 
 
-class MuscleLaboratory:
+class MuscleLaboratory(ABC):
     """A `bench.rig.Laboratory` with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
     Parameters
@@ -199,9 +200,9 @@ class MuscleLaboratory:
         if settings.fault != "none":
             self.world.add(_Fault(self, settings.fault_time))
 
+    @abstractmethod
     def make_muscle(self, settings: MuscleLaboratorySettings, rng: np.random.Generator) -> Muscle:
         """Return the muscle of this laboratory."""
-        raise NotImplementedError
 
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name.

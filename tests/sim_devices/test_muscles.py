@@ -338,7 +338,7 @@ class TestSettings:
             kind(MuscleLaboratorySettings(), VirtualClock(), 1)
 
     def test_which_muscle_it_is_must_be_said(self):
-        with pytest.raises(NotImplementedError):
+        with pytest.raises(TypeError, match="make_muscle"):
             MuscleLaboratory(MuscleLaboratorySettings(), VirtualClock(), 1)
 
     def test_another_specimen_answers_otherwise(self):
