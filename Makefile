@@ -16,7 +16,7 @@ demo-sma demo-muscles demo-hybrid: demo-%: $(SETUP)
 	$(BIN)/bench reproduce $* --out recordings
 
 test: check
-	$(BIN)/python -m pytest --numprocesses auto
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 check: $(SETUP)
 	$(BIN)/ruff check
