@@ -33,7 +33,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -241,8 +241,9 @@ class Journal:
         text = text.encode("utf-8", "backslashreplace").decode("utf-8")
         self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
 
-    def _transaction(self) -> _Transaction:
-        return _Transaction(self._db)
+    def _transaction(self) -> AbstractContextManager[None]:
+        # Whoever has begun one already, writes all in it.
+        return nullcontext() if self._db.in_transaction else _Transaction(self._db)
 
 
 class _Transaction:

@@ -444,6 +444,10 @@ class TestFaults:
                     raise sqlite3.OperationalError("database or disk is full")
                 return execute.execute(*arguments)
 
+            @property
+            def in_transaction(self):
+                return execute.in_transaction
+
             def executemany(self, statement, rows):
                 for row in rows:
                     self.execute(statement, row)
