@@ -710,10 +710,13 @@ def hybrid_runs(tmp_path_factory):
         ("piezo-loops", "piezo-loops", "amplitudes=40, 20"),
         ("piezo-step", "piezo-step", "duration=0.15"),
         ("flat", "piezo-loops", "amplitudes=0"),
-        ("failed", "piezo-loops", "amplitudes=60"),
+        ("failed", "piezo-loops", "amplitudes=40"),
     ):
         result = folder / "run.json"
         settings = [part for option in options for part in ("--set", option)]
+        if name == "failed":
+            for option in ("emulation.fault=amplifier-trips", "emulation.fault_time=5"):
+                settings += ["--override", option]
         with pytest.raises(SystemExit) as stopped:
             main(
                 ["run", protocol, "--rig", "hybrid", "--clock", "virtual", *settings, "--out", str(folder),
