@@ -205,10 +205,8 @@ class Engine:
                 messages.close()
 
     def _step(self, step: Step) -> Reading:
-        if isinstance(step.settle, UntilSteady) and step.settle.signal not in self._names:
-            raise ConfigurationError(
-                f"{step.settle.signal} is no signal of this rig; there are: {', '.join(self._names)}"
-            )
+        if isinstance(step.settle, UntilSteady):
+            self._check_signals(step.settle.signal)
         started = self._clock.now()
         self._send(step.setpoints)
         self._settle(step.settle, started)
@@ -218,9 +216,7 @@ class Engine:
 
     def _control(self, message: Control) -> Reading:
         wanted = (message.input, message.output, *message.others)
-        for name in wanted:
-            if name not in self._names:
-                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+        self._check_signals(*wanted)
         actuator = self._actuator(message.actuator)
         started = self._clock.now()
         latest = started + message.timeout
@@ -259,9 +255,7 @@ class Engine:
             self._trace = _NOT_AT_WORK
 
     def _fast_loop(self, message: FastLoop) -> Reading:
-        for name in (*message.inputs, *message.watched):
-            if name not in self._names:
-                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+        self._check_signals(*message.inputs, *message.watched)
         actuators = [self._actuator(name) for name in message.actuators]
         setpoints = [f"{name}_setpoint" for name in message.actuators]
         read = self._rig.quick_reader((*message.inputs, *message.watched))
@@ -372,6 +366,11 @@ class Engine:
         self._steps += 1
         self._tell(lambda observer: observer.step(record))
         return Reading(record.step, finished, record.settled, values)
+
+    def _check_signals(self, *names: str) -> None:
+        for name in names:
+            if name not in self._names:
+                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
 
     def _actuator(self, name: str) -> Actuator:
         actuators = self._rig.actuators
