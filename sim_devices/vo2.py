@@ -10,7 +10,7 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import EmulatedT7, NormalisedPSD
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
