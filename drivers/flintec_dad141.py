@@ -16,7 +16,8 @@ was; characters have 8 bits and one stop bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, field_validator
@@ -27,8 +28,9 @@ from pymodbus.pdu import ModbusPDU
 from bench.clock import Clock
 from bench.devices import Identity, LoadCell
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.line import LineDevice, SerialSettings, lost_line, open_port
+from drivers.device import LineDevice, Slope
 from drivers.modbus import exception_text, pack, swapped, unpack
+from drivers.serial_line import SerialSettings, lost_line, open_port
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
 """3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
@@ -105,7 +107,7 @@ class DAD141Settings(SerialSettings):
         description="time from reading to reading of a measurement in s, 0 to 60; unless given, half a period of "
         "the filter's cut-off, which makes their noise nearly independent",
     )
-    newtons_per_unit: float = Field(
+    newtons_per_unit: Slope = Field(
         default=1.0,
         description="calibration: N for each unit of weight, not 0; 9.80665 for kg, negative to turn the sign",
     )
@@ -132,13 +134,6 @@ class DAD141Settings(SerialSettings):
         default=(1410, 0x1410), min_length=1, description="values of register 0x202C (device identity) to accept"
     )
 
-    @field_validator("newtons_per_unit")
-    @classmethod
-    def _check_slope(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("must be a number other than 0")
-        return value
-
     @field_validator("force_limits")
     @classmethod
     def _check_limits(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -154,7 +149,6 @@ class _Client(ModbusSerialClient):
     pymodbus looks whether bytes have come, sleeps for a millisecond or more, and looks again whether more have:
     two naps for each reply. The head of a reply says how long it is, so that the port itself can wait for
     exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
-
     """
 
     def __init__(self, name: str, settings: DAD141Settings) -> None:
@@ -170,9 +164,9 @@ class _Client(ModbusSerialClient):
         return self.socket is not None
 
     def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:  # noqa: ARG002 - pymodbus's form
-        """Send a request, and forget whatever came before it."""
-        with _LineErrors(self):
-            self._forget()
+        """Send a request, and discard what came before it."""
+        with self._line_errors():
+            self._discard()
             self._received = 0
             sent: int = self.socket.write(request)
         return sent
@@ -181,7 +175,7 @@ class _Client(ModbusSerialClient):
         """Wait for a reply, up to the timeout, and return what has come of it."""
         if self._received > _LONGEST_REPLY:
             return b""  # it never becomes a reply
-        with _LineErrors(self):
+        with self._line_errors():
             reply: bytes = self.socket.read(_SHORTEST_REPLY)
             if len(reply) == _SHORTEST_REPLY and (missing := _reply_length(reply) - _SHORTEST_REPLY) > 0:
                 reply += self.socket.read(missing)
@@ -189,34 +183,29 @@ class _Client(ModbusSerialClient):
         return reply
 
     def drain(self) -> None:
-        """Let whatever still arrives pass, until nothing has come for a timeout."""
-        with _LineErrors(self):
+        """Discard what still arrives, until nothing has come for a timeout."""
+        with self._line_errors():
             for _ in range(_MOST_STRAY // _LONGEST_REPLY):
                 if not self.socket.read(_LONGEST_REPLY):
                     return
         raise ConnectionException("the line does not fall silent")
 
-    def _forget(self) -> None:
+    def _discard(self) -> None:
         # A socket says only that something is waiting, not how much; hence byte by byte at worst.
         for _ in range(_MOST_STRAY):
             if not (waiting := self.socket.in_waiting):
                 return
             self.socket.read(waiting)
 
-
-class _LineErrors:
-    """Turns what a port raises into what pymodbus raises."""
-
-    def __init__(self, client: _Client) -> None:
-        self._client = client
-
-    def __enter__(self) -> None:
-        if self._client.socket is None:
+    @contextmanager
+    def _line_errors(self) -> Iterator[None]:
+        """Turn what the port raises into what pymodbus raises."""
+        if self.socket is None:
             raise ConnectionException("the line is closed")
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if isinstance(error, OSError):
-            self._client.close()  # type: ignore[no-untyped-call]
+        try:
+            yield
+        except OSError as error:
+            self.close()  # type: ignore[no-untyped-call]
             raise ConnectionException(str(error)) from error
 
 
@@ -307,20 +296,17 @@ class _Line:
         try:
             for _ in range(_RESENDS):
                 try:
-                    return self._checked(self._once(request), doing)
+                    return self._once(request, doing)
                 except ModbusIOException:
                     self._client.drain()
-            return self._checked(self._once(request), doing)
+            return self._once(request, doing)
         except ModbusException as error:
             raise self._lost(error) from error
 
-    def _once(self, request: Callable[[], ModbusPDU]) -> ModbusPDU:
+    def _once(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
         self._clock.sleep_until(self._silent_since + self._pause)
         response = request()
         self._silent_since = self._clock.now()
-        return response
-
-    def _checked(self, response: ModbusPDU, doing: str) -> ModbusPDU:
         if response.isError():
             raise _RefusedError(self._name, response.exception_code, doing)
         return response

@@ -20,6 +20,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal, TypeVar
 
 from pydantic import Field, field_validator
@@ -27,6 +28,7 @@ from pydantic import Field, field_validator
 from bench.clock import Clock
 from bench.devices import Actuator, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from drivers.device import RecoverableDevice, attempt
 from drivers.dynamixel.protocol2 import (
     FEEDBACK,
     PING,
@@ -38,7 +40,6 @@ from drivers.dynamixel.protocol2 import (
     ServoLine,
     ServoLineSettings,
 )
-from drivers.line import RecoverableDevice
 
 MODEL_NUMBER = 30
 OLDEST_FIRMWARE = 39
@@ -57,7 +58,6 @@ _REQUIRED_SHUTDOWN = 0b110100  # overload, electrical shock, overheating
 _ANSWER_EVERYTHING = 2  # value of the status return level
 
 _START_TIMEOUT = 5.0
-_START_POLL = 0.1
 _REBOOT_DELAY = 0.2
 _EMERGENCY_PATIENCE = 1.0  # s for a reboot on the way to the safe state
 _STANDSTILL = 1.0  # s beside the goal without a motion that count as blocked
@@ -220,7 +220,6 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
-        self._setpoint = math.nan
         self._goal = 0
         self._armed = False
         self._expired = False
@@ -234,31 +233,11 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """The allowed set-points: the limits of the settings."""
         return self._settings.limits
 
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent; nan before the first."""
-        return self._setpoint
-
     def set(self, value: float) -> Status:
-        """Move to a set-point; switches the torque on if it is off.
+        """Move to a set-point, with a resolution of 0.00153 rad; switches the torque on if it is off.
 
-        Parameters
-        ----------
-        value : float
-            In the unit of `limits`, and within them; the servo resolves 0.00153 rad.
-
-        Returns
-        -------
-        Status
-            Complete when the shaft stands within `tolerance` of the goal. Fails if it stands elsewhere for 1 s,
-            if a later set-point or `stop` replaces this one, or if the torque goes off.
-
-        Raises
-        ------
-        LimitError
-            If the value is outside of `limits`; nothing is sent.
-        DeviceError
-            If the servo has a hardware error or an expired watchdog, or refuses.
+        The status completes when the shaft stands within `tolerance` of the goal. It fails if the shaft stands
+        elsewhere for 1 s, if a later set-point or `stop` replaces this one, or if the torque goes off.
         """
         self.check(value)
         goal = self._counts(value / self._settings.per_radian)
@@ -272,13 +251,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         return Status(self.name, self._clock, lambda: self._arrived(goal, standstill), timeout=timeout)
 
     def measure(self) -> dict[str, float]:
-        """Measure position, velocity and inferred load (1), in one round trip.
-
-        Raises
-        ------
-        DeviceError
-            If the servo has a hardware error or an expired watchdog, or does not answer.
-        """
+        """Measure position, velocity and inferred load (1), in one round trip."""
         load, velocity, position, _, _ = self._feedback()
         direction = self._settings.direction
         velocity_in_unit = direction * velocity * _VELOCITY_UNIT * self._settings.per_radian
@@ -298,27 +271,12 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
         If the servo refuses or still reports its torque on, its output is set to zero and it is rebooted,
         which loses the number of turns.
-
-        Raises
-        ------
-        DeviceError
-            If the servo does not confirm that the torque is off, after everything was tried.
         """
-        failures: list[DeviceError] = []
-        try:
-            self._write(_TORQUE, 0)
-        except DeviceError as error:
-            failures.append(error)
+        failures = attempt(partial(self._write, _TORQUE, 0))
         if not self._is_off():
-            with suppress(DeviceError):
-                self._write(_GOAL_PWM, 0)
-            with suppress(DeviceError):
-                self._reboot(_EMERGENCY_PATIENCE)
+            attempt(partial(self._write, _GOAL_PWM, 0), partial(self._reboot, _EMERGENCY_PATIENCE))
             if not self._is_off():
-                reason = f" ({failures[0]})" if failures else ""
-                raise DeviceError(
-                    self.name, f"does not confirm that its torque is off{reason}; disconnect its power supply"
-                )
+                raise self._unconfirmed("torque", failures)
         self._armed = False
         # The torque is off, so whether the watchdog could be disarmed does not matter for safety.
         with suppress(DeviceError):
@@ -343,10 +301,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         self.reboot()
 
     def _identify(self) -> Identity:
-        try:
-            model, firmware = struct.unpack("<HB", self._line.ask(PING, b"", 3))
-        except RefusedError as error:
-            raise self._refusal("a ping", error) from None
+        model, firmware = self._ping()
         place = f"{self._settings.port}, id {self._settings.id}"
         if model != MODEL_NUMBER:
             raise DeviceConnectionError(
@@ -543,19 +498,16 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         # The answer may be lost in the restart; whether the servo comes back is what counts.
         with suppress(DeviceConnectionError, RefusedError):
             self._line.order(REBOOT, b"")
-        end = self._clock.now() + patience
         self._clock.sleep(_REBOOT_DELAY)
-        while True:
-            try:
-                self._line.ask(PING, b"", 3)
-            except RefusedError as error:
-                raise self._refusal("a ping", error) from None
-            except DeviceConnectionError:
-                if self._clock.now() >= end:
-                    raise
-                self._clock.sleep(_START_POLL)
-            else:
-                return
+        self._wait_until(lambda: bool(self._ping()), patience - _REBOOT_DELAY)
+
+    def _ping(self) -> tuple[int, int]:
+        """Return model number and firmware."""
+        try:
+            model, firmware = struct.unpack("<HB", self._line.ask(PING, b"", 3))
+        except RefusedError as error:
+            raise self._refusal("a ping", error) from None
+        return model, firmware
 
     def _read(self, item: _Item, *, signed: bool = False) -> int:
         request = struct.pack("<HH", item.address, item.size)

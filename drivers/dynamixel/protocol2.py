@@ -12,7 +12,7 @@ import serial
 from pydantic import Field
 
 from bench.clock import Clock
-from drivers.line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 RANGE_ERROR = 4

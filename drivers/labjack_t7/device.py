@@ -9,8 +9,8 @@ from pydantic import Field, field_validator
 
 from bench.clock import Clock
 from bench.devices import DriverSettings, Identity
+from drivers.device import LineDevice
 from drivers.labjack_t7.registers import LabJackT7
-from drivers.line import LineDevice
 
 DEFAULT_PORT = 502
 

@@ -15,7 +15,8 @@ from pydantic import Field, model_validator
 from bench.clock import Clock
 from bench.devices import Limits, Status, VoltageSupply
 from bench.errors import DeviceError
-from drivers.labjack_t7.inputs import RAIL, Channel, Slope, T7InputDevice, T7InputSettings
+from drivers.device import Slope, attempt
+from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings
 from drivers.labjack_t7.registers import DAC, TDAC, LabJackT7
 
@@ -127,16 +128,8 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
     def set(self, value: float) -> Status:
         """Send a voltage in V, and switch the amplifier on if it is off, at 0 V.
 
-        The status is complete at once: an amplifier settles while the request goes back.
-
-        Raises
-        ------
-        LimitError
-            If `value` is outside of the limits; nothing is sent.
-        DeviceError
-            If the amplifier does not go on or went off by itself, or the instrument refuses.
-        DeviceConnectionError
-            If the instrument does not answer.
+        The status is complete at once: an amplifier settles within the time of the reply. An amplifier that does
+        not go on or went off by itself is a `DeviceError`.
         """
         self.check(value)
         if not self._enabled:
@@ -148,13 +141,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         return self._sent
 
     def safe(self) -> None:
-        """Send 0 V, switch the enable line off, and see that the amplifier is off and its output at 0 V.
-
-        Raises
-        ------
-        DeviceError
-            If that could not be confirmed; everything was tried.
-        """
+        """Send 0 V, switch the enable line off, and see that the amplifier is off and its output at 0 V."""
         self._setpoint = 0.0
         self._switch_off()
 
@@ -185,14 +172,9 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
     def _switch_off(self) -> None:
         """Try every step, also after one that fails, and raise the first error."""
         self._enabled = False
-        first: DeviceError | None = None
-        for step in (partial(self._send, 0.0), partial(self._output.switch, False), self._check_off):
-            try:
-                step()
-            except DeviceError as error:
-                first = first or error
-        if first is not None:
-            raise first
+        failures = attempt(partial(self._send, 0.0), partial(self._output.switch, False), self._check_off)
+        if failures:
+            raise failures[0]
 
     def _check_off(self) -> None:
         for _ in range(_LOOKS):
@@ -210,7 +192,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
 
     def _look(self) -> tuple[float, float, bool]:
         """Get voltage in V, current in A, and whether the amplifier reports that it is on, by one conversion."""
-        return self._monitored(*self._inputs.convert())
+        return self._monitored(*self._convert())
 
     def _monitored(self, voltage: float, current: float, status: float) -> tuple[float, float, bool]:
         self._looked = self._clock.now()

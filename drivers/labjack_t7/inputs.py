@@ -14,9 +14,8 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple, Self, TypeVar
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from bench.clock import Clock
 from bench.errors import DeviceError
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
@@ -33,7 +32,6 @@ from drivers.labjack_t7.registers import (
     AIN_SETTLING_US,
     STREAM_RESOLUTION_INDEX,
     STREAM_SETTLING_US,
-    LabJackT7,
     Register,
 )
 
@@ -49,14 +47,7 @@ _MISSED_SAMPLE = -9999.0  # what a stream puts in place of a sample that it had 
 _LARGEST_RANGE = 10.0  # V
 
 
-def _check_slope(value: float) -> float:
-    if value == 0:
-        raise ValueError("must be a number other than 0")
-    return value
-
-
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
-Slope = Annotated[float, AfterValidator(_check_slope)]
 
 
 class T7InputSettings(T7ConnectionSettings):
@@ -111,36 +102,23 @@ class _Voltage(NamedTuple):
     minimum: float
 
 
-class AnalogInputs:
-    """The analog inputs of a T7 that one sensor reads.
+InputSettingsT = TypeVar("InputSettingsT", bound=T7InputSettings)
 
-    The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one
-    instrument: give sensors on the same one the same `resolution_index` and `settling_us`.
 
-    Parameters
-    ----------
-    name : str
-        Name of the device, for messages.
-    instrument : LabJackT7
-        The connection.
-    settings : T7InputSettings
-        Which inputs, and how they are read.
+class T7InputDevice(T7Device[InputSettingsT]):
+    """A device on a LabJack T7 that is read by analog inputs.
+
+    `measure` has the instrument average a burst of `samples` conversions of each input, `glance` takes one
+    conversion: three requests and one, with inputs that are neighbours in ascending order, otherwise as many for
+    each input. Both raise `DeviceError` if a conversion is not valid or over the range, as clipped conversions would
+    shift the mean.
+
+    The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one instrument:
+    give sensors on the same one the same `resolution_index` and `settling_us`.
     """
 
-    def __init__(self, name: str, instrument: LabJackT7, settings: T7InputSettings) -> None:
-        self._name = name
-        self._instrument = instrument
-        self._settings = settings
-
-    def set_up(self) -> None:
-        """Write the settings to the instrument.
-
-        Raises
-        ------
-        DeviceError
-            If the instrument does not take one.
-        """
-        settings, instrument = self._settings, self._instrument
+    def _start(self) -> None:
+        settings, instrument = self._settings, self._line
         instrument.set({STREAM_RESOLUTION_INDEX: settings.resolution_index})
         instrument.set({STREAM_SETTLING_US: settings.settling_us})
         for channel in settings.channels:
@@ -155,44 +133,42 @@ class AnalogInputs:
                 instrument.set({AIN_EF_SAMPLES.of(channel): settings.samples})
                 instrument.set({AIN_EF_SCAN_RATE.of(channel): settings.sample_rate})
 
-    def average(self) -> list[float]:
-        """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other.
+    def measure(self) -> dict[str, float]:
+        """Measure every signal, by the means of `samples` conversions."""
+        return self._values(*self._average())
 
-        Takes three requests, or three for each input if they are not neighbours in ascending order.
+    def glance(self) -> dict[str, float]:
+        """Measure every signal by one conversion of each input; raises what `measure` does."""
+        return self._values(*self._convert())
 
-        Raises
-        ------
-        DeviceError
-            If a conversion is not valid or over the range, as clipped conversions would shift the mean.
-        DeviceConnectionError
-            If the instrument does not answer.
-        """
+    @abstractmethod
+    def _values(self, *volts: float) -> dict[str, float]: ...
+
+    def _average(self) -> list[float]:
+        """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
         if self._settings.samples == 1:
-            return self.convert()
+            return self._convert()
         means = self._read(AIN_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
         maxima = self._read(AIN_EF_READ_MAXIMUM)
         minima = self._read(AIN_EF_READ_MINIMUM)
         return self._checked([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
 
-    def convert(self) -> list[float]:
-        """Get one conversion of each input in V; raises what `average` does.
-
-        Takes one request, or one for each input if they are not neighbours in ascending order.
-        """
+    def _convert(self) -> list[float]:
+        """Get one conversion of each input in V."""
         return self._checked([_Voltage(volts, volts, volts) for volts in self._read(AIN)])
 
     def _read(self, register: Register) -> list[float]:
         """Get the value of a register for every input, in one request where they are neighbours."""
         channels = self._settings.channels
         if channels == tuple(range(channels[0], channels[0] + len(channels))):
-            return self._instrument.read(register.of(channels[0]), len(channels))
-        return [self._instrument.read(register.of(channel))[0] for channel in channels]
+            return self._line.read(register.of(channels[0]), len(channels))
+        return [self._line.read(register.of(channel))[0] for channel in channels]
 
     def _checked(self, voltages: Sequence[_Voltage]) -> list[float]:
         for channel, voltage in zip(self._settings.channels, voltages, strict=True):
             if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
                 raise DeviceError(
-                    self._name,
+                    self.name,
                     f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
                 )
             limit = self._settings.range
@@ -200,38 +176,8 @@ class AnalogInputs:
             if abs(extreme) >= RAIL * limit:
                 larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
                 raise DeviceError(
-                    self._name,
+                    self.name,
                     f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
                     "what is measured back into it",
                 )
         return [voltage.mean for voltage in voltages]
-
-
-InputSettingsT = TypeVar("InputSettingsT", bound=T7InputSettings)
-
-
-class T7InputDevice(T7Device[InputSettingsT]):
-    """A device on a LabJack T7 that is read by analog inputs.
-
-    `measure` has the instrument average a burst of `samples` conversions of each input, `glance` takes one
-    conversion: three requests and one, with inputs that are neighbours in ascending order. Both raise `DeviceError`
-    if an input is over its range, and as the class says.
-    """
-
-    def __init__(self, name: str, settings: InputSettingsT, clock: Clock, line: LabJackT7) -> None:
-        super().__init__(name, settings, clock, line)
-        self._inputs = AnalogInputs(name, line, settings)
-
-    def _start(self) -> None:
-        self._inputs.set_up()
-
-    def measure(self) -> dict[str, float]:
-        """Measure every signal, by the means of `samples` conversions."""
-        return self._values(*self._inputs.average())
-
-    def glance(self) -> dict[str, float]:
-        """Measure every signal by one conversion of each input; raises what `measure` does."""
-        return self._values(*self._inputs.convert())
-
-    @abstractmethod
-    def _values(self, *volts: float) -> dict[str, float]: ...

@@ -9,7 +9,6 @@ too.
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -18,6 +17,7 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import DeviceError
+from drivers.device import LineActuator
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
     DIO,
@@ -237,7 +237,7 @@ class DigitalOutput:
 LineSettingsT = TypeVar("LineSettingsT", bound=T7LineSettings)
 
 
-class T7LineDevice(T7Device[LineSettingsT]):
+class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT7]):
     """A device that a digital line of a LabJack T7 switches.
 
     The watchdog of the instrument switches the line off when no host has communicated with the instrument for its
@@ -251,12 +251,6 @@ class T7LineDevice(T7Device[LineSettingsT]):
     def __init__(self, name: str, settings: LineSettingsT, clock: Clock, line: LabJackT7) -> None:
         super().__init__(name, settings, clock, line)
         self._output = DigitalOutput(name, line, settings.line, active_high=settings.active_high)
-        self._setpoint = math.nan
-
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent; 0 after the safe state and after the output went off, nan at first."""
-        return self._setpoint
 
     def close(self) -> None:
         """Release the connection; a line that is on is left to the watchdog."""

@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 
 from bench.devices import PositionSensor
 from bench.errors import DeviceError
-from drivers.labjack_t7.inputs import Slope, T7InputDevice, T7InputSettings
+from drivers.device import Slope
+from drivers.labjack_t7.inputs import T7InputDevice, T7InputSettings
 
 _USABLE = 0.95  # share of a detector's length that limits may use
 _READOUTS = {"voltage": 1, "currents": 2, "ratiometric": 2}  # inputs that each takes

@@ -14,7 +14,7 @@ import serial
 from pydantic import Field
 
 from bench.errors import DeviceError
-from drivers.line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
 
 _MOST_STALE_ANSWERS = 8
 _ACKNOWLEDGE_LENGTH = 12  # !, address, sequence, CRC, carriage return

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from enum import IntEnum
+from functools import partial
 from typing import ClassVar
 
 from pydantic import Field, field_validator
@@ -20,12 +21,11 @@ from pydantic import Field, field_validator
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.line import RecoverableDevice
+from drivers.device import RecoverableDevice, attempt
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, TECLineSettings, decode, encode, single
 
 _START_TIMEOUT = 5.0
-_START_POLL = 0.1
 _RESET_DELAY = 0.3  # the device restarts 0.2 s after the command
 _OUT_OF_RANGE = 7
 
@@ -147,7 +147,6 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def __init__(self, name: str, settings: TECSettings, clock: Clock, line: TECLine) -> None:
         super().__init__(name, settings, clock, line)
         self._mode = settings.mode
-        self._setpoint = math.nan
         self._polarity = 1
 
     @classmethod
@@ -182,31 +181,10 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             return Limits(*self._settings.temperature_limits, "°C")
         return Limits(-self._settings.current_limit, self._settings.current_limit, "A")
 
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent, °C or A by mode; nan before the first."""
-        return self._setpoint
-
     def set(self, value: float) -> Status:
-        """Control the object temperature or the current; switches the output on if it is off.
+        """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
 
-        Parameters
-        ----------
-        value : float
-            Temperature in °C within `temperature_limits`, or current in A within ± `current_limit`, by mode;
-            a positive current heats.
-
-        Returns
-        -------
-        Status
-            Complete when the device reports the temperature stable; at once in current mode.
-
-        Raises
-        ------
-        LimitError
-            If the value is outside of `limits`; nothing is sent.
-        DeviceError
-            If the device is in its error state or refuses.
+        The status completes when the device reports the temperature stable; at once in current mode.
         """
         self.check(value)
         state = self._check()
@@ -228,13 +206,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return self._state() is _State.RUN
 
     def measure(self) -> dict[str, float]:
-        """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V).
-
-        Raises
-        ------
-        DeviceError
-            If the device is in its error state, restarts, or does not answer.
-        """
+        """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V)."""
         values = (
             self._read(_OBJECT_TEMPERATURE),
             self._read(_SINK_TEMPERATURE),
@@ -261,28 +233,15 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
         Live enable and output stage enable are both switched off; if either fails, or the device still
         reports a running output, the emergency stop (`ES`, error 11 on the device) follows.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not confirm that the output is off, after everything was tried.
         """
-        failures = []
-        for parameter in (_LIVE_ENABLED, _ENABLE):
-            try:
-                self._write(parameter, _OFF)
-            except DeviceError as error:
-                failures.append(error)
+        failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
         if failures or not self._is_off():
             try:
                 self._line.order("ES")
             except (DeviceError, RefusedError) as error:
                 failures.append(DeviceError(self.name, f"emergency stop: {error}"))
             if not self._is_off():
-                reason = f" ({failures[0]})" if failures else ""
-                raise DeviceError(
-                    self.name, f"does not confirm that its output is off{reason}; disconnect its power supply"
-                )
+                raise self._unconfirmed("output", failures)
         # The output is off, so whether the watchdog could be disarmed does not matter for safety.
         with suppress(DeviceError):
             self._write(_WATCHDOG, 0.0)
@@ -321,7 +280,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         )
 
     def _start(self) -> None:
-        self._wait_until_started()
+        self._wait_until(lambda: self._state() not in (_State.INIT, _State.RESET_PENDING), _START_TIMEOUT)
         self._check()
         self._configure()
 
@@ -416,20 +375,6 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
             "then switch the device off and on to clear the error",
         )
-
-    def _wait_until_started(self) -> None:
-        end = self._clock.now() + _START_TIMEOUT
-        while True:
-            problem: DeviceError | None = None
-            try:
-                state = self._state()
-                if state not in (_State.INIT, _State.RESET_PENDING):
-                    return
-            except DeviceConnectionError as error:
-                problem = error
-            if self._clock.now() >= end:
-                raise problem or DeviceError(self.name, f"did not start within {_START_TIMEOUT:g} s")
-            self._clock.sleep(_START_POLL)
 
     def _read(self, parameter: Parameter) -> float:
         answer = self._ask("?VR", parameter, 8)

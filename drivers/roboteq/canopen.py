@@ -20,7 +20,7 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.line import RESENDS, SerialSettings, lost_line, no_answer
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
 _MOST_READS = 4096

@@ -28,6 +28,7 @@ import re
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -35,7 +36,7 @@ from pydantic import Field, model_validator
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status, VoltageSupply
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.line import RecoverableDevice
+from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine, NodeSettings, described
 
 DEVICE_TYPE = 0x000F0191
@@ -147,7 +148,6 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         super().__init__(name, settings, clock, line)
         self._lock = threading.RLock()
         self._limits = Limits(*settings.voltage_limits, "V")
-        self._setpoint = math.nan
         self._command = 0
         self._battery = math.nan
         self._commanded_at = -math.inf
@@ -168,31 +168,12 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """The allowed set-points, V: the settings' `voltage_limits`."""
         return self._limits
 
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent, V; nan before the first, 0 after the output was dropped."""
-        return self._setpoint
-
     def set(self, value: float) -> Status:
-        """Apply a voltage.
+        """Apply a voltage in V, as `output` defines it.
 
-        Parameters
-        ----------
-        value : float
-            Voltage in V within `voltage_limits`, as `output` defines it. The command that comes nearest to it
-            is sent, but none beyond the upper or the lower limit.
-
-        Returns
-        -------
-        Status
-            Complete when the device applies the power that was asked for, at the end of its ramp.
-
-        Raises
-        ------
-        LimitError
-            If the value is outside of `limits`; nothing is sent.
-        DeviceError
-            If the device reports a fault, or its power supply is too low for the voltage.
+        The nearest command is sent, but none beyond the upper or the lower limit. The status completes when the
+        device applies the power that was asked for, at the end of its ramp. A power supply that is too low for the
+        voltage is a `DeviceError`.
         """
         self.check(value)
         with self._lock:
@@ -214,12 +195,8 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def measure(self) -> dict[str, float]:
         """Measure the voltage (V, from applied power and battery voltage) and the current (A, to 0.1 A).
 
-        Sends the present command again, adjusted to the battery voltage, which feeds the device's watchdog.
-
-        Raises
-        ------
-        DeviceError
-            If the device reports a fault, dropped its output, restarted, or does not answer.
+        Sends the present command again, adjusted to the battery voltage, which feeds the device's watchdog. An
+        output that was dropped and a restart of the device are each a `DeviceError`.
         """
         with self._lock:
             power = self._read(_POWER, self._settings.channel)
@@ -231,34 +208,17 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             return {voltage_signal.name: self._voltage(power, battery), current_signal.name: current}
 
     def safe(self) -> None:
-        """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not confirm that it applies no power, after everything was tried.
-        """
+        """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
         with self._lock:
             self._order += 1
-            failures: list[DeviceError] = []
             channel = self._settings.channel
-            for item, value, sub in ((_COMMAND, 0, channel), (_STOP, channel, 0)):
-                try:
-                    self._write(item, value, sub)
-                except DeviceError as error:
-                    failures.append(error)
+            failures = attempt(partial(self._write, _COMMAND, 0, channel), partial(self._write, _STOP, channel))
             self._setpoint, self._command = 0.0, 0
             if not failures and self._is_off():
                 return
-            try:
-                self.emergency_stop()
-            except DeviceError as error:
-                failures.append(error)
+            failures += attempt(self.emergency_stop)
             if not self._is_off():
-                reason = f" ({failures[0]})" if failures else ""
-                raise DeviceError(
-                    self.name, f"does not confirm that its output is off{reason}; disconnect its power supply"
-                )
+                raise self._unconfirmed("output", failures)
 
     def emergency_stop(self) -> None:
         """Switch the power stage off until `release`, or until the device is switched off and on.

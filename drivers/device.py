@@ -1,27 +1,33 @@
-"""Devices that own their line: opening it, checking what answers there, and releasing it.
-
-Serial lines are opened by URL, as pyserial does: `/dev/ttyUSB0`, `socket://host:port` or `emulated://NAME`.
-"""
+"""Devices that own their line: opening it, checking which instrument answers, and releasing it."""
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Annotated, Generic, Protocol, Self, TypeVar
 
-import serial
-from pydantic import Field
+from pydantic import AfterValidator
 
 from bench.clock import Clock
-from bench.devices import Device, DriverSettings, Identity
-from bench.errors import DeviceConnectionError
+from bench.devices import Actuator, Device, DriverSettings, Identity
+from bench.errors import DeviceConnectionError, DeviceError
 
-RESENDS = 2
-"""How often a serial driver sends a request again that brought no good answer."""
+_START_POLL = 0.1  # s
+
+
+def _check_slope(value: float) -> float:
+    if value == 0:
+        raise ValueError("must be a number other than 0")
+    return value
+
+
+Slope = Annotated[float, AfterValidator(_check_slope)]
+"""A setting by which a driver divides: any number but 0."""
 
 
 class Line(Protocol):
-    """What a device talks over."""
+    """A connection to an instrument."""
 
     def close(self) -> None:
         """Release the line."""
@@ -59,15 +65,6 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
     @classmethod
     def connect(cls, name: str, settings: SettingsT, clock: Clock) -> Self:
         """Open the line, check that the right instrument answers and is healthy, and configure it; nothing moves.
-
-        Parameters
-        ----------
-        name : str
-            Name in the rig.
-        settings : DriverSettings
-            The device's part of the rig file.
-        clock : Clock
-            The clock of the run.
 
         Raises
         ------
@@ -112,8 +109,26 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         self._line.close()
 
 
-class RecoverableDevice(LineDevice[SettingsT, LineT]):
-    """A device whose instrument keeps an error until it is restarted or released."""
+class LineActuator(LineDevice[SettingsT, LineT], Actuator):
+    """An actuator at the end of a line of its own."""
+
+    def __init__(self, name: str, settings: SettingsT, clock: Clock, line: LineT) -> None:
+        super().__init__(name, settings, clock, line)
+        self._setpoint = math.nan
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent, in the unit of `limits`; nan before the first, 0 after the safe state."""
+        return self._setpoint
+
+    def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:
+        """Return the error for a part that may still be on, after everything was tried."""
+        reason = f" ({failures[0]})" if failures else ""
+        return DeviceError(self.name, f"does not confirm that its {part} is off{reason}; disconnect its power supply")
+
+
+class RecoverableDevice(LineActuator[SettingsT, LineT]):
+    """An actuator whose instrument keeps an error until it is restarted or released."""
 
     @classmethod
     def recover(cls, name: str, settings: SettingsT, clock: Clock) -> Self:
@@ -126,50 +141,27 @@ class RecoverableDevice(LineDevice[SettingsT, LineT]):
     @abstractmethod
     def _restart(self) -> None: ...
 
-
-class SerialSettings(DriverSettings):
-    """Where an instrument on a serial line is; the settings of its driver extend it."""
-
-    port: str = Field(
-        min_length=1, description="line as pyserial opens it: /dev/ttyUSB0, socket://host:port or emulated://NAME"
-    )
-    baudrate: int = Field(description="speed of the line, Bd")
-    timeout: float = Field(
-        default=0.1, gt=0.0, le=10.0, description="wait for an answer, s; a request is sent three times at most"
-    )
-
-
-def open_port(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401 - pyserial is untyped
-    """Open a serial port; `options` are pyserial's beside speed and timeouts.
-
-    Raises
-    ------
-    DeviceConnectionError
-        If the port cannot be opened.
-    """
-    try:
-        return serial.serial_for_url(
-            settings.port,
-            baudrate=settings.baudrate,
-            timeout=settings.timeout,
-            write_timeout=settings.timeout,
-            **options,
-        )
-    except Exception as error:  # pyserial passes on system errors that are no OSError
-        raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
+    def _wait_until(self, ready: Callable[[], bool], patience: float) -> None:
+        """Wait until the instrument answers that it is ready, for so many seconds at most."""
+        end = self._clock.now() + patience
+        while True:
+            problem: DeviceError | None = None
+            try:
+                if ready():
+                    return
+            except DeviceConnectionError as error:
+                problem = error
+            if self._clock.now() >= end:
+                raise problem or DeviceError(self.name, f"did not start within {patience:g} s")
+            self._clock.sleep(_START_POLL)
 
 
-def lost_line(device: str, settings: SerialSettings, error: object, advice: str = "") -> DeviceConnectionError:
-    """Return the error for a line that failed while it was in use."""
-    return DeviceConnectionError(device, f"lost the line {settings.port} ({error}); check the cable{advice}")
-
-
-def no_answer(
-    device: str, settings: SerialSettings, problem: str, node: str, number: int, found: str = "", speed: str = ""
-) -> DeviceConnectionError:
-    """Return the error for a request without a good answer; `node` is the instrument's word for its address."""
-    return DeviceConnectionError(
-        device,
-        f"{problem} at {settings.port}, {node} {number}, after {1 + RESENDS} requests{found}; "
-        f"check power, cable, {node} and speed ({speed or f'{settings.baudrate} Bd'})",
-    )
+def attempt(*steps: Callable[[], object]) -> list[DeviceError]:
+    """Take every step, also after one that fails; return the failures."""
+    failures = []
+    for step in steps:
+        try:
+            step()
+        except DeviceError as error:
+            failures.append(error)
+    return failures
