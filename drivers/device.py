@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Annotated, Generic, Protocol, Self, TypeVar
+from typing import Annotated, Any, Generic, Protocol, Self, TypeVar
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from bench.clock import Clock
 from bench.devices import Actuator, Device, DriverSettings, Identity
@@ -24,6 +24,17 @@ def _check_slope(value: float) -> float:
 
 Slope = Annotated[float, AfterValidator(_check_slope)]
 """A setting by which a driver divides: any number but 0."""
+
+
+def watchdog_field(default: float, longest: float, effect: str) -> Any:  # noqa: ANN401 - as pydantic's Field
+    """Return the setting of an instrument's watchdog for its host, s; `effect` says what it does."""
+    return Field(
+        default=default,
+        ge=0.0,
+        le=longest,
+        description=f"silence of the host after which {effect}; must exceed the longest pause between two readings, "
+        "which is 2 s in a long hold",
+    )
 
 
 class Line(Protocol):
@@ -103,6 +114,12 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
     def identity(self) -> Identity:
         """Maker, model, serial number and firmware, as the instrument reported on connecting."""
         return self._identity
+
+    def _check_range(self, text: str, value: float, limits: tuple[float, float], unit: str, advice: str) -> None:
+        """Raise `DeviceError` if a value is outside of its limits; `text` and `advice` begin and end the message."""
+        low, high = limits
+        if not low <= value <= high:
+            raise DeviceError(self.name, f"{text} {low:g} to {high:g} {unit}; {advice}")
 
     def close(self) -> None:
         """Release the line; an output that is on stays on until the instrument's watchdog acts."""

@@ -81,10 +81,7 @@ class DAD141Settings(SerialSettings):
         default="N", description="parity (menu 8.7): N for none, E for even, O for odd"
     )
     timeout: float = Field(
-        default=0.2,
-        ge=0.02,
-        le=10.0,
-        description="wait for a reply in s, 0.02 to 10; a request is sent twice at most",
+        default=0.2, ge=0.02, le=10.0, description="wait for a reply, s: 0.02 to 10; a request is sent twice at most"
     )
     pause: float | None = Field(
         default=None,
@@ -94,18 +91,11 @@ class DAD141Settings(SerialSettings):
         "that Modbus asks for, or 1.75 ms above 19200 Bd",
     )
     filter: int = Field(
-        default=3,
-        ge=0,
-        le=7,
-        description="digital low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1 and 0.5 Hz",
+        default=3, ge=0, le=7, description="low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1, 0.5 Hz"
     )
     samples: int = Field(default=5, ge=1, le=1000, description="readings averaged in one measurement, 1 to 1000")
     interval: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=60.0,
-        description="time from reading to reading of a measurement in s, 0 to 60; unless given, half a period of "
-        "the filter's cut-off, which makes their noise nearly independent",
+        default=None, ge=0.0, le=60.0, description="time between readings, s; default: half a period of the cut-off"
     )
     newtons_per_unit: Slope = Field(
         default=1.0,
@@ -348,6 +338,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
         super().__init__(name, settings, clock, line)
         self._tared = False
+        # Half a period of the filter's cut-off makes the noise of the readings nearly independent.
         self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
         self._gross = math.nan
         self._gross_since = 0.0
@@ -494,13 +485,9 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 self.name, f"the instrument {what} Set the tare again, or clear it, so that its force can be trusted"
             )
         gross = settings.newtons_per_unit * block.gross + settings.zero_newtons
-        low, high = settings.force_limits
-        if not low <= gross <= high:
-            raise DeviceError(
-                self.name,
-                f"force {gross:.6g} N is outside of its calibrated range {low:g} to {high:g} N; "
-                "take load off, or extend the calibration and `force_limits`",
-            )
+        text = f"force {gross:.6g} N is outside of its calibrated range"
+        advice = "take load off, or extend the calibration and `force_limits`"
+        self._check_range(text, gross, settings.force_limits, "N", advice)
         self._check_fresh(block.gross)
         return settings.newtons_per_unit * block.net if self._tared else gross
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from bench.devices import Limits, LinearStage
+from bench.devices import LinearStage
 from drivers.dynamixel.mx28 import MX28, MX28Settings
 
 
@@ -27,15 +27,7 @@ class DrumSettings(MX28Settings):
         "2π/4096 rad · drum_radius"
     )
 
-    @model_validator(mode="after")
-    def _check_stage_limits(self) -> Self:
-        self._check_limits("stage_limits", self.stage_limits, "m")
-        return self
-
-    @property
-    def limits(self) -> Limits:
-        """The allowed positions, m."""
-        return Limits(*self.stage_limits, "m")
+    _LIMITS = ("stage_limits", "m")
 
     @property
     def per_radian(self) -> float:

@@ -21,14 +21,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
 from bench.devices import Actuator, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.device import RecoverableDevice, attempt
+from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.dynamixel.protocol2 import (
     FEEDBACK,
     PING,
@@ -116,17 +116,13 @@ class MX28Settings(ServoLineSettings):
     """Rig-file settings of any Dynamixel MX-28."""
 
     return_delay: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=508e-6,
-        description="pause of the servo before it answers, s: 0 to 508e-6, steps of 2e-6",
+        default=0.0, ge=0.0, le=508e-6, description="pause before an answer, s: 0 to 508e-6, in steps of 2e-6"
     )
     zero_counts: int = Field(
         default=0, ge=-HIGHEST_GOAL, le=HIGHEST_GOAL, description="where the set-point zero is, counts of 2π/4096"
     )
     direction: Literal[1, -1] = Field(
-        default=1,
-        description="1 if set-points grow with the counts (counter-clockwise at the horn), -1 if against them",
+        default=1, description="1 if set-points grow with the counts (counter-clockwise at the horn), otherwise -1"
     )
     profile_velocity: float = Field(
         default=1.0,
@@ -142,12 +138,8 @@ class MX28Settings(ServoLineSettings):
         description="acceleration of a motion, rad/s²: 0.3746 to 12271, rounded down to steps of 0.3746; at most "
         "the acceleration limit that is set in the servo",
     )
-    watchdog: float = Field(
-        default=2.5,
-        ge=0.0,
-        le=127 * _WATCHDOG_UNIT,
-        description="silence of the host after which the servo stops and holds, s: 0.02 to 2.54 in steps of 0.02, "
-        "0 for never; must exceed the longest pause between two readings, which is 2 s in a long hold",
+    watchdog: float = watchdog_field(
+        2.5, 127 * _WATCHDOG_UNIT, "the servo stops and holds, s: 0.02 to 2.54 in steps of 0.02, 0 for never"
     )
     tolerance: float = Field(
         default=0.01,
@@ -167,27 +159,33 @@ class MX28Settings(ServoLineSettings):
             raise ValueError("expected 0.02 to 2.54 s, or 0 for no watchdog")
         return value
 
-    @property
-    @abstractmethod
-    def limits(self) -> Limits:
-        """The set-points that are allowed."""
+    _LIMITS: ClassVar[tuple[str, str]]  # key and unit of the limits of the set-point
 
     @property
     @abstractmethod
     def per_radian(self) -> float:
         """Change of the set-point with the angle of the shaft, in the unit of `limits` per rad."""
 
-    def _check_limits(self, key: str, limits: tuple[float, float], unit: str) -> None:
-        """Raise `ValueError` unless limits are in order and within the servo's range."""
-        low, high = (limit / self.per_radian for limit in limits)
+    @property
+    def limits(self) -> Limits:
+        """The set-points that are allowed."""
+        key, unit = self._LIMITS
+        low, high = getattr(self, key)
+        return Limits(low, high, unit)
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        key, unit = self._LIMITS
+        low, high = (limit / self.per_radian for limit in getattr(self, key))
         if not low < high:
             raise ValueError(f"{key}: expected the lower limit first")
         ends = sorted(self.direction * (goal - self.zero_counts) * _COUNT for goal in (-HIGHEST_GOAL, HIGHEST_GOAL))
         if low < ends[0] or high > ends[1]:
             raise ValueError(
-                f"{key}: {Limits(*limits, unit)} is beyond the range of the servo, which with these zero_counts and "
+                f"{key}: {self.limits} is beyond the range of the servo, which with these zero_counts and "
                 f"direction is {Limits(ends[0] * self.per_radian, ends[1] * self.per_radian, unit)}"
             )
+        return self
 
 
 MX28SettingsT = TypeVar("MX28SettingsT", bound=MX28Settings)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from bench.devices import Limits, Servo
+from bench.devices import Servo
 from drivers.dynamixel.mx28 import MX28, MX28Settings
 
 
@@ -17,15 +17,7 @@ class AngleSettings(MX28Settings):
         description="lowest and highest angle set-point, rad; both within ±1048575 counts of the servo"
     )
 
-    @model_validator(mode="after")
-    def _check_position_limits(self) -> Self:
-        self._check_limits("position_limits", self.position_limits, "rad")
-        return self
-
-    @property
-    def limits(self) -> Limits:
-        """The allowed angles, rad."""
-        return Limits(*self.position_limits, "rad")
+    _LIMITS = ("position_limits", "rad")
 
     @property
     def per_radian(self) -> float:

@@ -58,10 +58,7 @@ class T7InputSettings(T7ConnectionSettings):
     )
     range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
     resolution_index: int = Field(
-        default=4,
-        ge=0,
-        le=8,
-        description="resolution index, 0 (default of the instrument) to 8 (least noise, slowest)",
+        default=4, ge=0, le=8, description="resolution index, 0 (instrument's default) to 8 (least noise, slowest)"
     )
     settling_us: float = Field(
         default=0.0, ge=0.0, le=4400.0, description="settling time of an input in µs, 0 (automatic) to 4400"

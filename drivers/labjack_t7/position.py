@@ -38,32 +38,19 @@ class T7PositionSettings(T7InputSettings):
         default=0.0, ge=-10.0, le=10.0, description="voltage readout: voltage at position zero in V, -10 to 10"
     )
     psd_length: float = Field(
-        default=0.037,
-        gt=0.0,
-        le=1.0,
-        description="currents readout: length of the detector in m, above 0 to 1; 0.037 for a Hamamatsu S3270",
+        default=0.037, gt=0.0, le=1.0, description="currents: length of the detector, m, to 1; Hamamatsu S3270: 0.037"
     )
     metres_per_metre: Slope = Field(
-        default=185.0,
-        description="currents readout: movement of the spot per movement of the tip, not 0; its sign is kept",
+        default=185.0, description="currents: movement of the spot per movement of the tip, not 0; its sign is kept"
     )
     minimum_sum_volts: float = Field(
-        default=0.5,
-        gt=0.0,
-        le=20.0,
-        description="currents readout: sum of both voltages in V below which the light is lost, above 0 to 20",
+        default=0.5, gt=0.0, le=20.0, description="currents: sum of voltages below which the light is lost, V, to 20"
     )
     stroke: float = Field(
-        default=0.035,
-        gt=0.0,
-        le=1.0,
-        description="ratiometric readout: stroke of the sensor in m, above 0 to 1; 0.035 for an SPS-L035-LATS",
+        default=0.035, gt=0.0, le=1.0, description="ratiometric: stroke of the sensor, m, to 1; SPS-L035-LATS: 0.035"
     )
     zero_position: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=1.0,
-        description="ratiometric readout: where on the stroke the position reads zero in m, 0 to the stroke",
+        default=0.0, ge=0.0, le=1.0, description="ratiometric: position on the stroke that reads zero, m, from 0"
     )
     position_limits: tuple[float, float] = Field(
         default=(-90e-6, 90e-6), description="calibrated range in m, low and high; a reading beyond is an error"
@@ -129,13 +116,9 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
             position = self._from_currents(*volts)
         else:
             position = self._from_ratio(*volts)
-        low, high = settings.position_limits
-        if not low <= position <= high:
-            raise DeviceError(
-                self.name,
-                f"position {position:.6g} m is outside of its calibrated range {low:g} to {high:g} m; "
-                "bring the actuator back or extend the calibration and `position_limits`",
-            )
+        text = f"position {position:.6g} m is outside of its calibrated range"
+        advice = "bring the actuator back or extend the calibration and `position_limits`"
+        self._check_range(text, position, settings.position_limits, "m", advice)
         return {f"{self.name}_position": position}
 
     def _from_currents(self, first: float, second: float) -> float:

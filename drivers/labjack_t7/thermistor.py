@@ -110,13 +110,9 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
                 "excitation; check its wires for a short circuit",
             )
         temperature = _celsius(settings.steinhart_hart, settings.reference_ohms * share / (1 - share))
-        lowest, highest = settings.temperature_limits
-        if not lowest <= temperature <= highest:
-            raise DeviceError(
-                self.name,
-                f"temperature {temperature:.4g} °C is outside of {lowest:g} to {highest:g} °C; bring it back, or "
-                "check the thermistor and `temperature_limits`",
-            )
+        text = f"temperature {temperature:.4g} °C is outside of"
+        advice = "bring it back, or check the thermistor and `temperature_limits`"
+        self._check_range(text, temperature, settings.temperature_limits, "°C", advice)
         return {f"{self.name}_temperature": temperature}
 
 

@@ -21,7 +21,7 @@ from pydantic import Field, field_validator
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.device import RecoverableDevice, attempt
+from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, TECLineSettings, decode, encode, single
 
@@ -91,13 +91,7 @@ class TECSettings(TECLineSettings):
         gt=0.0, le=10.0, description="highest current of either sign, A; a TEC-1091 gives 4, a TEC-1089 10"
     )
     voltage_limit: float = Field(gt=0.0, le=21.0, description="highest voltage of either sign, V")
-    watchdog: float = Field(
-        default=5.0,
-        ge=0.0,
-        le=600.0,
-        description="silence of the host after which the device switches its output off, s: 0.1 to 600, 0 for "
-        "never; must exceed the longest pause between two readings, which is 2 s in a long hold",
-    )
+    watchdog: float = watchdog_field(5.0, 600.0, "the device switches its output off, s: 0.1 to 600, 0 for never")
     stable_window: float = Field(
         default=0.1, gt=0.0, le=50.0, description="deviation that counts as having arrived, K"
     )
@@ -299,7 +293,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             ("stable_window", _STABLE_WINDOW, settings.stable_window),
             ("stable_time", _STABLE_TIME, settings.stable_time),
         ):
-            self._check_range(key, parameter, value)
+            self._check_allowed(key, parameter, value)
         self._polarity = 1 if self._read(_POLARITY) else -1
         self._write(_SAVING_OFF, 1)
         self._write(_LIVE_ENABLED, _OFF)
@@ -315,7 +309,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._write(_WATCHDOG, 0.0)
         self._setpoint = math.nan
 
-    def _check_range(self, key: str, parameter: Parameter, value: float) -> None:
+    def _check_allowed(self, key: str, parameter: Parameter, value: float) -> None:
         lowest, highest = self._range(parameter)
         if not lowest <= single(value) <= highest:
             raise ConfigurationError(

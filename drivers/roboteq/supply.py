@@ -36,7 +36,7 @@ from pydantic import Field, model_validator
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status, VoltageSupply
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.device import RecoverableDevice, attempt
+from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine, NodeSettings, described
 
 DEVICE_TYPE = 0x000F0191
@@ -100,18 +100,11 @@ class SupplySettings(NodeSettings):
     voltage_limits: tuple[float, float] = Field(
         description="lowest and highest set-point, V, within -60 to 60 and around 0; rms from 0"
     )
-    watchdog: float = Field(
-        default=1.0,
-        ge=0.0,
-        le=65.0,
-        description="silence of the host after which the controller drops its output, s, as set in it by ^RWD "
-        "(which is in ms): 0.001 to 65, 0 for never; must exceed the longest pause between two readings",
+    watchdog: float = watchdog_field(
+        1.0, 65.0, "the controller drops its output, s, as set in it by ^RWD (in ms): 0.001 to 65, 0 for never"
     )
     heartbeat: float = Field(
-        default=0.5,
-        ge=0.03,
-        le=60.0,
-        description="age of the last heartbeat beyond which the controller counts as lost, s",
+        default=0.5, ge=0.03, le=60.0, description="age of the last heartbeat after which the controller is lost, s"
     )
 
     @model_validator(mode="after")
