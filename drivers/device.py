@@ -135,7 +135,7 @@ class LineActuator(LineDevice[SettingsT, LineT], Actuator):
 
     @property
     def setpoint(self) -> float:
-        """The set-point that was last sent, in the unit of `limits`; nan before the first, 0 after the safe state."""
+        """The set-point that was last sent, in the unit of `limits`; nan before the first."""
         return self._setpoint
 
     def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:

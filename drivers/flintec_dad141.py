@@ -4,7 +4,7 @@ Sources: Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3, for 
 Technical Manual, Rev 2.5, 10.1 (identity), 10.4 (filters) and 10.5 (taring); MODBUS over Serial Line,
 Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
 
-The instrument is calibrated at its own keys, for a weight in a unit of the user's; the settings convert that to
+The instrument is calibrated at its own keys, for a weight in a unit that the user chose; the settings convert it to
 newtons. Nothing is saved in its EEPROM: a power cycle restores the previous filter and tare.
 
 Assumptions: register 0x202C holds the 1410 that the command ID returns, as a number or digit by digit; the first
@@ -87,8 +87,7 @@ class DAD141Settings(SerialSettings):
         default=None,
         ge=0.0,
         le=1.0,
-        description="silence between a reply and the next request in s, 0 to 1; unless given, the 3.5 characters "
-        "that Modbus asks for, or 1.75 ms above 19200 Bd",
+        description="pause before a request, s; default 3.5 characters, at least 1.75 ms",
     )
     filter: int = Field(
         default=3, ge=0, le=7, description="low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1, 0.5 Hz"
@@ -105,7 +104,7 @@ class DAD141Settings(SerialSettings):
         default=0.0, description="calibration: force in N at which the gross weight reads zero"
     )
     force_limits: tuple[float, float] = Field(
-        description="calibrated range in N, low and high; a gross force beyond, whatever the tare, is an error"
+        description="calibrated range in N, low and high; a gross force beyond, with any tare, is an error"
     )
     keep_tare: bool = Field(
         default=False, description="whether a tare found on connecting stays; otherwise it is reset"
@@ -543,7 +542,7 @@ def _integer(words: Sequence[int]) -> int:
 
 
 def _frame_pause(settings: DAD141Settings) -> float:
-    """Return the silence between frames in s."""
+    """Return the silence between frames in s; by default the 3.5 characters of Modbus, 1.75 ms above 19200 Bd."""
     if settings.pause is not None:
         return settings.pause
     if settings.baudrate > _FAST_LINE:

@@ -215,7 +215,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         )
 
     def _went_off(self) -> DeviceError:
-        """Bring everything into the safe state, and return what is known of the cause."""
+        """Bring everything into the safe state, and return the error with its probable cause."""
         self._setpoint = 0.0
         if self._output.is_on:
             cause = (

@@ -106,7 +106,7 @@ class DigitalOutput:
 
     @property
     def is_on(self) -> bool:
-        """Whether the level of the line is the one that is on, as the instrument says now."""
+        """Whether the level of the line is the one that is on, as the instrument reports now."""
         return bool(self._instrument.read_integer(DIO_STATE) & self._bit) == self._active_high
 
     def switch(self, on: bool) -> None:
@@ -137,7 +137,7 @@ class DigitalOutput:
 
     @property
     def watchdog(self) -> int:
-        """The time of the watchdog in s, as the instrument says now."""
+        """The time of the watchdog in s, as the instrument reports now."""
         return self._instrument.read_integer(WATCHDOG_TIMEOUT_S)
 
     def guard(self, seconds: int) -> None:

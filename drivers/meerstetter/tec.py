@@ -207,7 +207,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             self._polarity * self._read(_CURRENT),
             self._polarity * self._read(_VOLTAGE),
         )
-        # Read last: an error that comes up while the values are read spoils them, too.
+        # Read last: an error that comes up while the values are read invalidates them, too.
         self._check()
         if not all(map(math.isfinite, values)):
             raise DeviceError(self.name, "reports a value that is not a number; check the sensors")

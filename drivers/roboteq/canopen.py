@@ -101,8 +101,8 @@ class AbortedError(Exception):
 class SlcanAdapter(slcanBus):
     """python-can's slcan adapter, reading what has arrived rather than byte by byte.
 
-    The port's own timeout is the only wait, so that it is also the port's that decides which clock it takes.
-    An empty read is the silence of the whole timeout.
+    The only wait is the port's own timeout, so the port decides which clock it uses. An empty read means silence
+    for the whole timeout.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class SlcanAdapter(slcanBus):
         return frames
 
     def release(self) -> None:
-        """Close the channel and the port, whatever state they are in."""
+        """Close the channel and the port, in any state."""
         with suppress(CanError, serial.SerialException, OSError):
             self.shutdown()
         self._abandon()
@@ -338,7 +338,7 @@ def described(item: Entry, sub: int) -> str:
 
 
 def _cause(error: BaseException) -> BaseException:
-    """Return what python-can's errors were raised for."""
+    """Return the original cause of an error of python-can."""
     while error.__cause__ is not None:
         error = error.__cause__
     return error

@@ -1,12 +1,10 @@
-"""Driver of the Roboteq brushed motor controllers (SDC2160, SDC3260 and their family) as PWM voltage supplies.
+"""The Roboteq brushed motor controllers (SDC2160, SDC3260 and their family) as PWM voltage supplies.
 
-CANopen through an slcan adapter. Sources: Roboteq CANBus Networking Manual V2.0 (objects, types, scales; its
-SDO examples leave the bits e and s of the command byte clear, the device takes the standard ones that are used
-here), the electronic data sheet `roboteq_motor_controllers_v60.eds` (communication objects), Roboteq Advanced
-Digital Motor Controller User Manual V1.8 (watchdog `RWD`, emergency stop), CiA 301 (SDO, abort codes,
-heartbeat).
+Sources: Roboteq CANBus Networking Manual V2.0 (objects, types, scales), the electronic data sheet
+`roboteq_motor_controllers_v60.eds` (communication objects), Roboteq Advanced Digital Motor Controller User Manual
+V1.8 (watchdog `RWD`, emergency stop).
 
-The duty cycle of the output is D = command / 1000. Which voltage that is, depends on what is connected:
+The duty cycle of the output is D = command / 1000. The voltage depends on the load:
 
 - `output = "average"`: behind an LC filter the load sees the average, D · Vbus.
 - `output = "rms"`: without a filter a resistive load is heated as by the RMS voltage, Vbus · √D. One step of
@@ -17,7 +15,7 @@ Vbus is the battery voltage that the device measures (object 0x210D, resolution 
 set-point and every measurement, and the command follows it when it has moved by more than the last digit, so
 that the flicker of that digit does not reach the load.
 
-Once, over USB and with the maker's software, the bench builder sets the node, the bit rate, `^RWD` (watchdog),
+The bench builder sets these once, over USB and with the maker's software: the node, the bit rate, `^RWD` (watchdog),
 `^MXPF` (highest power) and `^ALIM` (highest current); CANopen has no objects for them.
 """
 
@@ -36,7 +34,7 @@ from pydantic import Field, model_validator
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status, VoltageSupply
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from drivers.device import RecoverableDevice, attempt, watchdog_field
+from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine, NodeSettings, described
 
 DEVICE_TYPE = 0x000F0191
@@ -100,8 +98,12 @@ class SupplySettings(NodeSettings):
     voltage_limits: tuple[float, float] = Field(
         description="lowest and highest set-point, V, within -60 to 60 and around 0; rms from 0"
     )
-    watchdog: float = watchdog_field(
-        1.0, 65.0, "the controller drops its output, s, as set in it by ^RWD (in ms): 0.001 to 65, 0 for never"
+    watchdog: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=65.0,
+        description="silence of the host after which the controller drops its output, s, as set in it by ^RWD "
+        "(which is in ms): 0.001 to 65, 0 for never; must exceed the longest pause between two readings",
     )
     heartbeat: float = Field(
         default=0.5, ge=0.03, le=60.0, description="age of the last heartbeat after which the controller is lost, s"
@@ -126,8 +128,8 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     its output by itself. Only commands feed the watchdog, queries do not (User Manual V1.8 says so of the
     serial commands; that CANopen is alike is an assumption). So `measure` and `glance` send the command again;
     while a voltage is held, ask for readings more often than the watchdog is long. After a longer gap the next
-    command would resume the power of before: the driver sends 0 first, and the reading that comes too late raises
-    `DeviceError`, as the voltage was not held.
+    command would resume the previous power: the driver sends 0 first, and the reading that comes too late raises
+    `DeviceError`, as the voltage was not held. The set-point is 0 after the output was dropped.
 
     The current is the one that the controller reports, with its resolution of 0.1 A; of what it is the mean within
     a PWM period is not documented.
@@ -397,7 +399,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         now, watchdog = self._clock.now(), self._settings.watchdog
         self._write(_COMMAND, command, self._settings.channel)
         if command and self._clock.now() - self._commanded_at >= watchdog > 0.0:
-            # It had to be sent again, and may have come late enough to resume the power of before.
+            # It had to be sent again, and may have come late enough to resume the previous power.
             now = self._clock.now()
             self._write(_COMMAND, command, self._settings.channel)
         self._commanded_at = now
