@@ -87,7 +87,7 @@ class DAD141Settings(SerialSettings):
         default=None,
         ge=0.0,
         le=1.0,
-        description="pause before a request, s; default 3.5 characters, at least 1.75 ms",
+        description="silence before a request, s: 0 to 1; unless given, 3.5 characters, or 1.75 ms above 19200 Bd",
     )
     filter: int = Field(
         default=3, ge=0, le=7, description="low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1, 0.5 Hz"
