@@ -21,7 +21,8 @@ from drivers.labjack_t7 import (
     T7Switch,
     T7Thermistor,
 )
-from sim_devices.instruments.labjack_t7 import EmulatedT7, PiezoAmplifier
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
 from sim_devices.world import World
 

@@ -1,0 +1,50 @@
+"""An optical displacement sensor with a voltage output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+
+class DisplacementSensor:
+    """An optical displacement sensor with a voltage in proportion to the displacement.
+
+    Parameters
+    ----------
+    displacement : callable
+        The displacement in m, from the plant.
+    volts_per_metre : float
+        Sensitivity in V/m.
+    reach : float
+        Displacement of either sign in m beyond which the output stays where it is.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the displacement, in m.
+    rng : numpy.random.Generator
+        Source of the noise.
+    """
+
+    def __init__(
+        self,
+        displacement: Callable[[], float],
+        volts_per_metre: float = 5e4,
+        reach: float = 200e-6,
+        noise: float = 10e-9,
+        resolution: float = 10e-9,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self._displacement = displacement
+        self._volts_per_metre = volts_per_metre
+        self._reach = reach
+        self._noise = noise
+        self._resolution = resolution
+        self._rng = rng
+
+    def __call__(self) -> float:
+        """Return the voltage in V at this instant."""
+        noisy = self._displacement() + self._noise * self._rng.standard_normal()
+        shown = round(noisy / self._resolution) * self._resolution
+        return self._volts_per_metre * min(max(shown, -self._reach), self._reach)

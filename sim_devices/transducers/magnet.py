@@ -1,0 +1,63 @@
+"""A linear magnet sensor with a ratiometric output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+
+class RatiometricSensor:
+    """A linear magnet sensor, of the kind of the SPS-L035-LATS, whose output is a share of its supply.
+
+    Assumption: the output goes from 10 to 90 % of a supply of 5 V over the stroke, and stays at its end for a
+    magnet that is beyond it.
+
+    Parameters
+    ----------
+    position : callable
+        The position of the magnet in m, counted from the start of the stroke, from the plant.
+    stroke : float
+        Stroke in m.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the position, in m.
+    supply_error : float
+        How far the supply of one instance is from 5 V, in V rms; drawn once.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the supply.
+
+    Attributes
+    ----------
+    supply_volts : float
+        Voltage of the supply in V; for faults and drift.
+    """
+
+    def __init__(
+        self,
+        position: Callable[[], float],
+        stroke: float = 0.035,
+        noise: float = 0.01e-3,
+        resolution: float = 0.04e-3,
+        supply_error: float = 20e-3,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self.supply_volts = 5.0 + supply_error * rng.standard_normal()
+        self._position = position
+        self._stroke = stroke
+        self._noise = noise
+        self._resolution = resolution
+        self._rng = rng
+
+    def output(self) -> float:
+        """Return the output voltage in V at this instant."""
+        noisy = self._position() + self._noise * self._rng.standard_normal()
+        step = round(noisy / self._resolution) * self._resolution
+        share = min(max(step / self._stroke, 0.0), 1.0)
+        return self.supply_volts * (0.1 + 0.8 * share)
+
+    def supply(self) -> float:
+        """Return the voltage in V of the supply at this instant."""
+        return self.supply_volts

@@ -1,0 +1,84 @@
+"""An NTC thermistor in a voltage divider (Steinhart and Hart 1968, Deep-Sea Research 15)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+_KELVIN = 273.15
+
+STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
+"""A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
+
+
+class Thermistor:
+    """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
+
+    Assumptions: no self-heating, an exact reference resistor.
+
+    Parameters
+    ----------
+    temperature : callable
+        The temperature in °C, from the plant.
+    reference_ohms : float
+        Reference resistor in Ω.
+    steinhart_hart : tuple of float
+        A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive.
+    excitation_volts : float
+        Excitation in V.
+    excitation_error : float
+        How far the excitation of one instance is from that, in V rms; drawn once.
+    noise : float
+        White noise in K rms, drawn anew for every conversion; zero or positive.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the excitation.
+
+    Attributes
+    ----------
+    excitation_volts : float
+        Voltage of the excitation in V; for faults and drift.
+    open, shorted : bool
+        Whether a wire of the thermistor is broken, or its wires touch; for faults.
+    """
+
+    def __init__(
+        self,
+        temperature: Callable[[], float],
+        reference_ohms: float = 10e3,
+        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
+        excitation_volts: float = 2.5,
+        excitation_error: float = 10e-3,
+        noise: float = 0.02,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        self.excitation_volts = excitation_volts + excitation_error * rng.standard_normal()
+        self.open = False
+        self.shorted = False
+        self._temperature = temperature
+        self._reference = reference_ohms
+        self._steinhart_hart = steinhart_hart
+        self._noise = noise
+        self._rng = rng
+
+    def divider(self) -> float:
+        """Return the voltage in V at the input of the divider at this instant."""
+        if self.shorted:
+            return 0.0
+        if self.open:
+            return self.excitation_volts
+        ohms = self._ohms(self._temperature() + self._noise * self._rng.standard_normal())
+        return self.excitation_volts * ohms / (ohms + self._reference)
+
+    def excitation(self) -> float:
+        """Return the voltage in V of the excitation at this instant."""
+        return self.excitation_volts
+
+    def _ohms(self, celsius: float) -> float:
+        """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
+        a, b, c = self._steinhart_hart
+        half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
+        root = math.sqrt((b / (3 * c)) ** 3 + half**2)
+        return math.exp(math.cbrt(root - half) - math.cbrt(root + half))
