@@ -20,7 +20,9 @@ from bench.clock import Clock
 from bench.errors import ConfigurationError
 from bench.rig import LaboratorySettings
 from sim_devices import protocol_emulated
-from sim_devices.instruments.dynamixel import COUNT, EmulatedDrum, EmulatedMX28, HardwareError
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_drum import EmulatedDrum
+from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq

@@ -60,7 +60,7 @@ class EmulatedDevice(Device):
     def close(self) -> None:
         """Do nothing: there is no line."""
 
-    def _noise(self, deviation: float) -> float:
+    def _draw(self, deviation: float) -> float:
         """Draw from a normal distribution of a standard deviation."""
         return 0.0 if self._rng is None else deviation * float(self._rng.standard_normal())
 

@@ -19,7 +19,8 @@ from __future__ import annotations
 import re
 import struct
 
-from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState, TransferAbortedError
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState
 
 LONGEST_LINE = 64
 """Characters after which a line without an end is dropped; the longest real one has 26."""
@@ -166,10 +167,10 @@ class SdoServer:
                 return self._upload()
             if specifier == 3:
                 return self._segment(command)
-            raise TransferAbortedError(AbortCode.COMMAND)
-        except TransferAbortedError as error:
+            raise RequestRefusedError(AbortCode.COMMAND)
+        except RequestRefusedError as error:
             self._text = None
-            return b"\x80" + self._multiplexer + struct.pack("<I", error.code)
+            return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
 
     def _object(self) -> tuple[int, int]:
         return int.from_bytes(self._multiplexer[:2], "little"), self._multiplexer[2]
@@ -178,15 +179,15 @@ class SdoServer:
         index, sub = self._object()
         row = self._device.entry(index, sub)
         if not row.writable:
-            raise TransferAbortedError(AbortCode.READ_ONLY)
+            raise RequestRefusedError(AbortCode.READ_ONLY)
         expedited, sized = bool(command & 2), bool(command & 1)
         if not expedited and sized:
-            raise TransferAbortedError(AbortCode.UNSUPPORTED)
+            raise RequestRefusedError(AbortCode.UNSUPPORTED)
         form = _FORMATS[row.kind]
         size = struct.calcsize(form)
         # Without the bit s the size is not said; the simplified form of the maker says it all the same.
         if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
-            raise TransferAbortedError(AbortCode.LENGTH)
+            raise RequestRefusedError(AbortCode.LENGTH)
         value: int = struct.unpack(form, data[:size])[0]
         self._device.write_object(index, value, sub)
         return b"\x60" + self._multiplexer + bytes(4)
@@ -202,9 +203,9 @@ class SdoServer:
 
     def _segment(self, command: int) -> bytes:
         if self._text is None:
-            raise TransferAbortedError(AbortCode.COMMAND)
+            raise RequestRefusedError(AbortCode.COMMAND)
         if command >> 4 & 1 != self._toggle:
-            raise TransferAbortedError(AbortCode.TOGGLE)
+            raise RequestRefusedError(AbortCode.TOGGLE)
         part, rest = self._text[:_SEGMENT], self._text[_SEGMENT:]
         head = self._toggle << 4 | (_SEGMENT - len(part)) << 1 | (not rest)
         self._toggle ^= 1

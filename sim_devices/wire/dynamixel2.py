@@ -21,12 +21,9 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
 
-from sim_devices.instruments.dynamixel import (
-    LOWEST_FIRMWARE_THAT_CLEARS,
-    EmulatedMX28,
-    ErrorNumber,
-    RequestRefusedError,
-)
+from sim_devices.instruments.dynamixel import LOWEST_FIRMWARE_THAT_CLEARS, EmulatedMX28
+from sim_devices.instruments.dynamixel_table import ErrorNumber
+from sim_devices.instruments.emulated import RequestRefusedError
 
 LONGEST_FRAME = 1024
 """Bytes beyond which what looks like a packet is taken for noise; it is the longest of the maker's software."""

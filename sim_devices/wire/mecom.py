@@ -22,7 +22,9 @@ import re
 import struct
 from binascii import crc_hqx
 
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC, Parameter, RequestRefusedError, ServerError
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.meerstetter_table import Parameter, ServerError
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 
 LONGEST_FRAME = 512
 """Characters after which a frame without an end is dropped; the longest real one is about half of it."""

@@ -552,7 +552,7 @@ def test_bluesky_finds_its_protocols(bench):
 
 
 @over_the_wire
-@pytest.mark.parametrize("fault", ["damage_next_answer", "drop_next_answer"])
+@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
 def test_spoilt_answer_is_asked_for_again(bench, output, fault):
     def set_and_wait():
         bench.device.set(5.0).wait()
