@@ -30,7 +30,8 @@ from sim_devices.instruments.t7_roles import (
     EmulatedPositionSensor,
     EmulatedTemperatureSensor,
 )
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import Thermistor

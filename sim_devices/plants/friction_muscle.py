@@ -10,13 +10,14 @@ pressures in bar and temperatures in °C; `MuscleParameters` and the muscles' co
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants.grid import NotNegative, PlantParameters, Seed, fluctuation
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, MILLIMETRE, PLACE, VOLTAGE, Muscle
 
 # What drives the muscle.
@@ -496,7 +497,7 @@ def advance_steps(
 
 
 @dataclass(frozen=True, kw_only=True)
-class MuscleParameters:
+class MuscleParameters(PlantParameters):
     """Numbers that both muscles have; the defaults are theirs.
 
     Attributes
@@ -528,13 +529,13 @@ class MuscleParameters:
     """
 
     contact_count: int = 40
-    specimen_seed: int = 2017
+    specimen_seed: Seed = 2017
     contact_stiffness: float
-    contact_spread: float
+    contact_spread: NotNegative
     rest_length: float
     series_stiffness: float = 20e3
     force_limit: float
-    pretension: float = 0.3
+    pretension: NotNegative = 0.3
     step: float = 0.1
     force_step: float = 0.1
     length_step: float = 0.1e-3
@@ -542,21 +543,8 @@ class MuscleParameters:
     maximum_voltage: float = 5.0
     resistance: float
 
-    # Parameters besides those listed that may be zero.
-    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ()
-    # Parameters that may have either sign.
-    _SIGNED: ClassVar[tuple[str, ...]] = ()
-
     def __post_init__(self) -> None:
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{name} must be finite, not {value}")
-            if name in ("contact_spread", "pretension", "specimen_seed", *self._NOT_NEGATIVE):
-                if not value >= 0:
-                    raise ValueError(f"{name} must not be negative, not {value}")
-            elif name not in self._SIGNED and not value > 0:
-                raise ValueError(f"{name} must be positive, not {value}")
+        super().__post_init__()
         if not self.pretension <= self.force_limit:
             raise ValueError(f"pretension must not exceed {self.force_limit:.4g} N, not {self.pretension} N")
         if not self.rated_voltage <= self.maximum_voltage:
@@ -585,8 +573,16 @@ def contact_table(parameters: MuscleParameters) -> Floats:
     return np.array([stiffness, weight / weight.sum(), share / share.mean()])
 
 
-def shared_coefficients(parameters: MuscleParameters) -> dict[int, float]:
-    """Return the coefficients that do not depend on the kind of muscle, by place."""
+def shared_coefficients(parameters: MuscleParameters, deviation: float, time: float) -> dict[int, float]:
+    """Return the coefficients that do not depend on the kind of muscle, by place.
+
+    Parameters
+    ----------
+    parameters : MuscleParameters
+        The numbers.
+    deviation, time : float
+        Standard deviation (bar or K) and correlation time (s) of supply or room.
+    """
     p = parameters
     values = dict.fromkeys(range(COEFFICIENT_SIZE), 0.0)
     values[STEP] = p.step
@@ -596,10 +592,14 @@ def shared_coefficients(parameters: MuscleParameters) -> dict[int, float]:
     values[FORCE_STEP] = p.force_step
     values[LENGTH_STEP] = p.length_step / MILLIMETRE
     values[ARM_TIME] = 1.0
+    values[OFFSET_DECAY], values[OFFSET_KICK] = fluctuation(deviation, time, p.step)
     return values
 
 
-class FrictionMuscle(Muscle):
+M = TypeVar("M", bound=MuscleParameters)
+
+
+class FrictionMuscle(Muscle[M]):
     """A muscle with dry contacts, driven by pressure or temperature, that carries a load or is held.
 
     Each contact is a spring behind a slider (Iwan, Journal of Applied Mechanics 33, 1966): its force follows the
@@ -621,14 +621,14 @@ class FrictionMuscle(Muscle):
 
     def __init__(
         self,
-        parameters: MuscleParameters,
+        parameters: M,
         coefficients: dict[int, float],
         cold: float,
         rated: float,
         rng: np.random.Generator,
     ) -> None:
         super().__init__(
-            parameters.step,
+            parameters,
             rng,
             maximum_voltage=parameters.maximum_voltage,
             resistance=parameters.resistance,

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from sim_devices.plants import friction_muscle as kernels
 from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.grid import NotNegative
 from sim_devices.plants.muscle import MILLIMETRE
 
 _BAR = 1e5
@@ -81,30 +81,19 @@ class McKibbenParameters(MuscleParameters):
     thread_length: float = 131e-3
     turns: float = 3.5
     bladder_stiffness: float = 300.0
-    bladder_cube: float = 0.12e6
-    jam: float = 0.22e6
-    friction: float = 0.2
-    friction_coefficient: float = 0.0025
-    friction_jam: float = 0.08
-    slip: float = 1.5e-8
+    bladder_cube: NotNegative = 0.12e6
+    jam: NotNegative = 0.22e6
+    friction: NotNegative = 0.2
+    friction_coefficient: NotNegative = 0.0025
+    friction_jam: NotNegative = 0.08
+    slip: NotNegative = 1.5e-8
     pressure_gain: float = 0.5e5
-    pressure_band: float = 1.25e3
+    pressure_band: NotNegative = 1.25e3
     time_constant: float = 0.3
     exhaust_time_constant: float = 0.1
     pressure_step: float = 2e3
-    supply_sd: float = 0.0
+    supply_sd: NotNegative = 0.0
     supply_time: float = 10.0
-
-    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = (
-        "bladder_cube",
-        "jam",
-        "friction",
-        "friction_coefficient",
-        "friction_jam",
-        "slip",
-        "pressure_band",
-        "supply_sd",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,34 +119,7 @@ class McKibbenParameters(MuscleParameters):
         return math.pi * self.braid_diameter * self.rest_length
 
 
-class McKibbenSnapshot(NamedTuple):
-    """Every output of the plant at one instant.
-
-    Attributes
-    ----------
-    pressure : float
-        Gauge pressure in the muscle, Pa.
-    voltage : float
-        Voltage that sets the regulator, V.
-    current : float
-        Current into the regulator's input, A.
-    force : float
-        Tension of the muscle, N.
-    length : float
-        Elongation of the muscle from its resting length, m; contraction is negative.
-    position : float
-        Position of the moving end, m: elongation of muscle, frame and load cell.
-    """
-
-    pressure: float
-    voltage: float
-    current: float
-    force: float
-    length: float
-    position: float
-
-
-class McKibbenMuscle(FrictionMuscle):
+class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
     """Length and force of a braided pneumatic muscle, advanced in time.
 
     At gauge pressure p and braid length L the tension is::
@@ -182,46 +144,29 @@ class McKibbenMuscle(FrictionMuscle):
         The session's randomness: the regulator's supply. The plant spawns its own generator from it.
     """
 
+    OUTPUTS = ("pressure", "voltage", "current", "force", "length", "position")
+
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
-        self._parameters = parameters
         rated = parameters.pressure_gain * parameters.rated_voltage / _BAR
         super().__init__(parameters, _coefficients(parameters), 0.0, rated, rng)
         self._state[kernels.OFFSET] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
-
-    @property
-    def parameters(self) -> McKibbenParameters:
-        """The numbers of this plant."""
-        return self._parameters
 
     @property
     def pressure(self) -> float:
         """Gauge pressure in the muscle, Pa; 1.5 bar at 3 V."""
         return float(self._state[kernels.DRIVE] * _BAR)
 
-    def snapshot(self) -> McKibbenSnapshot:
-        """Take all outputs at the present instant.
-
-        Returns
-        -------
-        McKibbenSnapshot
-            The outputs.
-        """
-        return McKibbenSnapshot._make(getattr(self, name) for name in McKibbenSnapshot._fields)
-
 
 def _coefficients(parameters: McKibbenParameters) -> dict[int, float]:
     """Prepare the numbers that the compiled loops need every step."""
     p = parameters
-    supply_decay = math.exp(-p.step / p.supply_time)
-    return kernels.shared_coefficients(p) | {
+    return kernels.shared_coefficients(p, p.supply_sd / _BAR, p.supply_time) | {
         kernels.KIND: kernels.PNEUMATIC,
         kernels.DRIVE_STEP: p.pressure_step / _BAR,
         kernels.GAIN: p.pressure_gain / _BAR,
         kernels.BAND: p.pressure_band / _BAR,
         kernels.DECAY: math.exp(-p.step / p.time_constant),
         kernels.FAN_DECAY: math.exp(-p.step / p.exhaust_time_constant),
-        kernels.OFFSET_DECAY: supply_decay,
-        kernels.OFFSET_KICK: p.supply_sd / _BAR * math.sqrt(1.0 - supply_decay**2),
         kernels.FRICTION: p.friction,
         kernels.FRICTION_STRETCH: p.friction_jam,
         kernels.FRICTION_DRIVE: p.friction_coefficient * p.braid_surface * _BAR,

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from sim_devices.plants.hybrid_parameters import HybridParameters
 
 from bench.clock import Stopwatch
 from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
 
 pytestmark = pytest.mark.benchmark
 

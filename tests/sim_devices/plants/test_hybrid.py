@@ -8,19 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
-
-from bench.clock import VirtualClock
-from bench.devices import TECMode
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.hybrid import (
+from sim_devices.plants.hybrid_parameters import (
     Bimorph,
-    HybridCantilever,
     HybridParameters,
     piezo_dynamics,
     piezo_sensitivity,
     thermal_sensitivity,
 )
+
+from bench.clock import VirtualClock
+from bench.devices import TECMode
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.plants import _hybrid_kernels as kernels
+from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.world import World
 
 LIVELY = HybridParameters()
