@@ -135,7 +135,7 @@ class GridPlant(ABC, Generic[P]):
 
 @cache
 def _snapshot_type(names: tuple[str, ...]) -> type[tuple[float, ...]]:
-    return namedtuple("Snapshot", names)  # type: ignore[misc]  # the names are known at run time only
+    return namedtuple("Snapshot", names)  # the names are known at run time only
 
 
 def fluctuation(deviation: float, time: float, step: float) -> tuple[float, float]:
