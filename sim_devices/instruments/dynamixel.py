@@ -102,10 +102,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The time of the emulated laboratory; the servo enters its own deadlines there.
+    name, world
+        See `EmulatedDevice`.
     load : ShaftLoad, optional
         What hangs on the shaft; without it the shaft is free.
     bus_id : int

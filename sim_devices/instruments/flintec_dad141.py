@@ -101,10 +101,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The laboratory that the instrument stands in.
+    name, world
+        See `EmulatedDevice`.
     force : callable
         The force on the cell in N, positive in tension, from the plant.
     rng : numpy.random.Generator

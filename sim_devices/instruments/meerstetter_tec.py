@@ -97,10 +97,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The time of the emulated laboratory; the instrument enters its own deadlines there.
+    name, world
+        See `EmulatedDevice`.
     load : PeltierLoad
         The plant's Peltier element.
     serial_number : int

@@ -181,10 +181,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The time of the emulated laboratory; the instrument enters its own deadlines there.
+    name, world
+        See `EmulatedDevice`.
     load : HeatingLoad
         What is heated.
     output : {"average", "rms"}

@@ -116,10 +116,8 @@ class EmulatedPositionSensor(_T7Reader, PositionSensor):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here.
+    name, instrument
+        See `_T7Reader`.
     readout : {"voltage", "currents", "ratiometric"}
         One normalised voltage, two amplified photocurrents, or an output that is a share of its supply.
     channels : sequence of int
@@ -134,8 +132,6 @@ class EmulatedPositionSensor(_T7Reader, PositionSensor):
 
     Raises
     ------
-    RegisterError
-        If the instrument refuses a setting.
     ValueError
         If the number of channels does not fit the readout.
     """
@@ -194,10 +190,8 @@ class EmulatedTemperatureSensor(_T7Reader, TemperatureSensor):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here.
+    name, instrument
+        See `_T7Reader`.
     channels : tuple of int
         Inputs of a thermistor's divider and of its excitation, 0 to 13.
     """
@@ -226,10 +220,8 @@ class EmulatedSwitch(_T7Device, Switch):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its line is switched off and put under its watchdog here.
+    name, instrument
+        See `_T7Device`; the line is switched off and put under the watchdog here.
     line : int
         Number of the line, 0 to 22.
     active_high : bool
@@ -300,10 +292,8 @@ class EmulatedHighVoltageSupply(_T7Reader, VoltageSupply):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here, its line is switched off and put under its watchdog.
+    name, instrument
+        See `_T7Reader`; the line is switched off and put under the watchdog here.
     line, watchdog
         Line of the enable input, as those of `EmulatedSwitch`.
     channels : tuple of int

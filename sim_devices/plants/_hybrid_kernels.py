@@ -9,6 +9,7 @@ everything else is in SI units, and a positive current heats the beam.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -86,6 +87,28 @@ FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
 Floats = NDArray[np.float64]
 
 
+class Thermal(NamedTuple):
+    """All numbers of the thermal part; the first three and the factors are changed in place.
+
+    Attributes
+    ----------
+    rise : ndarray
+        Node temperatures, K.
+    increment : ndarray
+        Change of them over the latest step that is known, K.
+    state, command, c, nodes, factors : ndarray
+        State, commands, coefficients, node table and factorised matrix.
+    """
+
+    rise: Floats
+    increment: Floats
+    state: Floats
+    command: Floats
+    c: Floats
+    nodes: Floats
+    factors: Floats
+
+
 @njit(cache=True)
 def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bool:
     """Set room temperature and current for the step that begins here.
@@ -153,9 +176,7 @@ def factorise(current: float, c: Floats, nodes: Floats, factors: Floats) -> None
 
 
 @njit(cache=True)
-def look_ahead(
-    rise: Floats, increment: Floats, state: Floats, command: Floats, c: Floats, nodes: Floats, factors: Floats
-) -> None:
+def look_ahead(thermal: Thermal) -> None:
     """Find the change of the temperatures over the step that begins here.
 
     The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
@@ -164,13 +185,10 @@ def look_ahead(
 
     Parameters
     ----------
-    rise : ndarray
-        Node temperatures, K.
-    increment : ndarray
-        On entry the change over the step before, on return that over this one, K.
-    state, command, c, nodes, factors : ndarray
-        See the functions above; `state` and `factors` are changed in place.
+    thermal : Thermal
+        On entry with the increment over the step before, on return with that over this one.
     """
+    rise, increment, state, command, c, nodes, factors = thermal
     saturated = take_commands(rise, state, command, c)
     if command[CLOSED] != 0.0:
         error = command[TARGET] - rise[FACE]
@@ -211,17 +229,7 @@ def look_ahead(
 
 
 @njit(cache=True)
-def advance_steps(
-    normals: Floats,
-    ahead: bool,
-    rise: Floats,
-    increment: Floats,
-    state: Floats,
-    command: Floats,
-    c: Floats,
-    nodes: Floats,
-    factors: Floats,
-) -> None:
+def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
     """Complete one grid step for each of `normals`.
 
     Parameters
@@ -230,12 +238,13 @@ def advance_steps(
         Standard normal numbers, one a step, for the room.
     ahead : bool
         Whether the first step's change is already known.
-    rise, increment, state, command, c, nodes, factors : ndarray
-        See `look_ahead`; the first three and `factors` are changed in place.
+    thermal : Thermal
+        See `look_ahead`.
     """
+    rise, increment, state, command, c, _, _ = thermal
     for row in range(normals.size):
         if not ahead:
-            look_ahead(rise, increment, state, command, c, nodes, factors)
+            look_ahead(thermal)
         ahead = False
         for j in range(NODES):
             rise[j] += increment[j]

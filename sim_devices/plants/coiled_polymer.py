@@ -20,8 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
 from sim_devices.plants.grid import NotNegative, Signed, check_temperature
 from sim_devices.plants.muscle import MILLIMETRE
 
@@ -142,44 +141,46 @@ class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
         room = parameters.ambient_temperature
         super().__init__(parameters, _coefficients(parameters), room, room + parameters.rise, rng)
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
-        self._state[kernels.OFFSET] = offset
+        self._state["offset"] = offset
         self._drive(room + offset, clamped=False)
 
     @property
     def temperature(self) -> float:
         """Temperature of the muscle, °C; 120 °C at 3 V."""
-        return float(self._state[kernels.DRIVE])
+        return float(self._state["drive"])
 
     @property
     def ambient_temperature(self) -> float:
         """Temperature of the room, °C."""
-        return float(self._parameters.ambient_temperature + self._state[kernels.OFFSET])
+        return float(self._parameters.ambient_temperature + self._state["offset"])
 
 
-def _coefficients(parameters: CoiledPolymerParameters) -> dict[int, float]:
+def _coefficients(parameters: CoiledPolymerParameters) -> Record:
     """Prepare the numbers that the compiled loops need every step."""
     p = parameters
-    return kernels.shared_coefficients(p, p.ambient_sd, p.ambient_time) | {
-        kernels.KIND: kernels.THERMAL,
-        kernels.DRIVE_STEP: p.temperature_step,
-        kernels.BASE: p.ambient_temperature,
-        kernels.GAIN: p.rise / p.rated_voltage**2,
-        kernels.DECAY: math.exp(-p.step / p.time_constant),
-        kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
-        kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
-        kernels.OFFSET_GAIN: p.ambient_gain,
-        kernels.ARM: p.arm_stiffness * MILLIMETRE,
-        kernels.ARM_TIME: p.arm_time,
-        kernels.FRICTION: p.friction,
-        kernels.FRICTION_PRESS: p.friction_coils,
-        kernels.FRICTION_DRIVE: p.friction_load,
-        kernels.SLIP: p.slip,
-        kernels.COLD_STIFFNESS: p.cold_stiffness * MILLIMETRE,
-        kernels.HOT_STIFFNESS: p.hot_stiffness * MILLIMETRE,
-        kernels.SOFTENING: p.softening,
-        kernels.SOFTENING_WIDTH: p.softening_width,
-        kernels.EXPANSION: p.expansion / MILLIMETRE,
-        kernels.EXPANSION_ABOVE: p.expansion_above / MILLIMETRE,
-        kernels.CONTACT: p.coil_contact * MILLIMETRE**2,
-        kernels.CONTACT_AT: p.coil_length / MILLIMETRE,
-    }
+    return coefficients(
+        p,
+        p.ambient_sd,
+        p.ambient_time,
+        drive_step=p.temperature_step,
+        base=p.ambient_temperature,
+        gain=p.rise / p.rated_voltage**2,
+        decay=math.exp(-p.step / p.time_constant),
+        fan_decay=math.exp(-p.step / p.fan_time_constant),
+        fan_share=p.fan_time_constant / p.time_constant,
+        offset_gain=p.ambient_gain,
+        arm=p.arm_stiffness * MILLIMETRE,
+        arm_time=p.arm_time,
+        friction=p.friction,
+        friction_press=p.friction_coils,
+        friction_drive=p.friction_load,
+        slip=p.slip,
+        cold_stiffness=p.cold_stiffness * MILLIMETRE,
+        hot_stiffness=p.hot_stiffness * MILLIMETRE,
+        softening=p.softening,
+        softening_width=p.softening_width,
+        expansion=p.expansion / MILLIMETRE,
+        expansion_above=p.expansion_above / MILLIMETRE,
+        contact=p.coil_contact * MILLIMETRE**2,
+        contact_at=p.coil_length / MILLIMETRE,
+    )

@@ -35,21 +35,14 @@ Seed = Annotated[int, "zero or positive"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlantParameters:
-    """Numbers of a plant: finite, and positive unless their type says otherwise.
-
-    Attributes
-    ----------
-    step : float
-        Step of the time grid, s.
+class Numbers:
+    """Numbers that are finite, and positive unless their type says otherwise.
 
     Raises
     ------
     ValueError
         If a number is not allowed.
     """
-
-    step: float
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(type(self), include_extras=True).items():
@@ -60,6 +53,19 @@ class PlantParameters:
                     raise ValueError(f"{name} must be finite, not {value}")
                 if (sign == "zero or positive" and value < 0) or (sign == "positive" and value <= 0):
                     raise ValueError(f"{name} must be {sign}, not {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantParameters(Numbers):
+    """Numbers of a plant.
+
+    Attributes
+    ----------
+    step : float
+        Step of the time grid, s.
+    """
+
+    step: float
 
 
 P = TypeVar("P", bound=PlantParameters)

@@ -96,7 +96,6 @@ class HybridCantilever(GridPlant[HybridParameters]):
         self._nodes = _node_table(parameters)
         self._coefficients = _coefficients(parameters)
         self._fast_coefficients = _fast_coefficients(parameters)
-        self._factors = np.zeros((kernels.FACTOR_ROWS, kernels.NODES))
         self._increment = np.zeros(kernels.NODES)
         self._state = np.zeros(kernels.STATE_SIZE)
         self._command = np.zeros(kernels.COMMAND_SIZE)
@@ -105,51 +104,31 @@ class HybridCantilever(GridPlant[HybridParameters]):
         self._ahead = False
         self._elapsed = 0.0
 
-        fluctuation = parameters.ambient_sd * float(self._noise.standard_normal())
-        self._rise = np.full(kernels.NODES, fluctuation)
-        self._state[kernels.FLUCTUATION] = fluctuation
-        self._state[kernels.FACTORED] = math.nan
-        self._take_commands()
-
-    def advance(self, dt: float) -> None:
-        """Advance the plant in time.
-
-        Parameters
-        ----------
-        dt : float
-            Time to advance, s, at least 0; any size.
-
-        Raises
-        ------
-        ValueError
-            If `dt` is negative or not finite.
-        """
-        super().advance(dt)
-        self._elapsed += dt
-        if not self._ahead and self._pending > GRID_TOLERANCE:
-            kernels.look_ahead(
-                self._rise,
-                self._increment,
-                self._state,
-                self._command,
-                self._coefficients,
-                self._nodes,
-                self._factors,
-            )
-            self._ahead = True
-
-    def _take_steps(self, normals: NDArray[np.float64]) -> None:
-        kernels.advance_steps(
-            normals,
-            self._ahead,
+        deviation = parameters.ambient_sd * float(self._noise.standard_normal())
+        self._rise = np.full(kernels.NODES, deviation)
+        self._thermal = kernels.Thermal(
             self._rise,
             self._increment,
             self._state,
             self._command,
             self._coefficients,
             self._nodes,
-            self._factors,
+            np.zeros((kernels.FACTOR_ROWS, kernels.NODES)),
         )
+        self._state[kernels.FLUCTUATION] = deviation
+        self._state[kernels.FACTORED] = math.nan
+        self._take_commands()
+
+    def advance(self, dt: float) -> None:
+        """Advance the plant in time; see `GridPlant.advance`."""
+        super().advance(dt)
+        self._elapsed += dt
+        if not self._ahead and self._pending > GRID_TOLERANCE:
+            kernels.look_ahead(self._thermal)
+            self._ahead = True
+
+    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+        kernels.advance_steps(normals, self._ahead, self._thermal)
         self._ahead = False
 
     def _take_commands(self) -> None:

@@ -7,16 +7,16 @@ micro-actuator", IEEE Transactions on Robotics 26(6), 2010.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.plants.grid import NotNegative, PlantParameters, Signed, check_rating, check_temperature
+from sim_devices.plants.grid import NotNegative, Numbers, PlantParameters, Signed, check_rating, check_temperature
 
 
-@dataclass(frozen=True)
-class Bimorph:
+@dataclass(frozen=True, kw_only=True)
+class Bimorph(Numbers):
     """The strip: a piezo layer and a passive layer, from the paper's tables I and II.
 
     Attributes
@@ -43,21 +43,13 @@ class Bimorph:
     passive_thickness: float = 0.1e-3
     piezo_compliance: float = 15e-12
     passive_compliance: float = 9.1e-12
-    piezo_coefficient: float = -100e-12
-    piezo_expansion: float = 3.3e-6
-    passive_expansion: float = 17e-6
+    piezo_coefficient: Signed = -100e-12
+    piezo_expansion: Signed = 3.3e-6
+    passive_expansion: Signed = 17e-6
     piezo_conductivity: float = 1.4
     passive_conductivity: float = 381.5
     piezo_heat: float = 7500.0 * 420.0
     passive_heat: float = 8960.0 * 386.0
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{each.name} must be finite, not {value}")
-            if each.name not in ("piezo_coefficient", "piezo_expansion", "passive_expansion") and not value > 0:
-                raise ValueError(f"{each.name} must be positive, not {value}")
 
     @property
     def perimeter(self) -> float:

@@ -21,8 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
 from sim_devices.plants.grid import NotNegative
 from sim_devices.plants.muscle import MILLIMETRE
 
@@ -149,31 +148,34 @@ class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
         rated = parameters.pressure_gain * parameters.rated_voltage / _BAR
         super().__init__(parameters, _coefficients(parameters), 0.0, rated, rng)
-        self._state[kernels.OFFSET] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
+        self._state["offset"] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
 
     @property
     def pressure(self) -> float:
         """Gauge pressure in the muscle, Pa; 1.5 bar at 3 V."""
-        return float(self._state[kernels.DRIVE] * _BAR)
+        return float(self._state["drive"] * _BAR)
 
 
-def _coefficients(parameters: McKibbenParameters) -> dict[int, float]:
+def _coefficients(parameters: McKibbenParameters) -> Record:
     """Prepare the numbers that the compiled loops need every step."""
     p = parameters
-    return kernels.shared_coefficients(p, p.supply_sd / _BAR, p.supply_time) | {
-        kernels.KIND: kernels.PNEUMATIC,
-        kernels.DRIVE_STEP: p.pressure_step / _BAR,
-        kernels.GAIN: p.pressure_gain / _BAR,
-        kernels.BAND: p.pressure_band / _BAR,
-        kernels.DECAY: math.exp(-p.step / p.time_constant),
-        kernels.FAN_DECAY: math.exp(-p.step / p.exhaust_time_constant),
-        kernels.FRICTION: p.friction,
-        kernels.FRICTION_STRETCH: p.friction_jam,
-        kernels.FRICTION_DRIVE: p.friction_coefficient * p.braid_surface * _BAR,
-        kernels.SLIP: p.slip * _BAR / MILLIMETRE,
-        kernels.PRESSURE_AREA: _BAR_NEWTON / (4.0 * math.pi * p.turns**2),
-        kernels.THREAD_LENGTH: p.thread_length / MILLIMETRE,
-        kernels.BLADDER: p.bladder_stiffness * MILLIMETRE,
-        kernels.BLADDER_CUBE: p.bladder_cube * MILLIMETRE**3,
-        kernels.JAM: p.jam * MILLIMETRE**2,
-    }
+    return coefficients(
+        p,
+        p.supply_sd / _BAR,
+        p.supply_time,
+        pneumatic=1.0,
+        drive_step=p.pressure_step / _BAR,
+        gain=p.pressure_gain / _BAR,
+        band=p.pressure_band / _BAR,
+        decay=math.exp(-p.step / p.time_constant),
+        fan_decay=math.exp(-p.step / p.exhaust_time_constant),
+        friction=p.friction,
+        friction_stretch=p.friction_jam,
+        friction_drive=p.friction_coefficient * p.braid_surface * _BAR,
+        slip=p.slip * _BAR / MILLIMETRE,
+        pressure_area=_BAR_NEWTON / (4.0 * math.pi * p.turns**2),
+        thread_length=p.thread_length / MILLIMETRE,
+        bladder=p.bladder_stiffness * MILLIMETRE,
+        bladder_cube=p.bladder_cube * MILLIMETRE**3,
+        jam=p.jam * MILLIMETRE**2,
+    )

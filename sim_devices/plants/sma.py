@@ -254,11 +254,15 @@ class SMAWire(Muscle[SMAParameters]):
             reach=parameters.rest_length,
         )
         self._coefficients = _coefficients(parameters)
-        self._grains = grain_table(parameters)
-        self._martensite = np.zeros(parameters.grain_count, dtype=np.bool_)
-        self._oriented = np.zeros(parameters.grain_count, dtype=np.bool_)
-        self._scratch = np.empty((2, parameters.grain_count))
         self._state = np.zeros(kernels.STATE_SIZE)
+        self._parts = kernels.Parts(
+            self._state,
+            self._coefficients,
+            grain_table(parameters),
+            np.zeros(parameters.grain_count, dtype=np.bool_),
+            np.zeros(parameters.grain_count, dtype=np.bool_),
+            np.empty((2, parameters.grain_count)),
+        )
         self._condition()
 
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
@@ -266,16 +270,7 @@ class SMAWire(Muscle[SMAParameters]):
         self._heat(parameters.ambient_temperature + offset, clamped=False)
 
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
-        kernels.advance_steps(
-            normals,
-            self._state,
-            self._command,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-            self._scratch,
-        )
+        kernels.advance_steps(normals, self._command, self._parts)
 
     @property
     def temperature(self) -> float:
@@ -341,26 +336,10 @@ class SMAWire(Muscle[SMAParameters]):
         self._load(0.0)
 
     def _load(self, newton: float) -> None:
-        kernels.load_to(
-            newton / self._coefficients[kernels.AREA],
-            self._state,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-        )
+        kernels.load_to(newton / self._coefficients[kernels.AREA], self._parts)
 
     def _heat(self, celsius: float, clamped: bool) -> None:
-        kernels.heat_to(
-            celsius,
-            clamped,
-            self._state,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-            self._scratch,
-        )
+        kernels.heat_to(celsius, clamped, self._parts)
 
 
 def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:

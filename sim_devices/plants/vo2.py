@@ -273,13 +273,13 @@ class VO2Cantilever(GridPlant[VO2Parameters]):
         check_temperature("initial_temperature", start)
         super().__init__(parameters, rng, (2,))
         self._coefficients = _coefficients(parameters)
-        self._up, down = relay_thresholds(parameters)
-        self._down_relay = np.argsort(down, kind="stable")
-        self._down = down[self._down_relay]
-        self._on = np.zeros(parameters.relay_count, dtype=np.bool_)
+        up, down = relay_thresholds(parameters)
+        order = np.argsort(down, kind="stable")
         self._counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
+        on = np.zeros(parameters.relay_count, dtype=np.bool_)
         self._command = np.zeros(kernels.COMMAND_SIZE)
         self._state = np.zeros(kernels.STATE_SIZE)
+        self._parts = kernels.Parts(self._state, self._coefficients, self._counters, up, down[order], order, on)
 
         state = self._state
         wander = float(self._noise.standard_normal())
@@ -288,19 +288,9 @@ class VO2Cantilever(GridPlant[VO2Parameters]):
         state[kernels.WANDER] = parameters.wander_sd * wander
         # The session's offset is that of the moment at which the laser is aligned: drift begins there.
         state[kernels.DRIFT] = 0.0
-        state[kernels.DRIVE] = min(float(self._down[0]), start) - parameters.coupling - 1.0
+        state[kernels.DRIVE] = min(float(self._parts.down[0]), start) - parameters.coupling - 1.0
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
-        kernels.settle_film(
-            self.film_temperature,
-            parameters.coupling,
-            parameters.relay_step,
-            state,
-            self._counters,
-            self._up,
-            self._down,
-            self._down_relay,
-            self._on,
-        )
+        kernels.settle_film(self.film_temperature, self._parts)
 
     def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
         """Close the temperature loop.
@@ -347,17 +337,7 @@ class VO2Cantilever(GridPlant[VO2Parameters]):
         self._command[kernels.COMMAND] = 0.0
 
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
-        kernels.advance_steps(
-            normals,
-            self._state,
-            self._counters,
-            self._command,
-            self._coefficients,
-            self._up,
-            self._down,
-            self._down_relay,
-            self._on,
-        )
+        kernels.advance_steps(normals, self._command, self._parts)
 
     @property
     def plate_temperature(self) -> float:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
 
+@dataclass(eq=False)
 class DisplacementSensor:
     """An optical displacement sensor with a voltage in proportion to the displacement.
 
@@ -26,25 +28,16 @@ class DisplacementSensor:
         Source of the noise.
     """
 
-    def __init__(
-        self,
-        displacement: Callable[[], float],
-        volts_per_metre: float = 5e4,
-        reach: float = 200e-6,
-        noise: float = 10e-9,
-        resolution: float = 10e-9,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self._displacement = displacement
-        self._volts_per_metre = volts_per_metre
-        self._reach = reach
-        self._noise = noise
-        self._resolution = resolution
-        self._rng = rng
+    displacement: Callable[[], float]
+    volts_per_metre: float = 5e4
+    reach: float = 200e-6
+    noise: float = 10e-9
+    resolution: float = 10e-9
+    _: KW_ONLY
+    rng: np.random.Generator
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        noisy = self._displacement() + self._noise * self._rng.standard_normal()
-        shown = round(noisy / self._resolution) * self._resolution
-        return self._volts_per_metre * min(max(shown, -self._reach), self._reach)
+        noisy = self.displacement() + self.noise * self.rng.standard_normal()
+        shown = round(noisy / self.resolution) * self.resolution
+        return self.volts_per_metre * min(max(shown, -self.reach), self.reach)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
 
+@dataclass(eq=False)
 class RatiometricSensor:
     """A linear magnet sensor, of the kind of the SPS-L035-LATS, whose output is a share of its supply.
 
@@ -34,28 +36,23 @@ class RatiometricSensor:
         Voltage of the supply in V; for faults and drift.
     """
 
-    def __init__(
-        self,
-        position: Callable[[], float],
-        stroke: float = 0.035,
-        noise: float = 0.01e-3,
-        resolution: float = 0.04e-3,
-        supply_error: float = 20e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.supply_volts = 5.0 + supply_error * rng.standard_normal()
-        self._position = position
-        self._stroke = stroke
-        self._noise = noise
-        self._resolution = resolution
-        self._rng = rng
+    position: Callable[[], float]
+    stroke: float = 0.035
+    noise: float = 0.01e-3
+    resolution: float = 0.04e-3
+    supply_error: float = 20e-3
+    _: KW_ONLY
+    rng: np.random.Generator
+    supply_volts: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.supply_volts = 5.0 + self.supply_error * self.rng.standard_normal()
 
     def output(self) -> float:
         """Return the output voltage in V at this instant."""
-        noisy = self._position() + self._noise * self._rng.standard_normal()
-        step = round(noisy / self._resolution) * self._resolution
-        share = min(max(step / self._stroke, 0.0), 1.0)
+        noisy = self.position() + self.noise * self.rng.standard_normal()
+        step = round(noisy / self.resolution) * self.resolution
+        share = min(max(step / self.stroke, 0.0), 1.0)
         return self.supply_volts * (0.1 + 0.8 * share)
 
     def supply(self) -> float:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 
+@dataclass(eq=False)
 class NormalisedPSD:
     """A position-sensitive detector whose amplifier gives one voltage in proportion to the deflection.
 
@@ -26,27 +29,21 @@ class NormalisedPSD:
     The amplifier saturates at ±10 V, noise included.
     """
 
-    SATURATION = 10.0
+    SATURATION: ClassVar[float] = 10.0
 
-    def __init__(
-        self,
-        deflection: Callable[[], float],
-        volts_per_metre: float = 1e5,
-        noise_volts: float = 5e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self._deflection = deflection
-        self._volts_per_metre = volts_per_metre
-        self._noise = noise_volts
-        self._rng = rng
+    deflection: Callable[[], float]
+    volts_per_metre: float = 1e5
+    noise_volts: float = 5e-3
+    _: KW_ONLY
+    rng: np.random.Generator
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        volts = self._deflection() * self._volts_per_metre + self._noise * self._rng.standard_normal()
+        volts = self.deflection() * self.volts_per_metre + self.noise_volts * self.rng.standard_normal()
         return float(min(max(volts, -self.SATURATION), self.SATURATION))
 
 
+@dataclass(eq=False)
 class TwoCurrentPSD:
     """A position-sensitive detector whose two photocurrents are amplified to two voltages.
 
@@ -77,24 +74,16 @@ class TwoCurrentPSD:
     A spot beyond the end of the detector gives no current at all. The amplifiers saturate at 0 and 10 V.
     """
 
-    SATURATION = 10.0
+    SATURATION: ClassVar[float] = 10.0
 
-    def __init__(
-        self,
-        deflection: Callable[[], float],
-        metres_per_metre: float = 185.0,
-        psd_length: float = 0.037,
-        sum_volts: float = 8.0,
-        noise_volts: float = 5e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.light = 1.0
-        self._deflection = deflection
-        self._ratio_per_metre = 2 * metres_per_metre / psd_length
-        self._sum = sum_volts
-        self._noise = noise_volts
-        self._rng = rng
+    deflection: Callable[[], float]
+    metres_per_metre: float = 185.0
+    psd_length: float = 0.037
+    sum_volts: float = 8.0
+    noise_volts: float = 5e-3
+    _: KW_ONLY
+    rng: np.random.Generator
+    light: float = field(default=1.0, init=False)
 
     def first(self) -> float:
         """Return the voltage in V of current 1 at this instant."""
@@ -105,7 +94,7 @@ class TwoCurrentPSD:
         return self._amplified(1.0)
 
     def _amplified(self, side: float) -> float:
-        ratio = self._deflection() * self._ratio_per_metre
+        ratio = self.deflection() * (2 * self.metres_per_metre / self.psd_length)
         share = (1 + side * ratio) / 2 if abs(ratio) <= 1 else 0.0
-        volts = self.light * self._sum * share + self._noise * self._rng.standard_normal()
+        volts = self.light * self.sum_volts * share + self.noise_volts * self.rng.standard_normal()
         return float(min(max(volts, 0.0), self.SATURATION))

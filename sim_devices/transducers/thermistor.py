@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
@@ -13,6 +14,7 @@ STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
 """A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
 
 
+@dataclass(eq=False)
 class Thermistor:
     """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
 
@@ -43,25 +45,19 @@ class Thermistor:
         Whether a wire of the thermistor is broken, or its wires touch; for faults.
     """
 
-    def __init__(
-        self,
-        temperature: Callable[[], float],
-        reference_ohms: float = 10e3,
-        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
-        excitation_volts: float = 2.5,
-        excitation_error: float = 10e-3,
-        noise: float = 0.02,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.excitation_volts = excitation_volts + excitation_error * rng.standard_normal()
-        self.open = False
-        self.shorted = False
-        self._temperature = temperature
-        self._reference = reference_ohms
-        self._steinhart_hart = steinhart_hart
-        self._noise = noise
-        self._rng = rng
+    temperature: Callable[[], float]
+    reference_ohms: float = 10e3
+    steinhart_hart: tuple[float, float, float] = STEINHART_HART
+    excitation_volts: float = 2.5
+    excitation_error: float = 10e-3
+    noise: float = 0.02
+    _: KW_ONLY
+    rng: np.random.Generator
+    open: bool = field(default=False, init=False)
+    shorted: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self.excitation_volts += self.excitation_error * self.rng.standard_normal()
 
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
@@ -69,8 +65,8 @@ class Thermistor:
             return 0.0
         if self.open:
             return self.excitation_volts
-        ohms = self._ohms(self._temperature() + self._noise * self._rng.standard_normal())
-        return self.excitation_volts * ohms / (ohms + self._reference)
+        ohms = self._ohms(self.temperature() + self.noise * self.rng.standard_normal())
+        return self.excitation_volts * ohms / (ohms + self.reference_ohms)
 
     def excitation(self) -> float:
         """Return the voltage in V of the excitation at this instant."""
@@ -78,7 +74,7 @@ class Thermistor:
 
     def _ohms(self, celsius: float) -> float:
         """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
-        a, b, c = self._steinhart_hart
+        a, b, c = self.steinhart_hart
         half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
         root = math.sqrt((b / (3 * c)) ** 3 + half**2)
         return math.exp(math.cbrt(root - half) - math.cbrt(root + half))

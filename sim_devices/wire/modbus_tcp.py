@@ -19,28 +19,7 @@ import struct
 import threading
 from types import TracebackType
 
-from sim_devices.wire.modbus import (
-    DEVICE_FAILURE,
-    ILLEGAL_ADDRESS,
-    ILLEGAL_FUNCTION,
-    ILLEGAL_VALUE,
-    RegisterBank,
-    RegisterError,
-    answer,
-)
-
-__all__ = [
-    "DEVICE_FAILURE",
-    "ILLEGAL_ADDRESS",
-    "ILLEGAL_FUNCTION",
-    "ILLEGAL_VALUE",
-    "FramingError",
-    "ModbusTcpServer",
-    "ModbusTcpStream",
-    "RegisterBank",
-    "RegisterError",
-    "answer",
-]
+from sim_devices.wire.modbus import RegisterBank, answer
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _MOST_BYTES = 254  # unit identifier and the longest PDU

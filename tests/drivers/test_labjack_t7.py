@@ -23,7 +23,8 @@ from drivers.labjack_t7 import (
 )
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
-from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings

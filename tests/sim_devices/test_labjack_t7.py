@@ -24,13 +24,8 @@ from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import STEINHART_HART, Thermistor
-from sim_devices.wire.modbus_tcp import (
-    FramingError,
-    ModbusTcpServer,
-    ModbusTcpStream,
-    RegisterError,
-    answer,
-)
+from sim_devices.wire.modbus import RegisterError, answer
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpServer, ModbusTcpStream
 from sim_devices.world import World
 
 LSB = 2 * RAIL * 10 / 65536

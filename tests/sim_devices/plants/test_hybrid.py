@@ -8,6 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
+
+from bench.clock import VirtualClock
+from bench.devices import TECMode
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.plants import _hybrid_kernels as kernels
+from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import (
     Bimorph,
     HybridParameters,
@@ -15,12 +21,6 @@ from sim_devices.plants.hybrid_parameters import (
     piezo_sensitivity,
     thermal_sensitivity,
 )
-
-from bench.clock import VirtualClock
-from bench.devices import TECMode
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.world import World
 
 LIVELY = HybridParameters()
