@@ -105,7 +105,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     name, world
         See `EmulatedDevice`.
     load : ShaftLoad, optional
-        What hangs on the shaft; without it the shaft is free.
+        The load on the shaft; without it the shaft is free.
     bus_id : int
         Id on the bus, 0 to 252.
     firmware : int
@@ -176,7 +176,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._power_on()
         world.add(self)
 
-    # The servo as its manual has it: control table and instructions.
+    # Control table and instructions.
 
     @property
     def position(self) -> float:
@@ -197,32 +197,32 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     @property
     def bus_id(self) -> int:
-        """Get the id on the bus, 0 to 252."""
+        """The id on the bus, 0 to 252."""
         return self._values[7]
 
     @property
     def model_number(self) -> int:
-        """Get the model number."""
+        """The model number."""
         return self._values[0]
 
     @property
     def firmware(self) -> int:
-        """Get the firmware version."""
+        """The firmware version."""
         return self._values[6]
 
     @property
     def status_return_level(self) -> int:
-        """Get which instructions are answered: 0 pings, 1 reads as well, 2 all."""
+        """Which instructions are answered: 0 pings, 1 reads as well, 2 all."""
         return self._values[68]
 
     @property
     def alert(self) -> bool:
-        """Get whether there is a hardware error."""
+        """Whether there is a hardware error."""
         return self._hardware_error != 0
 
     @property
     def answering(self) -> bool:
-        """Get whether packets reach the servo and it is not restarting."""
+        """Whether packets reach the servo and it is not restarting."""
         with self._world.at_present():
             return self._plugged_in and math.isinf(self._restart_due)
 
@@ -349,10 +349,10 @@ class EmulatedMX28(EmulatedInstrument, Servo):
                     self.eeprom_writes += 1
             self.reboot()
 
-    # Faults to try the bench with.
+    # Faults.
 
     def trip(self, error: HardwareError) -> None:
-        """Have a hardware error come up."""
+        """Raise a hardware error."""
         with self._world.at_present():
             self._follow()
             self._raise_error(error)
@@ -373,14 +373,14 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             self._temperature = celsius
             self._protect()
 
-    # What happens by itself.
+    # Timed events.
 
     def deadline(self) -> float:
         """Return when watchdog, overload, restart, or the next position or the arrival is due (s)."""
         return min(self._watchdog_due, self._overload_due, self._restart_due, self._step_due)
 
     def expire(self) -> None:
-        """Do what is due."""
+        """Carry out what is due."""
         now = self._world.time
         self._follow()
         if now >= self._watchdog_due:
@@ -396,7 +396,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             self._protect()
             self._schedule()
 
-    # The role of a servo, as a host on the spot would play it.
+    # The role of a servo.
 
     @property
     def identity(self) -> Identity:

@@ -14,8 +14,8 @@ class EmulatedDrum(EmulatedDevice, LinearStage):
     """An emulated MX-28 with a drum on its shaft, as the role of a linear stage and as a plant sees it.
 
     Called directly, positions are those of the position registers, as `zero_counts`, `direction` and `radius`
-    turn them into m; the stage resolves `COUNT` · `radius`. It has the name of its servo, and on the wire the
-    servo is what answers.
+    turn them into m; the stage resolves `COUNT` · `radius`. It has the name of its servo; on the wire the servo
+    answers.
 
     Parameters
     ----------

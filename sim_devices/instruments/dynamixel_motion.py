@@ -23,7 +23,7 @@ _BALANCE_PRECISION = 1e-6  # rad
 
 
 class ShaftLoad(Protocol):
-    """What hangs on the shaft."""
+    """The load on the shaft."""
 
     def torque(self, angle: float) -> float:
         """Return the torque on the shaft at an angle (rad), N·m; positive towards larger angles.

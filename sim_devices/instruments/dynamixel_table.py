@@ -183,7 +183,7 @@ def check_value(values: Mapping[int, int], item: Item, value: int) -> None:
     values : mapping of int to int
         The present values of the table, by address.
     item : Item
-        What is written.
+        The item.
     value : int
         The new value.
 

@@ -1,4 +1,4 @@
-"""What the emulated instruments have in common: a role without a wire, and the faults of a line."""
+"""The common base of the emulated instruments: a role without a wire, and the faults of a line."""
 
 from __future__ import annotations
 

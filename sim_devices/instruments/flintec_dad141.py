@@ -85,7 +85,7 @@ def reading_interval(setting: int) -> float:
 
 @dataclass(frozen=True)
 class _SetUp:
-    """What command WP saves; the factory's values (Technical Manual, 10.3 and 10.4)."""
+    """The settings that command WP saves; the factory's values (Technical Manual, 10.3 and 10.4)."""
 
     filter: int = 3
     filter_mode: int = 0
@@ -187,7 +187,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self.power_cycle()
         world.add(self)
 
-    # What the laboratory around the instrument does to it.
+    # The power supply.
 
     def power_cycle(self) -> None:
         """Switch the instrument off and on again."""

@@ -17,7 +17,7 @@ Assumptions, where these say nothing:
 - DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
   offset. The register of a DAC reads back what was written.
 - After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
-  nothing as long as nobody communicates, so they are done once.
+  nothing while there is no communication, so they are done once.
 - A single conversion takes no laboratory time; a burst takes what its scan rate says.
 - Reading the register of a single digital line makes it an input, as the map says that it configures the
   direction too; an input that nothing drives is pulled high, as all lines are after power-up.
@@ -199,7 +199,7 @@ class EmulatedT7(RegisterInstrument):
 
     @property
     def identity(self) -> Identity:
-        """What the instrument says of itself."""
+        """Identity of the instrument."""
         return Identity("LabJack", "T7", str(self.serial_number), f"{self.firmware:.4f}")
 
     # The outputs as the laboratory sees them.
@@ -260,7 +260,7 @@ class EmulatedT7(RegisterInstrument):
         return self._due
 
     def expire(self) -> None:
-        """Do what the watchdog is set to do."""
+        """Take the actions of the watchdog."""
         dog = self._watchdog
         if dog.dac0_enabled:
             self._set_dac(0, dog.dac0)

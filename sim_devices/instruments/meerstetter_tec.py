@@ -64,7 +64,7 @@ _HARDWARE_VERSION = 120
 
 
 class PeltierLoad(Protocol):
-    """What the output stage is connected to; a positive current heats the plate."""
+    """The load of the output stage; a positive current heats the plate."""
 
     @property
     def plate_temperature(self) -> float:
@@ -158,21 +158,21 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._started_at = self._in_window_since = self._saturated_since = math.nan
         world.add(self)
 
-    # The device as its manual has it: parameters and commands.
+    # Parameters and commands.
 
     @property
     def address(self) -> int:
-        """Get the device address, 1 to 254 (parameter 2051)."""
+        """The device address, 1 to 254 (parameter 2051)."""
         return int(self._values[2051])
 
     @property
     def identification(self) -> str:
-        """Get the identification string, 20 characters; the wording is an assumption."""
+        """The identification string, 20 characters; the wording is an assumption."""
         return f"{self._identity.model} v{self._identity.firmware}".ljust(20)
 
     @property
     def status(self) -> DeviceStatus:
-        """Get the state of the device at the clock's present time; does not feed the watchdog."""
+        """The state of the device at the clock's present time; does not feed the watchdog."""
         with self._world.at_present():
             return self._status
 
@@ -185,7 +185,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             self._feed(now)
 
     def parameter(self, number: int, instance: int = 1) -> Parameter:
-        """Get the row of the parameter table.
+        """Return the row of the parameter table.
 
         Raises
         ------
@@ -200,7 +200,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         return row
 
     def read_parameter(self, number: int, instance: int = 1) -> float:
-        """Get the value of a parameter, in the unit of the table.
+        """Return the value of a parameter, in the unit of the table.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             self._restart_due = self._world.time + RESET_DELAY
             self._apply()
 
-    # Faults to try the bench with.
+    # Faults.
 
     def trip(self, error_number: int, *, parameter: int = 0) -> None:
         """Put the device into its error state.
@@ -267,14 +267,14 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         with self._world.at_present():
             self._trip(error_number, parameter)
 
-    # What happens by itself.
+    # Timed events.
 
     def deadline(self) -> float:
         """Return when the watchdog, a restart or the next check of the protections is due (s)."""
         return min(self._watchdog_due, self._restart_due, self._supervision_due)
 
     def expire(self) -> None:
-        """Do what is due."""
+        """Carry out what is due."""
         now = self._world.time
         if now >= self._watchdog_due:
             self._watchdog_due = math.inf
@@ -285,7 +285,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             self._supervision_due = now + SUPERVISION_INTERVAL
             self._supervise(now)
 
-    # The role of a TEC amplifier, as a host on the spot would play it.
+    # The role of a TEC amplifier.
 
     @property
     def identity(self) -> Identity:
@@ -294,11 +294,11 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     @property
     def mode(self) -> TECMode:
-        """What is held constant (parameter 2000)."""
+        """The quantity that is held constant (parameter 2000)."""
         return TECMode.TEMPERATURE if self._values[2000] == CONTROLLER else TECMode.CURRENT
 
     def select_mode(self, mode: TECMode) -> None:
-        """Choose what is held constant; a change switches the output off."""
+        """Choose the quantity that is held constant; a change switches the output off."""
         with self._request():
             if mode is not self.mode:
                 for number in (50000, 2010, 50001):

@@ -166,7 +166,7 @@ _INDICES = frozenset(index for index, _ in DICTIONARY)
 
 
 class HeatingLoad(Protocol):
-    """What the first motor output is connected to."""
+    """The load at the first motor output."""
 
     def apply(self, voltage: float) -> None:
         """Apply a voltage, V: the average with an LC filter, the RMS value without; held until the next."""
@@ -184,7 +184,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     name, world
         See `EmulatedDevice`.
     load : HeatingLoad
-        What is heated.
+        The heated load.
     output : {"average", "rms"}
         Whether an LC filter is between output and load, so that it sees the average, or none.
     voltage_limits : tuple of float
@@ -202,7 +202,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     bitrate : int
         Speed of the bus, bit/s.
     device_name : str
-        What object 0x1008 says.
+        Value of object 0x1008.
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
@@ -270,22 +270,22 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         }
         world.add(self)
 
-    # The device as its manual has it: objects and network management.
+    # Objects and network management.
 
     @property
     def state(self) -> NodeState:
-        """Get the NMT state."""
+        """The NMT state."""
         return self._state
 
     @property
     def power(self) -> int:
-        """Get the applied power at the clock's present time, ‰; does not feed the watchdog."""
+        """The applied power at the clock's present time, ‰; does not feed the watchdog."""
         with self._world.at_present():
             return self._power
 
     @property
     def voltage(self) -> float:
-        """Get the voltage that the load sees at the clock's present time, V."""
+        """The voltage that the load sees at the clock's present time, V."""
         with self._world.at_present():
             return self._applied_voltage
 
@@ -303,7 +303,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         return row
 
     def read_object(self, index: int, sub: int = 0) -> int | str:
-        """Get the value of an object, in the unit of the manual.
+        """Return the value of an object, in the unit of the manual.
 
         Raises
         ------
@@ -367,11 +367,11 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             due += [self._state] * min(count, _LONGEST_HEARTBEAT_BACKLOG)
         return due if self._plugged_in else []
 
-    # Faults to try the bench with.
+    # Faults.
 
     @property
     def battery_voltage(self) -> float:
-        """Get or set the voltage of the power supply, V."""
+        """The voltage of the power supply, V."""
         return self._battery
 
     @battery_voltage.setter
@@ -381,7 +381,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self._apply()
 
     def trip(self, fault: Fault | ChannelFlag) -> None:
-        """Have the device report a fault, which drops the output, or a flag of the first channel."""
+        """Report a fault, which drops the output, or a flag of the first channel."""
         with self._world.at_present():
             if isinstance(fault, Fault):
                 self._trips |= fault
@@ -410,7 +410,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         """Cut the adapter's line in its middle."""
         return answer[: len(answer) // 2] + b"\r"
 
-    # What happens by itself.
+    # Timed events.
 
     def deadline(self) -> float:
         """Return when the watchdog expires (s)."""
@@ -422,7 +422,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._held = True
         self._apply()
 
-    # The role of a voltage supply, as a host on the spot would play it.
+    # The role of a voltage supply.
 
     @property
     def identity(self) -> Identity:

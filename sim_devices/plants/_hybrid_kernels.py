@@ -120,7 +120,7 @@ def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bo
     state : ndarray
         State, changed in place.
     command : ndarray
-        What amplifier and room were told.
+        Commands to amplifier and room.
     c : ndarray
         Coefficients.
 
@@ -180,7 +180,7 @@ def look_ahead(thermal: Thermal) -> None:
     """Find the change of the temperatures over the step that begins here.
 
     The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
-    balance to rounding. What convection has beyond that changes over seconds and is taken at the middle of
+    balance to rounding. The nonlinear part of convection changes over seconds and is taken at the middle of
     the step, extrapolated from the step before.
 
     Parameters

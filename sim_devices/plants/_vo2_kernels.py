@@ -250,7 +250,7 @@ def step_plate(state: Floats, command: Floats, c: Floats) -> None:
     state : ndarray
         State, changed in place.
     command : ndarray
-        What the amplifier was told.
+        Commands to the amplifier.
     c : ndarray
         Coefficients.
     """

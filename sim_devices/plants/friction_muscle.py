@@ -1,4 +1,4 @@
-"""What the braided pneumatic muscle and the coiled polymer muscle share: friction, equilibrium and time.
+"""The common part of the braided pneumatic and the coiled polymer muscle: friction, equilibrium and time.
 
 Both are an elastic backbone whose law depends on the drive, pressure or temperature, in parallel with many dry
 contacts and with one weak Maxwell arm. The compiled loops keep their numbers in records, which they change in
@@ -460,7 +460,7 @@ class MuscleParameters(PlantParameters):
     contact_count : int
         Number of dry contacts, at least 1.
     specimen_seed : int
-        Seed of the contacts. The specimen is the same piece whatever the session's seed.
+        Seed of the contacts. The specimen does not depend on the session's seed.
     contact_stiffness : float
         Stiffness of all contacts together before any has slipped, N/m.
     contact_spread : float

@@ -12,8 +12,8 @@ Robotics 26(6), 2010. Where its printed equations do not balance, the network he
 laws, with the heat of the Peltier effect taken at the absolute temperature of each face. Numbers marked
 *assumed* are ours, chosen so that the plant behaves as the paper's specimen does.
 
-The paper's three actuators (table III) are this one plant: the thermal bimorph is the plant that `apply` is
-never called of, the classic piezo cantilever the plant that `drive` is never called of.
+The paper's three actuators (table III) are this one plant: the thermal bimorph is this plant without `apply`,
+the classic piezo cantilever this plant without `drive`.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class HybridParameters(PlantParameters):
         Rates at which it saturates, 1/V; the second adds while it grows and takes off while it shrinks and
         must be the smaller.
     creep_share : float
-        What each of the creep's lags adds, as a share of the deflection.
+        Contribution of each of the creep's lags, as a share of the deflection.
     creep_times : tuple of float
         Time constants of the three lags, s.
     piezo_warming : float
@@ -194,7 +194,7 @@ class HybridParameters(PlantParameters):
     resonance_decay, resonance_square : float
         Coefficients of the resonance ``s² + resonance_decay s + resonance_square``, 1/s and 1/s² (paper, eq. 21).
     numerator_linear, numerator_constant : float
-        Coefficients of the numerator, in the same form. The gain is normalised: D(s)/D(0) is what acts.
+        Coefficients of the numerator, in the same form. The gain is normalised: D(s)/D(0) acts.
     resonance_offset : float
         Relative shift of the resonance frequency at constant damping ratio, within ±0.5; ±0.03 is a sensible
         test of a notch.

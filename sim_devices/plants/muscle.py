@@ -1,4 +1,4 @@
-"""What every muscle is told: a voltage, the fan, and a load to carry or a length to be held at."""
+"""The commands of every muscle: a voltage, the fan, and a load to carry or a length to be held at."""
 
 from __future__ import annotations
 

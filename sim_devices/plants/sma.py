@@ -46,7 +46,7 @@ class SMAParameters(PlantParameters):
     grain_count : int
         Number of grains; at least 1.
     specimen_seed : int
-        Seed of the grains. The specimen is the same piece whatever the session's seed.
+        Seed of the grains. The specimen does not depend on the session's seed.
     austenite_finish, austenite_finish_spread : float
         Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes
         austenite.

@@ -49,7 +49,7 @@ class VO2Parameters(PlantParameters):
     relay_count : int
         Number of hysteresis relays; at least 1.
     specimen_seed : int
-        Seed of the relay thresholds. The specimen is the same piece whatever the session's seed.
+        Seed of the relay thresholds. The specimen does not depend on the session's seed.
     correlation : float
         Correlation of threshold and width in normal scores, in (-1, 1).
     minor_share : float

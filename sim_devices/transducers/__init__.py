@@ -1,1 +1,1 @@
-"""Emulated transducers: what a plant does, as voltages at the inputs of an instrument."""
+"""Emulated transducers: quantities of a plant as voltages at the inputs of an instrument."""

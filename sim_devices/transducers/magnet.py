@@ -26,7 +26,7 @@ class RatiometricSensor:
     resolution : float
         Steps in which the sensor gives the position, in m.
     supply_error : float
-        How far the supply of one instance is from 5 V, in V rms; drawn once.
+        Deviation of the supply of one instance from 5 V, V rms; drawn once.
     rng : numpy.random.Generator
         Source of the noise and of the error of the supply.
 

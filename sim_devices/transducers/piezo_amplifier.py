@@ -11,7 +11,7 @@ from sim_devices.world import World
 
 
 class PiezoLoad(Protocol):
-    """What a high-voltage amplifier drives."""
+    """The load of a high-voltage amplifier."""
 
     def apply(self, voltage: float) -> None:
         """Apply a voltage, V; held until the next."""
@@ -34,7 +34,7 @@ class PiezoAmplifier:
     world : World
         The laboratory that the amplifier stands in.
     load : PiezoLoad
-        What is driven, 0 V at first.
+        The driven load, 0 V at first.
     gain : float
         Gain in V/V.
     offset_volts : float
@@ -46,7 +46,7 @@ class PiezoAmplifier:
     volts_per_volt, amperes_per_volt : float
         Output voltage and current per volt of their monitors.
     scale_error : float
-        How far gain and voltage monitor of one instance are from their values, as a share, rms; drawn once.
+        Relative deviation of gain and voltage monitor of one instance, rms; drawn once.
     noise_volts : float
         White noise of either monitor in V rms, drawn anew for every conversion; zero or positive.
     rng : numpy.random.Generator
@@ -103,7 +103,7 @@ class PiezoAmplifier:
         return self._target + (self._start - self._target) * math.exp(-elapsed / self._time_constant)
 
     def drive(self, volts: float, enable: bool) -> None:
-        """Take what is at the inputs: the set-point in V, and whether the amplifier is enabled."""
+        """Apply the inputs: the set-point in V, and whether the amplifier is enabled."""
         if volts == self._input and enable == self._enabled:
             return
         self._input = volts
@@ -112,7 +112,7 @@ class PiezoAmplifier:
         self._follow()
 
     def trip(self) -> None:
-        """Have the protection switch the amplifier off, until the enable input is taken away."""
+        """Switch the amplifier off by its protection, until the enable input is taken away."""
         with self._world.lock:
             self._world.advance()
             self._tripped = self._enabled

@@ -31,7 +31,7 @@ class Thermistor:
     excitation_volts : float
         Excitation in V.
     excitation_error : float
-        How far the excitation of one instance is from that, in V rms; drawn once.
+        Deviation of the excitation of one instance, V rms; drawn once.
     noise : float
         White noise in K rms, drawn anew for every conversion; zero or positive.
     rng : numpy.random.Generator
@@ -42,7 +42,7 @@ class Thermistor:
     excitation_volts : float
         Voltage of the excitation in V; for faults and drift.
     open, shorted : bool
-        Whether a wire of the thermistor is broken, or its wires touch; for faults.
+        Whether a wire of the thermistor is broken, or its wires are shorted; for faults.
     """
 
     temperature: Callable[[], float]

@@ -11,7 +11,7 @@ management commands and its heartbeat. It takes the simplified command bytes of 
 V2.0, whose bits e and s are 0, as well, and answers them by the standard ones.
 
 Assumptions: a frame that is sent at another bit rate than the bus has is lost without a word; segmented and
-block downloads are refused; a remote frame is answered by nobody.
+block downloads are refused; a remote frame is not answered.
 """
 
 from __future__ import annotations
@@ -65,20 +65,20 @@ class CanopenSlcanServer:
         self._listening = False
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in whatever pieces they come; return what the adapter sends."""
+        """Take bytes from the host, in pieces of any size; return what the adapter sends."""
         with self._device.world.lock:
             *lines, rest = (self._received + data).split(b"\r")
             sent = self._heartbeats()
             for line in lines:
                 sent += _REFUSED if self._overrun or len(line) > LONGEST_LINE else self._obey(line)
                 self._overrun = False
-            # What is longer than any line stays refused up to its end.
+            # A line that is too long is refused up to its end.
             self._overrun = self._overrun or len(rest) > LONGEST_LINE
             self._received = b"" if self._overrun else rest
             return sent
 
     def _heartbeats(self) -> bytes:
-        """Return what the device has sent by itself since the host last spoke."""
+        """Return the heartbeats since the last request of the host."""
         states = self._device.heartbeats()
         if not self._on_the_bus():
             return b""
@@ -120,7 +120,7 @@ class CanopenSlcanServer:
         return sent
 
     def _frame(self, identifier: int, data: bytes) -> bytes:
-        """Put a frame on the bus; return the lines of what the node answers."""
+        """Put a frame on the bus; return the lines of the node's answer."""
         device = self._device
         if not device.plugged_in:
             return b""

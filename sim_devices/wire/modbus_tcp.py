@@ -43,7 +43,7 @@ class ModbusTcpStream:
         self._received = bytearray()
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the client, in whatever pieces they come; return the replies to whole frames.
+        """Take bytes from the client, in pieces of any size; return the replies to whole frames.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class ModbusTcpStream:
                 break
             reply = answer(self._bank, bytes(self._received[_HEADER.size : end]))
             del self._received[:end]
-            # The unit is echoed whatever it is: a device on TCP is addressed by its port.
+            # Any unit is echoed: a device on TCP is addressed by its port.
             replies += _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
         return bytes(replies)
 
