@@ -15,6 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants import cooler
+from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
+
 # Nodes of the thermal chain, each joined to the next: insulated end and front of the block, back and
 # actuator face of the TEC, then the elements of the beam from its base to its tip.
 BLOCK_END, BLOCK_FRONT, BACK, FACE, BEAM = range(5)
@@ -36,9 +39,9 @@ FACTOR_ROWS = 3
 FLUCTUATION, ROOM, CURRENT, FACTORED, INTEGRAL = range(5)
 STATE_SIZE = 5
 
-# Command: regulated (1) or driven (0), current (A), target rise (K), current limit (A), step of the room (K).
-CLOSED, COMMAND, TARGET, LIMIT, ROOM_STEP = range(5)
-COMMAND_SIZE = 5
+# Command of the room, after those of the cooler: step of its temperature (K).
+ROOM_STEP = cooler.COMMAND_SIZE
+COMMAND_SIZE = ROOM_STEP + 1
 
 # Coefficients, prepared once from the parameters.
 (

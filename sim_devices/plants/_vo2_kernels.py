@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
+
 ZERO_CELSIUS = 273.15
 
 # Continuous state.
@@ -23,10 +25,6 @@ STATE_SIZE = 7
 # Relay counters: relays that are on, up-thresholds and down-thresholds below the present drive.
 ON_COUNT, UP_BELOW, DOWN_BELOW = range(3)
 COUNTER_SIZE = 3
-
-# Command: loop closed (1) or open (0), target (°C), current limit (A), current command (A).
-CLOSED, TARGET, LIMIT, COMMAND = range(4)
-COMMAND_SIZE = 4
 
 # Coefficients, prepared once from the parameters.
 (

@@ -167,25 +167,3 @@ def check_temperature(name: str, celsius: float) -> None:
     """Raise `ValueError` unless a number is a temperature, °C."""
     if not ABSOLUTE_ZERO < celsius < math.inf:
         raise ValueError(f"{name} must be a temperature above absolute zero, not {celsius} °C")
-
-
-def check_loop(target_celsius: float, current_limit: float) -> None:
-    """Raise `ValueError` unless a temperature loop can have this target (°C) and this limit of the current (A)."""
-    check_temperature("target_celsius", target_celsius)
-    if not current_limit >= 0.0:
-        raise ValueError(f"current_limit must not be negative, not {current_limit} A")
-
-
-def check_current(current: float, maximum: float) -> None:
-    """Raise `ValueError` unless a Peltier module's rating (A) allows a current (A)."""
-    if not abs(current) <= maximum:
-        raise ValueError(f"current must lie within ±{maximum} A, not {current} A")
-
-
-def check_rating(seebeck: float, conductance: float, maximum_current: float) -> None:
-    """Raise `ValueError` if the rating of a Peltier module (A) reaches its thermal runaway."""
-    if not seebeck * maximum_current < conductance:
-        raise ValueError(
-            f"maximum_current must stay below the thermal runaway at {conductance / seebeck:.3g} A, "
-            f"not {maximum_current}"
-        )

@@ -24,22 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.grid import (
-    ABSOLUTE_ZERO,
-    GRID_TOLERANCE,
-    GridPlant,
-    check_current,
-    check_loop,
-    check_temperature,
-    fluctuation,
-)
+from sim_devices.plants.cooler import CooledPlant
+from sim_devices.plants.grid import ABSOLUTE_ZERO, GRID_TOLERANCE, check_temperature, fluctuation
 from sim_devices.plants.hybrid_parameters import HybridParameters, piezo_dynamics, thermal_sensitivity
 
 # Rise (K) at which the free convection's share is that of the parameters.
 _CONVECTION_RISE = 10.0
 
 
-class HybridCantilever(GridPlant[HybridParameters]):
+class HybridCantilever(CooledPlant[HybridParameters]):
     """Deflection of a bimorph strip by temperature and by voltage, advanced in time.
 
     The cooler's current is positive when it heats the beam, as everywhere on the bench (the paper's is
@@ -135,54 +128,14 @@ class HybridCantilever(GridPlant[HybridParameters]):
         if not self._ahead:
             kernels.take_commands(self._rise, self._state, self._command, self._coefficients)
 
-    def drive(self, current_ampere: float) -> None:
-        """Drive a constant current through the cooler.
+    def _loop_target(self, celsius: float) -> float:
+        return celsius - self._parameters.ambient_temperature
 
-        Parameters
-        ----------
-        current_ampere : float
-            Current, A; positive heats the beam.
-
-        Raises
-        ------
-        ValueError
-            If the magnitude exceeds ``parameters.maximum_current``.
-        """
-        check_current(current_ampere, self._parameters.maximum_current)
-        self._command[kernels.CLOSED] = 0.0
-        self._command[kernels.COMMAND] = current_ampere
-        self._take_commands()
-
-    def release(self) -> None:
-        """Switch the cooler's output off; the beam relaxes towards block and room."""
-        self.drive(0.0)
-
-    def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
-        """Close a temperature loop around the base: proportional and integral in the heat, not beyond the rating.
-
-        Parameters
-        ----------
-        target_celsius : float
-            Target of the base temperature, °C.
-        current_limit : float, optional
-            Largest current of either sign that the amplifier may give, A. A target out of its reach is
-            approached and not reached.
-
-        Raises
-        ------
-        ValueError
-            If the target is not a temperature or the limit is negative or not a number.
-        """
-        check_loop(target_celsius, current_limit)
-        if not self._command[kernels.CLOSED]:
-            # The loop takes over with the heat that the present current gives.
-            current = self.current
-            pumped = self._parameters.seebeck * (self.base_temperature - ABSOLUTE_ZERO)
-            self._state[kernels.INTEGRAL] = current * (pumped + 0.5 * self._parameters.resistance * current)
-        self._command[kernels.CLOSED] = 1.0
-        self._command[kernels.TARGET] = target_celsius - self._parameters.ambient_temperature
-        self._command[kernels.LIMIT] = current_limit
-        self._take_commands()
+    def _take_over(self) -> None:
+        # The loop takes over with the heat that the present current gives.
+        current = self.current
+        pumped = self._parameters.seebeck * (self.base_temperature - ABSOLUTE_ZERO)
+        self._state[kernels.INTEGRAL] = current * (pumped + 0.5 * self._parameters.resistance * current)
 
     def step_ambient(self, change_kelvin: float) -> None:
         """Change the mean temperature of the room, as an opened window does; changes add up.

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.plants.grid import NotNegative, Numbers, PlantParameters, Signed, check_rating, check_temperature
+from sim_devices.plants.cooler import CooledParameters
+from sim_devices.plants.grid import NotNegative, Numbers, Signed, check_temperature
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +122,7 @@ def _curvature_gain(bimorph: Bimorph) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HybridParameters(PlantParameters):
+class HybridParameters(CooledParameters):
     """Every number of the plant.
 
     The strip, the block, the convection coefficient and the poles and zeros of the piezo dynamics come from
@@ -255,9 +256,7 @@ class HybridParameters(PlantParameters):
             raise ValueError(f"resonance_offset must lie within ±0.5, not {self.resonance_offset}")
         if not self.resonance_decay**2 < 4.0 * self.resonance_square:
             raise ValueError(f"resonance_decay must leave the resonance a frequency, not {self.resonance_decay} 1/s")
-        for name in ("ambient_temperature", "straight_temperature"):
-            check_temperature(name, getattr(self, name))
-        check_rating(self.seebeck, self.conductance, self.maximum_current)
+        check_temperature("straight_temperature", self.straight_temperature)
 
 
 def piezo_dynamics(parameters: HybridParameters) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:

@@ -22,22 +22,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
-from sim_devices.plants.grid import (
-    GridPlant,
-    NotNegative,
-    PlantParameters,
-    Seed,
-    Signed,
-    check_current,
-    check_loop,
-    check_rating,
-    check_temperature,
-    fluctuation,
-)
+from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
+from sim_devices.plants.grid import NotNegative, Seed, Signed, check_temperature, fluctuation
 
 
 @dataclass(frozen=True, kw_only=True)
-class VO2Parameters(PlantParameters):
+class VO2Parameters(CooledParameters):
     """Every number of the plant.
 
     The values that come from the paper are the beam length and the operating range that the rest was
@@ -171,7 +161,6 @@ class VO2Parameters(PlantParameters):
             raise ValueError(f"correlation must lie in (-1, 1), not {self.correlation}")
         if not 0.0 <= self.minor_share <= 1.0:
             raise ValueError(f"minor_share must lie in [0, 1], not {self.minor_share}")
-        check_rating(self.seebeck, self.conductance, self.maximum_current)
 
 
 def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -215,7 +204,7 @@ def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], ND
     return up[order], down[order]
 
 
-class VO2Cantilever(GridPlant[VO2Parameters]):
+class VO2Cantilever(CooledPlant[VO2Parameters]):
     """Curvature of a VO2 microcantilever on a Peltier plate, advanced in time.
 
     The plate is either regulated (`regulate`: the closed second-order loop of a temperature
@@ -277,7 +266,7 @@ class VO2Cantilever(GridPlant[VO2Parameters]):
         order = np.argsort(down, kind="stable")
         self._counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
         on = np.zeros(parameters.relay_count, dtype=np.bool_)
-        self._command = np.zeros(kernels.COMMAND_SIZE)
+        self._command = np.zeros(COMMAND_SIZE)
         self._state = np.zeros(kernels.STATE_SIZE)
         self._parts = kernels.Parts(self._state, self._coefficients, self._counters, up, down[order], order, on)
 
@@ -291,50 +280,6 @@ class VO2Cantilever(GridPlant[VO2Parameters]):
         state[kernels.DRIVE] = min(float(self._parts.down[0]), start) - parameters.coupling - 1.0
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
         kernels.settle_film(self.film_temperature, self._parts)
-
-    def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
-        """Close the temperature loop.
-
-        Parameters
-        ----------
-        target_celsius : float
-            Target of the plate temperature, °C.
-        current_limit : float, optional
-            Largest current of either sign that the amplifier may give, A. Where the loop asks for
-            more, the plate's rate saturates at what this current can do; a target out of its reach is
-            approached and not reached.
-
-        Raises
-        ------
-        ValueError
-            If the target is not a temperature or the limit is negative or not a number.
-        """
-        check_loop(target_celsius, current_limit)
-        self._command[kernels.CLOSED] = 1.0
-        self._command[kernels.TARGET] = target_celsius
-        self._command[kernels.LIMIT] = current_limit
-
-    def drive(self, current_ampere: float) -> None:
-        """Drive a constant current; the loop is open.
-
-        Parameters
-        ----------
-        current_ampere : float
-            Current, A; positive heats the plate. The output follows with the amplifier's lag.
-
-        Raises
-        ------
-        ValueError
-            If the magnitude exceeds the module's rating ``parameters.maximum_current``.
-        """
-        check_current(current_ampere, self._parameters.maximum_current)
-        self._command[kernels.CLOSED] = 0.0
-        self._command[kernels.COMMAND] = current_ampere
-
-    def release(self) -> None:
-        """Switch the output off; the plate relaxes towards the heat sink and the room."""
-        self._command[kernels.CLOSED] = 0.0
-        self._command[kernels.COMMAND] = 0.0
 
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
         kernels.advance_steps(normals, self._command, self._parts)
