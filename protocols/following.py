@@ -55,7 +55,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
         slope = fastest_slope(Inverse(model.operator), times, values)
         if not slope.within(parameters.fastest):
             raise ValueError(
-                f"the reference asks for {slope.rate:.2f} {drive.rate_unit} at {slope.time:g} s, and the drive follows "
+                f"the reference asks for {slope.rate:.2f} {drive.rate_unit} at {slope.time:g} s; the drive follows "
                 f"{parameters.fastest:g} {drive.rate_unit} at most"
             )
     limits = (parameters.reset, parameters.hottest)

@@ -138,7 +138,7 @@ class TestPlan:
         assert max(asked) == 10.5
         assert min(asked) == 0.3
         start = messages.index(Phase("length over force at 0 V"))
-        one = [m.loop.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
+        one = [m.task.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
         np.testing.assert_allclose(np.diff(one), [*[(10.5 - 0.3) / 11] * 11, *[-(10.5 - 0.3) / 11] * 11])
 
     def test_verification_has_the_paper_s_90_samples(self):
