@@ -23,7 +23,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
-from bench.tracking_results import FOLLOW
+from bench.results.tracking import FOLLOW
 
 
 class Parameters(ProtocolParameters):

@@ -29,7 +29,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
-from bench.tracking_results import REACH, READING
+from bench.results.tracking import REACH, READING
 
 
 class Parameters(ProtocolParameters):

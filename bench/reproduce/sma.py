@@ -18,14 +18,6 @@ from rich.table import Table
 
 from bench.clock import Stopwatch
 from bench.errors import DataError
-from bench.figures import (
-    Curve,
-    plot_densities,
-    plot_errors,
-    plot_panels,
-    plot_sequence_and_errors,
-    plot_tracking,
-)
 from bench.hysteresis import Preisach, TwoStage
 from bench.identification import Errors
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series, predict_series
@@ -43,10 +35,18 @@ from bench.muscle_runs import (
     read_resting,
     read_series,
 )
-from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.figures import (
+    Curve,
+    plot_densities,
+    plot_errors,
+    plot_panels,
+    plot_sequence_and_errors,
+    plot_tracking,
+)
+from bench.results.report import export_run
+from bench.results.tracking import TargetResults, target_results
 from bench.runs import RunResult
-from bench.tracking_results import TargetResults, target_results
 
 Floats = npt.NDArray[np.float64]
 

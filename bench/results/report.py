@@ -13,15 +13,15 @@ from rich.markdown import Markdown
 from rich.table import Table as Columns
 
 from bench.errors import ConfigurationError, DataError
-from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.identification import measure_errors
 from bench.journal import Record, Table
 from bench.measurements import header_with_unit, write_csv
 from bench.model_file import ModelFile, is_coupled_model, load_model, parse_model
 from bench.modelling import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
+from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME, run_card
-from bench.tracking_results import results_json
 
 
 def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console: Console) -> dict[str, Any]:
