@@ -50,15 +50,16 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bench.calibration import DerivedSignal
 from bench.clock import Clock
 from bench.devices import Actuator, Device, DriverSettings, Signal, role_of
 from bench.errors import ConfigurationError
 from bench.journal import check_names
+from bench.layout import DashboardLayout
 from bench.safety import Interlock
 from bench.validation import problems
 
@@ -80,40 +81,13 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
-def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
-    if not ends[0] < ends[1]:
-        raise ValueError("expected two numbers, the lower one first")
-    return ends
-
-
-_Range = Annotated[tuple[float, float], AfterValidator(_check_range)]
-
-
-class LoopTable(_Table):
-    """A table `[[dashboard.loops]]`: one more loop of the live view."""
-
-    input: str = Field(description="signal on the horizontal axis of the loop")
-    output: str = Field(description="signal on the vertical axis of the loop")
-    input_range: _Range = Field(description="ends of the horizontal axis")
-    output_range: _Range = Field(description="ends of the vertical axis")
-
-
-class DashboardTable(LoopTable):
-    """The table `[dashboard]`: the hysteresis loops and the Preisach plane of the live view."""
-
-    input: str = Field(description="signal on the horizontal axis of the loop, and input of the plane")
-    plane: _Range = Field(description="ends of both axes of the Preisach plane")
-    levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
-    loops: tuple[LoopTable, ...] = Field(default=(), description="further loops")
-
-
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
     derived: dict[str, DerivedSignal] = Field(default_factory=dict)
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
-    dashboard: DashboardTable | None = None
+    dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
 
@@ -179,7 +153,7 @@ class RigFile:
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
-    dashboard: DashboardTable | None
+    dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
 
@@ -369,10 +343,8 @@ class Rig:
         known = ", ".join(names)
         used = [(f"interlocks.{i}.signal", lock.signal) for i, lock in enumerate(self.file.interlocks)]
         if self.file.dashboard is not None:
-            loops: dict[str, LoopTable] = {"dashboard": self.file.dashboard}
-            loops |= {f"dashboard.loops.{i}": loop for i, loop in enumerate(self.file.dashboard.loops)}
-            for key, loop in loops.items():
-                used += [(f"{key}.input", loop.input), (f"{key}.output", loop.output)]
+            for prefix, plot in self.file.dashboard.plots.items():
+                used += [(f"dashboard.{prefix}input", plot.input), (f"dashboard.{prefix}output", plot.output)]
         for key, signal in used:
             if signal not in names:
                 raise ConfigurationError(
