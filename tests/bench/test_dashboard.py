@@ -1,6 +1,5 @@
 """The dashboard: what it records, and that nothing it is connected to can hold a run up."""
 
-import gc
 import os
 import signal
 import socket
@@ -875,11 +874,11 @@ def test_clients_that_never_read_hold_nothing_up(tmp_path: Path) -> None:
     clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
     clients[1].sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0]))
     clients[2].sendall(b"nonsense")
-    longest = feed(dashboard, 20_000)
-    stopwatch = Stopwatch()
+    # While none of them reads, everything is taken and the file is completed.
+    feed(dashboard, 20_000)
+    wait_until(lambda: not dashboard._queue.qsize())
     dashboard.close()
-    assert stopwatch.seconds() < 5.0
-    assert longest < 0.5
+    wait_until(lambda: not dashboard._thread.is_alive())
     for client in clients:
         client.close()
     assert dashboard.dropped == 0
@@ -897,22 +896,21 @@ def test_a_viewer_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
         feed(dashboard, 300)
         wait_until(lambda: (tmp_path / "viewer.rrd").exists() and (tmp_path / "viewer.rrd").stat().st_size > 10_000)
         os.kill(viewer.pid, signal.SIGSTOP)
-        longest, batches = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
+        batches = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
         os.kill(viewer.pid, signal.SIGCONT)
-        _, more = feed_batches(dashboard, until=lambda: dashboard.viewer_keeps_up)
+        more = feed_batches(dashboard, until=lambda: dashboard.viewer_keeps_up)
         os.kill(viewer.pid, signal.SIGSTOP)
-        _, again = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
-        stopwatch = Stopwatch()
+        again = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
         dashboard.close()
-        assert stopwatch.seconds() < 8.0
-        assert longest < 0.5
+        # The file is completed while the viewer is still stopped.
+        rows = 300 + 250 * (batches + more + again)
+        wait_until(lambda: rows == len(read(tmp_path / "run.rrd").get("/signals/temperature", {}).get("scalars", [])))
         found = read(tmp_path / "run.rrd")
     finally:
         viewer.kill()
         viewer.wait()
     dashboard._thread.join(PATIENCE)
     assert dashboard.dropped == 0
-    rows = 300 + 250 * (batches + more + again)
     assert len(table(found["/signals/temperature"], "scalars")[0]) == rows
     said = [text[0].partition("  ")[2] for text in found["/events"]["text"]]
     assert [text.partition(";")[0] for text in said] == [
@@ -931,10 +929,10 @@ def test_what_rerun_cannot_take_is_dropped_counted_and_said(tmp_path: Path, monk
 
     monkeypatch.setattr(rr.RecordingStream, "send_columns", stand_still)
     dashboard = make_dashboard(tmp_path / "run.rrd")
-    longest = feed(dashboard, 2 * QUEUED_TICKS)
+    # Rerun stands still until it is let go; had the control thread waited for it, nothing would be lost.
+    feed(dashboard, 2 * QUEUED_TICKS)
     # What matters more than telemetry still has room.
     dashboard.step(StepRecord(7, 0.0, 8.0, "", "", True, {}, (0.0,) * len(SIGNALS)))
-    assert longest < 0.5
     lost = dashboard.dropped
     assert lost > 0
     let_go.set()
@@ -951,9 +949,9 @@ def test_closing_is_bounded_when_rerun_stands_still(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(rr.RecordingStream, "send_columns", lambda *_, **__: let_go.wait(PATIENCE))
     dashboard = make_dashboard(tmp_path / "run.rrd")
     feed(dashboard, 1_000)
-    stopwatch = Stopwatch()
     dashboard.close()
-    assert stopwatch.seconds() < 2.0
+    # Closing came back although the thread still waits for Rerun.
+    assert dashboard._thread.is_alive()
     let_go.set()
     dashboard._thread.join(PATIENCE)
 
@@ -968,17 +966,21 @@ def test_a_refused_entry_does_not_end_the_view(tmp_path: Path) -> None:
     assert "1 entries are missing" in found["/events"]["text"][-1][0]
 
 
-def test_telling_costs_the_control_thread_next_to_nothing(tmp_path: Path) -> None:
-    values = tuple(float(i) for i in range(len(SIGNALS)))
-    with make_dashboard(tmp_path / "run.rrd") as dashboard:
-        gc.disable()
-        stopwatch = Stopwatch()
-        for i in range(10_000):
-            dashboard.telemetry(0.1 * i, i, values)
-        seconds = stopwatch.seconds()
-        gc.enable()
-    # About 1 µs; the rest is room for a busy machine.
-    assert seconds / 10_000 < 10e-6
+def test_the_control_thread_only_puts_entries_into_the_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, control_entries: list[Tick | StepRecord | Event]
+) -> None:
+    callers, original = [], rr.RecordingStream.send_columns
+
+    def note_the_caller(self: rr.RecordingStream, *arguments: object, **options: object) -> None:
+        callers.append(threading.current_thread())
+        original(self, *arguments, **options)
+
+    monkeypatch.setattr(rr.RecordingStream, "send_columns", note_the_caller)
+    with make_dashboard(tmp_path / "run.rrd", signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
+        tell(dashboard, control_entries)
+    assert set(callers) == {dashboard._thread}
+    # Batches, not rows: each entity is written at most once for every 200 entries or second.
+    assert len(callers) < len(control_entries)
 
 
 def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
@@ -986,7 +988,8 @@ def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
     stopwatch = Stopwatch()
     with Record(folder) as record:
         rebuild(record, folder / "run.rrd")
-    assert stopwatch.seconds() < 8.0
+    # About 1 s; the rest is for a busy machine.
+    assert stopwatch.seconds() < PATIENCE
     assert len(table(read(folder / "run.rrd")["/signals/current"], "scalars")[0]) == 20_000
 
 
@@ -995,8 +998,8 @@ def test_a_long_control_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
     stopwatch = Stopwatch()
     with Record(folder) as record:
         rebuild(record, folder / "run.rrd")
-    # About 0.6 s; the rest is room for a busy machine.
-    assert stopwatch.seconds() < 5.0
+    # About 0.6 s; the rest is for a busy machine.
+    assert stopwatch.seconds() < PATIENCE
     assert len(table(read(folder / "run.rrd")["/control/error"], "scalars")[0]) == 12_061
 
 
@@ -1051,26 +1054,23 @@ def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, mus
         assert ((abs(plane - (255, 226, 138)).sum(axis=2) < 60).sum() > 100) == is_drawn
 
 
-def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> float:
-    """Tell ticks as fast as an emulated laboratory does; return the longest call, s."""
-    values, longest, stopwatch = tuple(float(i) for i in range(len(SIGNALS))), 0.0, Stopwatch()
-    before = stopwatch.seconds()
+def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> None:
+    """Report ticks as fast as an emulated laboratory does."""
+    values = tuple(float(i) for i in range(len(SIGNALS)))
     for i in range(start, start + ticks):
         dashboard.telemetry(0.1 * i, i, values)
-        now = stopwatch.seconds()
-        longest, before = max(longest, now - before), now
-    return longest
 
 
-def feed_batches(dashboard: Dashboard, until: Callable[[], bool]) -> tuple[float, int]:
-    """Tell ticks in many batches until something happens; return the longest call, s, and how many."""
-    longest, batches, clock = 0.0, 0, WallClock()
+def feed_batches(dashboard: Dashboard, until: Callable[[], bool]) -> int:
+    """Report ticks in many batches until something happens; return how many."""
+    batches, clock = 0, WallClock()
     while not until():
         assert clock.now() < PATIENCE, "it does not happen"
-        longest, batches = max(longest, feed(dashboard, 250, start=250 * batches)), batches + 1
+        feed(dashboard, 250, start=250 * batches)
+        batches += 1
         while dashboard._queue.qsize():
             clock.sleep(0.001)
-    return longest, batches
+    return batches
 
 
 def port_of(dashboard: Dashboard) -> int:
