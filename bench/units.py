@@ -11,11 +11,12 @@ _DIGITS = 3
 """Most digits after the point of a number whose unit can take a prefix."""
 
 
-def fitting_prefix(unit: str, greatest: float, least: float = 1.0) -> tuple[float, str]:
-    """Return factor and unit, with the largest SI prefix in which numbers up to `greatest` (in `unit`) reach `least`.
+def fitting_prefix(unit: str, *numbers: float, least: float = 1.0) -> tuple[float, str]:
+    """Return factor and unit with the largest SI prefix in which the greatest number (in `unit`) reaches `least`.
 
     Units that take no prefix, such as °C or 1/m, are returned with the factor 1.
     """
+    greatest = max(map(abs, numbers), default=0.0)
     if unit in _PREFIXABLE and greatest > 0.0:
         # Rounding must not decide about a limit such as 1e-4 m.
         fits = (prefix for prefix, factor in _PREFIXES.items() if greatest * factor >= least * (1.0 - 1e-9))
@@ -36,8 +37,7 @@ def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -
     precision : int
         Digits after the point that are worth showing in `unit`.
     """
-    greatest = max((abs(number) for number in numbers if number is not None), default=0.0)
-    factor, shown = fitting_prefix(unit, greatest, least=0.1)
+    factor, shown = fitting_prefix(unit, *(number for number in numbers if number is not None), least=0.1)
     digits = max(precision - round(math.log10(factor)), 0)
     if unit in _PREFIXABLE:
         digits = min(digits, _DIGITS)

@@ -10,11 +10,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.dashboard.drawing import INK, Colour, prefix_of_range, time_view
+from bench.dashboard.drawing import INK, Colour, time_view
 from bench.dashboard.recording import Floats
-from bench.dashboard.signal_plots import find_column, likely_range
+from bench.dashboard.signal_plots import find_column, likely_magnitude
 from bench.devices import Signal
 from bench.protocol import TRACES
+from bench.units import fitting_prefix
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
 
@@ -30,19 +31,7 @@ _BAND: Colour = (122, 132, 148)
 
 @dataclass(frozen=True)
 class ControlPlots:
-    """The columns of a controller's signals, and how to show them.
-
-    Attributes
-    ----------
-    output : int
-        Column of the controlled signal.
-    traces : tuple of int
-        Columns of `TRACES`.
-    extent : tuple of float or None
-        Range of the controlled signal, if the layout has it.
-    factor, unit : float and str
-        Unit shown, and its factor over that of the signals.
-    """
+    """Columns of the controlled signal and of `TRACES`, the range of the former, and the unit shown."""
 
     output: int
     traces: tuple[int, ...]
@@ -54,7 +43,7 @@ class ControlPlots:
     def of(cls, signals: Sequence[Signal], controls: str, extent: tuple[float, float] | None) -> ControlPlots:
         """Return the plots of a run whose controllers control the signal `controls`."""
         output, *traces = (find_column(signals, "controls", name) for name in (controls, *TRACE_NAMES))
-        factor, unit = prefix_of_range(signals[output].unit, extent or likely_range(signals[output]))
+        factor, unit = fitting_prefix(signals[output].unit, *(extent or [likely_magnitude(signals[output])]))
         return cls(output, tuple(traces), extent, factor, unit)
 
     def is_at_work(self, values: Sequence[float]) -> bool:

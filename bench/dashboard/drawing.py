@@ -54,15 +54,15 @@ class Frame:
     @classmethod
     def of_plot(cls, plot: XYPlot, x: Signal, y: Signal) -> Frame:
         """Return the frame of one signal over another."""
-        x_factor, x_unit = prefix_of_range(x.unit, plot.input_range)
-        y_factor, y_unit = prefix_of_range(y.unit, plot.output_range)
+        x_factor, x_unit = fitting_prefix(x.unit, *plot.input_range)
+        y_factor, y_unit = fitting_prefix(y.unit, *plot.output_range)
         titles = f"{x.description} [{x_unit}]", f"{y.description} [{y_unit}]"
         return cls(plot.input_range, plot.output_range, *titles, x_factor, y_factor)
 
     @classmethod
     def of_plane(cls, extent: tuple[float, float], unit: str) -> Frame:
         """Return the frame of a Preisach plane over an input in `unit`."""
-        factor, shown = prefix_of_range(unit, extent)
+        factor, shown = fitting_prefix(unit, *extent)
         return cls(extent, extent, f"β [{shown}]", f"α [{shown}]", factor, factor)
 
     def x(self, value: float) -> float:
@@ -103,11 +103,6 @@ class Frame:
             rr.Transform3D(mat3x3=np.diag([across, down, 1.0]), translation=[self.x(x[0]), self.y(y[1]), 0.0]),
             rr.Image(_coloured(values), draw_order=-10.0),
         )
-
-
-def prefix_of_range(unit: str, extent: tuple[float, float]) -> tuple[float, str]:
-    """Return factor and unit that make the numbers of an axis readable."""
-    return fitting_prefix(unit, max(abs(extent[0]), abs(extent[1])))
 
 
 def lines(strips: Any, colour: Colour, points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401

@@ -18,16 +18,9 @@ from bench.units import fitting_prefix
 
 
 class Planes:
-    """The planes of a layout.
+    """The planes of a layout with the first input x and output y.
 
-    Parameters
-    ----------
-    layout : DashboardLayout
-        Range and lattice of the first input's plane.
-    x, y : Signal
-        The first input and output.
-    densities : sequence of ModelDensity
-        Those that are known from the start; views are made for what does not fit the first plane.
+    Those of `densities`, which are known from the start, that do not fit the first plane get views of their own.
     """
 
     def __init__(self, layout: DashboardLayout, x: Signal, y: Signal, densities: Sequence[ModelDensity]) -> None:

@@ -24,26 +24,10 @@ _PORTS_TRIED = 50
 
 
 class Recording:
-    """One recording; used by one thread at a time.
+    """One recording, whose streams carry the same `run_id`; used by one thread at a time.
 
-    Parameters
-    ----------
-    run_id : str
-        Identifier of the run; both streams carry it.
-    title : str
-        Name of the run in the viewer.
-    path : Path or None
-        The .rrd file to write; its folder exists, the file does not.
-    port : int or None
-        Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any, None serves
-        no live view.
-    blueprint : rrb.Blueprint
-        Arrangement of the views.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file exists or cannot be made, or no port is free.
+    Without `path` there is no file, without `port` no live view; a port that is taken gives the next free one, 0 any.
+    Raises a ConfigurationError if the file exists or cannot be made, or no port is free.
     """
 
     def __init__(

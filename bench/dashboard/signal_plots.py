@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.dashboard.drawing import Colour, prefix_of_range, time_view
+from bench.dashboard.drawing import Colour, time_view
 from bench.dashboard.recording import Floats
 from bench.devices import Signal
 from bench.errors import ConfigurationError
+from bench.units import fitting_prefix
 
 _SETPOINT: Colour = (150, 158, 168)
 _PALETTE: tuple[Colour, ...] = (
@@ -42,23 +43,7 @@ _QUANTITIES = {
 
 @dataclass(frozen=True)
 class SignalPlot:
-    """The signals of one unit.
-
-    Attributes
-    ----------
-    path : str
-        Entity, below `signals` (ticks) and `readings` (steps).
-    title : str
-        Quantity and unit.
-    columns : list of int
-        Columns of the signals.
-    factor : float
-        Of the unit shown over that of the signals.
-    height : int
-        Relative height; a signal of the XY plots has 2.
-    style : SeriesLines
-        Names and colours of the lines.
-    """
+    """The signals of one unit: their columns, the factor to the unit shown, and how the lines look."""
 
     path: str
     title: str
@@ -87,7 +72,7 @@ def plots_by_unit(
         columns = [i for i, signal in shown_signals if signal.unit == unit]
         members = [signals[i] for i in columns]
         extents = [ranges[signal.name] for signal in members if signal.name in ranges]
-        factor, shown = prefix_of_range(unit, extents[0] if extents else likely_range(members[0]))
+        factor, shown = fitting_prefix(unit, *(extents[0] if extents else [likely_magnitude(members[0])]))
         quantity = _QUANTITIES.get(unit, unit)
         title = quantity if len(members) > 1 else members[0].description
         style = rr.SeriesLines(
@@ -109,9 +94,9 @@ def find_column(signals: Sequence[Signal], key: str, name: str) -> int:
     return names.index(name)
 
 
-def likely_range(signal: Signal) -> tuple[float, float]:
+def likely_magnitude(signal: Signal) -> float:
     """Return the likely magnitude of a signal's values, judged by the digits that are worth showing."""
-    return 0.0, 10.0 ** (3 - signal.precision)
+    return float(10.0 ** (3 - signal.precision))
 
 
 def _colour(name: str, position: int) -> Colour:

@@ -32,21 +32,9 @@ _PLOTS_IN_A_ROW = 3
 class Writer:
     """Writes a run to a recording, once it is open; used by one thread at a time.
 
-    Parameters
-    ----------
-    signals : sequence of Signal
-        What is measured, in the order of the values.
-    meta : mapping
-        The run's metadata, as in its journal.
-    densities : sequence of ModelDensity
-        Densities that are known from the start.
-
-    Raises
-    ------
-    ConfigurationError
-        If the dashboard's layout is wrong, or a signal that it or `controls` names does not exist.
-    KeyError
-        If the metadata is incomplete.
+    Signals and metadata are those of the run's journal, `densities` those known from the start. Raises a
+    ConfigurationError if the layout is wrong, or a signal that it or `controls` names does not exist, and a KeyError
+    if the metadata is incomplete.
     """
 
     def __init__(

@@ -43,19 +43,8 @@ class Point(NamedTuple):
 class XYPlots:
     """The plots of a layout, the first of which drives the memory curve.
 
-    Parameters
-    ----------
-    layout : DashboardLayout
-        Their axes.
-    signals : sequence of Signal
-        Signals of the run.
-    title : str
-        Name of a plot that stands alone; several are named after their signals.
-
-    Raises
-    ------
-    ConfigurationError
-        If the layout names a signal that does not exist.
+    A plot that stands alone has the name `title`; several are named after their signals. Raises a
+    ConfigurationError if the layout names a signal that does not exist.
     """
 
     def __init__(self, layout: DashboardLayout, signals: Sequence[Signal], title: str) -> None:
@@ -123,18 +112,9 @@ class XYPlots:
 
 
 class _Track:
-    """One plot: where it is drawn, and the line since the point that was drawn last.
+    """One plot of column y over column x below the entity `path`, and the line since the point drawn last.
 
-    Parameters
-    ----------
-    path : str
-        Entity below which it is drawn.
-    plot : XYPlot
-        Its axes.
-    x, y : int
-        Columns of its signals.
-    extent : tuple of float
-        Range of the input, of which `_VISIBLE` is visible.
+    `_VISIBLE` is a part of `extent`, a range of the input.
     """
 
     def __init__(self, path: str, plot: XYPlot, x: int, y: int, extent: tuple[float, float]) -> None:

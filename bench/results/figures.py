@@ -1,4 +1,7 @@
-"""Figures of runs and models, by matplotlib."""
+"""Figures of runs and models, by matplotlib.
+
+Each function draws one figure to the file `path`, PNG or PDF by its ending. Axis labels include units.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,6 @@ _STYLE: dict[Any, Any] = {
 }
 _COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
 
-
 _MARKED = 200
 """Most samples of a curve that are marked one by one."""
 
@@ -61,18 +63,14 @@ class Curve(NamedTuple):
 def plot_loops(
     path: Path, inputs: Floats, measured: Floats, modelled: Floats | None, *, input_label: str, output_label: str
 ) -> None:
-    """Draw measured loops, and those of a model beside them (Zhang et al. 2013, Fig. 5a).
+    """Draw measured loops, and those of a model beside them.
 
     Parameters
     ----------
-    path : Path
-        File to write, PNG or PDF by its ending.
     inputs, measured : ndarray, shape (N,)
         Input and output, one sample a step.
     modelled : ndarray or None, shape (N,)
         Output of the model.
-    input_label, output_label : str
-        Axis labels, with units.
     """
     with _figure(path, (6.0, 4.2)) as figure:
         axes = figure.subplots()
@@ -83,44 +81,35 @@ def plot_loops(
         axes.set(xlabel=input_label, ylabel=output_label)
 
 
-def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, limits: str = "") -> None:
-    """Draw the error of each model against the sample index, one panel a model (Figs. 5b, 7 and 9).
+def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str) -> None:
+    """Draw the error of each model against the sample index, one panel a model.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     errors : mapping of str to ndarray
         Measured minus modelled by the model's title, each of shape (N,).
-    error_label : str
-        Axis label, with unit.
-    limits : str
-        A line of text above the panels.
     """
     with _figure(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
         for i, (title, error) in enumerate(errors.items()):
-            _error_panel(panels[i], title, error, error_label, i)
+            panels[i].plot(error, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            panels[i].set_ylabel(error_label)
+            rms = float(np.sqrt(np.mean(error**2)))
+            panels[i].set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
-        if limits:
-            figure.suptitle(limits)
 
 
 def plot_sequence_and_errors(
     path: Path, inputs: Floats, errors: Mapping[str, Floats], *, input_label: str, error_label: str
 ) -> None:
-    """Draw an input sequence, and below it the errors of several models (Fig. 10).
+    """Draw an input sequence, and below it the errors of several models.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     inputs : ndarray, shape (N,)
         Input, one sample a step.
     errors : mapping of str to ndarray
         Measured minus modelled by the model's title, each of shape (N,).
-    input_label, error_label : str
-        Axis labels, with units.
     """
     with _figure(path, (6.0, 5.5)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True)
@@ -142,20 +131,16 @@ def plot_tracking(
     output_label: str,
     error_label: str,
 ) -> None:
-    """Draw a reference and the outputs under several controllers, and below it their errors (Fig. 12).
+    """Draw a reference and the outputs under several controllers, and below it their errors.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     reference : ndarray, shape (N,)
         The reference.
     outputs : mapping of str to ndarray
         Measured outputs by the controller's title, each of shape (N,).
     horizontal : ndarray or None, shape (N,)
-        Where they are drawn, such as times; their index if None.
-    horizontal_label, output_label, error_label : str
-        Axis labels, with units.
+        Horizontal positions, such as times; the index if None.
     """
     places = np.arange(reference.size, dtype=np.float64) if horizontal is None else horizontal
     marker = "." if horizontal is None else ""
@@ -183,12 +168,8 @@ def plot_panels(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     panels : mapping of str to sequence of Curve
         Curves by the panel's title.
-    horizontal_label, vertical_label : str
-        Axis labels, with units.
     columns : int
         Panels beside each other.
     """
@@ -200,7 +181,7 @@ def plot_panels(
                 axes.plot(
                     curve.horizontal,
                     curve.vertical,
-                    # Where samples are dense, their marks would hide what is behind.
+                    # Marks of dense samples would hide other curves.
                     ".-" if curve.horizontal.size <= _MARKED else "-",
                     color=f"C{k}",
                     linewidth=0.7,
@@ -223,8 +204,6 @@ def plot_densities(path: Path, densities: Sequence[Density]) -> None:
 
     Parameters
     ----------
-    path : Path
-        File to write.
     densities : sequence of Density
         Their titles are those of the panels.
     """
@@ -251,8 +230,6 @@ def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], me
 
     Parameters
     ----------
-    path : Path
-        File to write.
     density : Density
         The operator's density, for its levels.
     swept : ndarray of bool, shape (K,)
@@ -278,8 +255,6 @@ def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], label
 
     Parameters
     ----------
-    path : Path
-        File to write.
     hours : ndarray, shape (N,)
         Laboratory time in h.
     signals : mapping of str to ndarray
@@ -301,10 +276,3 @@ def _frame_plane(axes: Axes, density: Density) -> None:
     axes.plot(ends, ends, color="black", linewidth=0.8)
     labels = {"xlabel": with_unit("β", density.unit), "ylabel": with_unit("α", density.unit)}
     axes.set(**labels, aspect="equal", xlim=ends, ylim=ends)
-
-
-def _error_panel(axes: Axes, title: str, error: Floats, label: str, color: int) -> None:
-    axes.plot(error, color=_COLORS[color % len(_COLORS)], linewidth=0.7)
-    axes.set_ylabel(label)
-    rms = float(np.sqrt(np.mean(error**2)))
-    axes.set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")

@@ -36,9 +36,9 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
     model_paths : sequence of Path
         Model files to compare, besides those that were identified from the run.
     out : Path or None
-        Where figures go; the folder `report` beside the journal if None.
+        Folder of the figures; `report` beside the journal if None.
     console : Console
-        Where to print.
+        Console to print on.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def _picture(record: Record, folder: Path) -> Path:
         rebuild(record, recording)
         complaints = picture(recording, path)
     if complaints:
-        raise DataError(f"{path}: the viewer complains: {'; '.join(complaints)}")
+        raise DataError(f"{path}: the viewer reports: {'; '.join(complaints)}")
     return path
 
 
@@ -291,7 +291,7 @@ def _models_of(record: Record) -> list[ModelFile]:
     return [
         parse_model(content, f"{record.path}: model {name}")
         for name, content in record.models().items()
-        # A model among voltage, force and length has two inputs: its errors are those of several runs together.
+        # A coupled model has two inputs; its errors are those of several runs together.
         if not is_coupled_model(content)
     ]
 
@@ -303,7 +303,7 @@ def _headers(record: Record, table: Table) -> list[str]:
 
 
 def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
-    # A fifth of a second of import that only this format needs.
+    # Takes a fifth of a second to import.
     import pyarrow as pa
     import pyarrow.parquet as pq
 
