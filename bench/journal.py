@@ -1,7 +1,7 @@
-"""The durable record of a run: one SQLite file, written before anything else is told.
+"""The durable record of a run: one SQLite file, written before any observer is notified.
 
 The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
-it is handed over; what `Journal` has returned from survives the death of the process and of the machine.
+it is handed over; what `Journal` has returned from survives a crash of the process and of the machine.
 Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
 becomes one self-contained file, which can be read where nothing can be written.
 
@@ -11,7 +11,7 @@ Schema, version 1
     Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `overrides`, `protocol`,
     `parameters`, `seed`, `clock`, `epoch` (time of day at t = 0), `devices` (identity by name),
     `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and whether it was clean),
-    `host` (with the room's time at the start), `controls` (the signal under control), `plan`, `dashboard`,
+    `host` (with the wall-clock time at the start), `controls` (the signal under control), `plan`, `dashboard`,
     and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished` (laboratory s),
     `safe_state` (outcome by device). A file without `status` is of a run that is going on or whose process
     died.
@@ -113,7 +113,7 @@ class Event:
 
 
 _LONGEST_UNWRITTEN = 0.1
-"""Time of the room after which a tick is written for good, s."""
+"""Wall-clock time after which a tick is committed, s."""
 
 
 class Journal:
@@ -171,8 +171,8 @@ class Journal:
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Record one tick of a hold: laboratory time in s, step number, one value a signal.
 
-        A tick that comes less than 0.1 s of the room after the last write, as they do on the virtual clock, waits
-        for the next tick, step or event to be written with it.
+        A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
+        the next tick, step or event.
         """
         self._waiting.append((t, step, *map(float, values)))
         if self._since_write.seconds() >= _LONGEST_UNWRITTEN:
@@ -218,7 +218,7 @@ class Journal:
         self._db.close()
 
     def _write(self, statement: str, values: Sequence[object]) -> None:
-        """Write one row for good, after whatever waits."""
+        """Commit one row, after the ticks that wait."""
         if not self._waiting:
             self._db.execute(statement, values)
         else:
@@ -237,12 +237,12 @@ class Journal:
 
     def _put_meta(self, key: str, value: object) -> None:
         text = json.dumps(value, ensure_ascii=False, default=str)
-        # What no encoding holds, such as a file name of another system, becomes an escape, as JSON has it.
+        # Characters that no encoding holds, as in a file name of another system, become JSON escapes.
         text = text.encode("utf-8", "backslashreplace").decode("utf-8")
         self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
 
     def _transaction(self) -> AbstractContextManager[None]:
-        # Whoever has begun one already, writes all in it.
+        # Reuse an open transaction.
         return nullcontext() if self._db.in_transaction else _Transaction(self._db)
 
 
