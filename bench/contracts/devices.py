@@ -122,10 +122,13 @@ class ActuatorContract(DeviceContract):
     ----------
     beyond : float
         How far beyond its limits the actuator is asked to go, as a share of their range.
+    driven : str, optional
+        The quantity that follows the set-point, without the device's name, where the role says so.
     """
 
     role: ClassVar[type] = Actuator
     beyond: ClassVar[float] = 1e-3
+    driven: ClassVar[str | None] = None
 
     @pytest.fixture
     def sent(self) -> Callable[[], object]:
@@ -169,9 +172,9 @@ class ActuatorContract(DeviceContract):
         """Return how close a reading comes to its set-point; a hundredth of the range."""
         return 0.01 * (device.limits.high - device.limits.low)
 
-    def driven(self, device: Actuator) -> str | None:  # noqa: ARG002 - the roles ask the device
-        """Return the quantity that follows the set-point, without the device's name, where the role says so."""
-        return None
+    def quantity(self, device: Actuator) -> str | None:  # noqa: ARG002 - of a TEC amplifier its mode decides
+        """Return the quantity that follows the set-point now."""
+        return self.driven
 
     def test_set_point_has_a_unit_and_limits(self, device: Actuator) -> None:
         """The set-point is nan before the first; its signal, and the limits, are in the same unit."""
@@ -228,19 +231,21 @@ class ActuatorContract(DeviceContract):
         """A status completes when the device has arrived, and the readings change with the set-point."""
         found = []
         for value in set_points:
-            ended: list[object] = []
             status = device.set(value)
-            status.add_callback(ended.append)
             assert device.setpoint == value
             status.wait()
+            ended: list[object] = []
+            status.add_callback(ended.append)
+            assert ended == [status]
             assert status.done
             assert status.success
             assert status.exception() is None
             clock.sleep(0.05)
             found.append(_values(device, device.measure()))
-            if (quantity := self.driven(device)) is not None:
-                assert found[-1][f"{device.name}_{quantity}"] == pytest.approx(value, abs=tolerance)
         assert found[0] != found[1], f"the readings of {device.name} are the same at {set_points}: they are stale"
+        if (quantity := self.quantity(device)) is not None:
+            for value, values in zip(set_points, found, strict=True):
+                assert values[f"{device.name}_{quantity}"] == pytest.approx(value, abs=tolerance)
 
     def test_safe_after_a_set_point_and_again_changes_nothing(
         self, device: Actuator, clock: Clock, set_points: tuple[float, float], effects: Callable[[], object]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from typing import ClassVar
 
 import pytest
 
@@ -31,7 +31,7 @@ class TECAmplifierContract(ActuatorContract):
     role = TECAmplifier
     quantities = (("temperature", "°C"), ("sink_temperature", "°C"), ("current", "A"), ("voltage", "V"))
 
-    def driven(self, device: Actuator) -> str:
+    def quantity(self, device: Actuator) -> str:
         """Return what the mode holds constant."""
         assert isinstance(device, TECAmplifier)
         return device.mode.value
@@ -65,10 +65,7 @@ class VoltageSupplyContract(ActuatorContract):
 
     role = VoltageSupply
     quantities = (("voltage", "V"), ("current", "A"))
-
-    def driven(self, device: Actuator) -> str:  # noqa: ARG002
-        """Return the voltage."""
-        return "voltage"
+    driven = "voltage"
 
     def test_output_names_its_voltage(self, device: VoltageSupply) -> None:
         """`output` is one of the three, and the descriptions name it."""
@@ -98,7 +95,7 @@ class LoadCellContract(DeviceContract):
     def resolution(self, device: LoadCell) -> float:
         """Return how close two readings of one force are, N; twice the spread of ten readings and 2 mN."""
         (forces,) = zip(*(device.glance().values() for _ in range(10)), strict=True)
-        return 2e-3 + 2.0 * (max(forces) - min(forces))
+        return 2e-3 + 2.0 * float(max(forces) - min(forces))
 
     def test_tare_makes_the_present_force_zero(self, device: LoadCell, resolution: float) -> None:
         """`tare` makes the present force zero, again without effect; `clear_tare` brings the gross force back."""
@@ -132,29 +129,27 @@ class TemperatureSensorContract(DeviceContract):
 
 
 class _PositionerContract(ActuatorContract):
-    """What a servo and a linear stage have in common."""
+    """What a servo and a linear stage have in common; `holding` is the property that says that it holds."""
 
-    @abstractmethod
-    def holds(self, device: Actuator) -> bool:
-        """Return whether the device holds its position."""
-
-    def driven(self, device: Actuator) -> str:  # noqa: ARG002
-        """Return the position."""
-        return "position"
+    driven = "position"
+    holding: ClassVar[str]
 
     def test_holds_from_set_until_safe(self, device: Actuator, clock: Clock, set_points: tuple[float, float]) -> None:
         """It is free at first, held after `set` and `stop`, free after `safe`; `stop` holds nothing that is free."""
-        device.stop()
-        assert not self.holds(device)
-        for value in set_points:
-            device.set(value)
-            assert self.holds(device)
+        first, second = set_points
+        found = []
+        for bring in (
+            device.stop,
+            lambda: device.set(first),
+            device.stop,
+            device.safe,
+            device.stop,
+            lambda: device.set(second),
+        ):
+            bring()
             clock.sleep(0.1)
-            device.stop()
-            assert self.holds(device)
-            device.safe()
-            device.stop(success=False)
-            assert not self.holds(device)
+            found.append(getattr(device, self.holding))
+        assert found == [False, True, True, False, False, True]
 
     def test_stop_holds_the_position_of_the_moment(
         self, device: Actuator, clock: Clock, set_points: tuple[float, float], tolerance: float
@@ -178,11 +173,7 @@ class ServoContract(_PositionerContract):
 
     role = Servo
     quantities = (("position", "rad"), ("velocity", "rad/s"), ("load", "1"))
-
-    def holds(self, device: Actuator) -> bool:
-        """Return whether the torque is on."""
-        assert isinstance(device, Servo)
-        return device.torque_enabled
+    holding = "torque_enabled"
 
 
 class LinearStageContract(_PositionerContract):
@@ -190,11 +181,7 @@ class LinearStageContract(_PositionerContract):
 
     role = LinearStage
     quantities = (("position", "m"), ("velocity", "m/s"), ("load", "1"))
-
-    def holds(self, device: Actuator) -> bool:
-        """Return whether the stage is under force."""
-        assert isinstance(device, LinearStage)
-        return device.force_enabled
+    holding = "force_enabled"
 
 
 class SwitchContract(ActuatorContract):
@@ -202,6 +189,7 @@ class SwitchContract(ActuatorContract):
 
     role = Switch
     quantities = (("state", "1"),)
+    driven = "state"
 
     @pytest.fixture
     def set_points(self) -> tuple[float, float]:
@@ -217,10 +205,6 @@ class SwitchContract(ActuatorContract):
     def allowed(self) -> str:
         """Return how a message names what is allowed."""
         return "neither 0 (off) nor 1 (on)"
-
-    def driven(self, device: Actuator) -> str:  # noqa: ARG002
-        """Return the state."""
-        return "state"
 
     def test_set_point_has_a_unit_and_limits(self, device: Actuator) -> None:
         """The set-point is nan before the first and has the unit 1; the limits are off and on."""
