@@ -138,7 +138,7 @@ class TestCarryOut:
         assert outcome.status == "completed", outcome.reason
         assert outcome.is_safe
 
-    @pytest.mark.timeout(60)
+    @pytest.mark.timeout(200)
     def test_ctrl_c_waits_for_no_console(self, make, console, capfd):
         # Whatever was interrupted may hold the console's locks, or wait for another that holds them.
         held, release, released = threading.Event(), threading.Event(), threading.Event()
@@ -146,7 +146,7 @@ class TestCarryOut:
         def hold():
             with console._lock:
                 held.set()
-                release.wait(10.0)
+                release.wait(60.0)
                 released.set()
 
         def press(parameters):
@@ -154,7 +154,7 @@ class TestCarryOut:
                 event.clear()
             holder = threading.Thread(target=hold)
             holder.start()
-            held.wait(10.0)
+            held.wait(60.0)
             signal.raise_signal(signal.SIGINT)
             seen.append(released.is_set())
             release.set()
