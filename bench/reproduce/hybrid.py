@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from bench.campaign import Campaign, make_table, print_end
 from bench.clock import Stopwatch
 from bench.figures import Curve, plot_panels, plot_tracking
 from bench.hybrid_runs import (
@@ -40,7 +41,6 @@ from bench.identification.thermal_network import Design
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.report import export_run
-from bench.reproduce.campaign import Campaign, make_table, print_end
 from bench.runs import RunResult
 
 Floats = npt.NDArray[np.float64]
