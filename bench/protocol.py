@@ -615,9 +615,9 @@ def packaged_protocols() -> dict[str, ProtocolDefinition]:
     """
     found: dict[str, ProtocolDefinition] = {}
     package = importlib.import_module(PROTOCOL_PACKAGE)
-    for module in pkgutil.iter_modules(package.__path__):
+    for module in pkgutil.walk_packages(package.__path__, f"{PROTOCOL_PACKAGE}."):
         try:
-            imported = importlib.import_module(f"{PROTOCOL_PACKAGE}.{module.name}")
+            imported = importlib.import_module(module.name)
         except Exception as error:
             raise ConfigurationError(
                 f"protocol module {module.name} cannot be loaded: {type(error).__name__}: {error}"

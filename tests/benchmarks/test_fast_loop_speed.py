@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from bench.clock import Stopwatch, VirtualClock
-from bench.control.hybrid import FineController, FineParameters
 from bench.engine import Engine
-from bench.hybrid_runs import DEFLECTION
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import Design
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import FastLoop, ProtocolParameters, protocol
 from bench.rig import Rig, load_rig
 from bench.runs import trace_signals
+from rigs.hybrid.control import FineController, FineParameters
+from rigs.hybrid.identification import DEFLECTION
+from rigs.hybrid.model import HybridModel
+from rigs.hybrid.network import Design
 
 pytestmark = pytest.mark.benchmark
 

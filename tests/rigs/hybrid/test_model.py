@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification.dynamics import PUBLISHED_DYNAMICS, ThirdOrder
-from bench.identification.hybrid_model import HybridModel, choose_order, identify_pi, identify_polynomial
-from bench.identification.thermal_network import NODES, Design
+from rigs.hybrid.model import HybridModel, choose_order, identify_pi, identify_polynomial
+from rigs.hybrid.network import NODES, Design
 
 NETWORK = Design().network()
 TIP = NODES.index("tip")

@@ -5,7 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from bench.control.hybrid import (
+from bench.control.loops import SampledController
+from bench.model_file import load_hybrid_model
+from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from protocols.muscle import parse_numbers
+from rigs.hybrid.control import (
     AddedSine,
     FineController,
     FineParameters,
@@ -17,11 +21,7 @@ from bench.control.hybrid import (
     ThermalFeedback,
     staircase,
 )
-from bench.control.loops import SampledController
-from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS
-from bench.model_file import load_hybrid_model
-from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
-from protocols.muscle import parse_numbers
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.identification.thermal_network import (
+from rigs.hybrid.network import (
     FREE_PARAMETERS,
     NODES,
     Design,

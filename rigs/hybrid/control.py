@@ -27,8 +27,8 @@ from bench.control.tracking import Trace, check_positive
 from bench.hysteresis import Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.dynamics import notch
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import ThermalNetwork
+from rigs.hybrid.model import HybridModel
+from rigs.hybrid.network import ThermalNetwork
 
 Reference: TypeAlias = Callable[[float], float]
 """Wanted deflection, m, at a time in s from the first complete reading; also before 0 and after the end."""

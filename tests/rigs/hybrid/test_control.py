@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.control.hybrid import (
+from bench.hysteresis import DeadZones, PrandtlIshlinskii
+from bench.identification.dynamics import PUBLISHED_DYNAMICS, identify_dynamics
+from rigs.hybrid.control import (
     AddedSine,
     FineController,
     FineParameters,
@@ -26,10 +28,8 @@ from bench.control.hybrid import (
     _Unscented,
     staircase,
 )
-from bench.hysteresis import DeadZones, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS, identify_dynamics
-from bench.identification.hybrid_model import HybridModel, identify_pi, identify_polynomial
-from bench.identification.thermal_network import Design, identify_network
+from rigs.hybrid.model import HybridModel, identify_pi, identify_polynomial
+from rigs.hybrid.network import Design, identify_network
 from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.control.loops import Playback
-from bench.hybrid_runs import BASE, DEFLECTION, TIP
 from bench.protocol import Dwell, FastLoop, Messages, Phase, ProtocolParameters, Step, parameter, protocol
 from protocols.muscle import parse_numbers
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP
 
 SENSORS = (DEFLECTION, BASE, TIP)
 THERMAL = ("tec", *SENSORS)

@@ -12,21 +12,21 @@ from rich.console import Console
 
 from bench.cli import main
 from bench.clock import VirtualClock
-from bench.control.hybrid import HybridController, OpenLoopHybrid, ThermalFeedback
 from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
-from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import Design
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
-from protocols.hybrid_control import REST, moves_of
-from sim_devices.hybrid import ENABLE_LINE, HybridLaboratory
+from protocols.hybrid.control import REST, moves_of
+from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
+from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
+from rigs.hybrid.model import HybridModel
+from rigs.hybrid.network import Design
 
 WIRED, DIRECT = "hybrid", "hybrid-direct"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
