@@ -53,7 +53,7 @@ FREE_PARAMETERS: tuple[str, ...] = (
 )
 """What `identify_network` fits unless told otherwise."""
 
-_ABSOLUTE_ZERO = -273.15
+ABSOLUTE_ZERO = -273.15
 _BLOCK_END, _BLOCK_FRONT, _BASE, _TIP = range(4)
 
 # Farthest that a parameter may move from its start, as logarithm: a factor of 20.
@@ -390,7 +390,7 @@ class ThermalNetwork:
     def _system(self, current: float, ambient: float) -> tuple[Floats, Floats]:
         """Return M and b: the rises above ambient change at M @ rises + b."""
         joule, peltier = self._forcing(current)
-        return self._matrix(current), joule + (ambient - _ABSOLUTE_ZERO) * peltier
+        return self._matrix(current), joule + (ambient - ABSOLUTE_ZERO) * peltier
 
     def _forcing(self, current: float) -> tuple[Floats, Floats]:
         """Return what the current does at rest: rates by Joule heat, K/s, and by Peltier heat, per kelvin of air."""
@@ -432,7 +432,7 @@ class ThermalNetwork:
 
     def _back_face(self, temperatures: Floats, current: float) -> float:
         """Return the absolute temperature of the massless node, K."""
-        absolute = temperatures - _ABSOLUTE_ZERO
+        absolute = temperatures - ABSOLUTE_ZERO
         joule = 0.5 * self.electrical_resistance * current**2
         flow = joule + absolute[_BASE] / self.tec_resistance + absolute[_BLOCK_FRONT] / self.glue_resistance
         return float(flow / self._node_conductance(current))
@@ -466,7 +466,7 @@ class ThermalNetwork:
     def electrical_power(self, temperatures: ArrayLike, current: float) -> float:
         """Return R_p i² + alpha (T_0 - T_x) i, what the cooler takes from its supply, W."""
         nodes, i = _nodes("temperatures", temperatures), _checks.number("current", current)
-        difference = nodes[_BASE] - _ABSOLUTE_ZERO - self._back_face(nodes, i)
+        difference = nodes[_BASE] - ABSOLUTE_ZERO - self._back_face(nodes, i)
         return float(self.electrical_resistance * i**2 + self.seebeck * difference * i)
 
     def linearise(self, current: float = 0.0, ambient: float = 22.0) -> tuple[Floats, Floats]:
@@ -485,7 +485,7 @@ class ThermalNetwork:
         back_by_current = (joule - self.seebeck * back) / self._node_conductance(current)
         heat = np.zeros(4)
         heat[_BLOCK_FRONT] = back_by_current / self.glue_resistance
-        front = self.seebeck * (temperatures[_BASE] - _ABSOLUTE_ZERO)
+        front = self.seebeck * (temperatures[_BASE] - ABSOLUTE_ZERO)
         heat[_BASE] = front + joule + back_by_current / self.tec_resistance
         return self._matrix(current), heat / self.capacities
 
@@ -560,7 +560,7 @@ class ThermalNetwork:
         for first, stop in _runs(i, air):
             transition = _transition(self, float(i[first]), step)
             # At rest without current the rises stay exactly 0.
-            state = np.concatenate([now - air[first], [1.0, air[first] - _ABSOLUTE_ZERO]])
+            state = np.concatenate([now - air[first], [1.0, air[first] - ABSOLUTE_ZERO]])
             path = _powers(transition, state, stop - first)[:, :4] + air[first]
             result[first:stop] = path[:-1]
             now = path[-1]
@@ -640,7 +640,7 @@ def _ambients(ambient: ArrayLike, count: int) -> Floats:
 
 def _air(ambient: ArrayLike) -> float:
     value = _checks.number("ambient", ambient)
-    if value <= _ABSOLUTE_ZERO:
+    if value <= ABSOLUTE_ZERO:
         raise ValueError(f"ambient: expected °C above absolute zero, got {value}")
     return value
 

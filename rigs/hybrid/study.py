@@ -19,7 +19,6 @@ from rich.console import Console
 from bench.clock import Stopwatch
 from bench.figures import Curve, plot_panels, plot_tracking
 from bench.identification import measure_errors
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.report import export_run
@@ -41,6 +40,7 @@ from rigs.hybrid.identification import (
     read_loops,
     sine_at,
 )
+from rigs.hybrid.model import PUBLISHED_DYNAMICS
 from rigs.hybrid.network import Design
 
 Floats = npt.NDArray[np.float64]

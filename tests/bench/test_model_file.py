@@ -20,7 +20,6 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.model_file import (
     COUPLED_FORMAT,
     FORMAT,
@@ -36,7 +35,7 @@ from bench.model_file import (
     parse_coupled_model,
     parse_model,
 )
-from rigs.hybrid.model import HybridModel
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 from rigs.hybrid.network import Design
 
 LEVELS = uniform_levels(30.0, 70.0, 4)

@@ -12,8 +12,8 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS, ThirdOrder
-from rigs.hybrid.model import HybridModel, choose_order, identify_pi, identify_polynomial
+from bench.identification.dynamics import ThirdOrder
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network import NODES, Design
 
 NETWORK = Design().network()
