@@ -20,7 +20,7 @@ from bench.identification.dynamics import DynamicsIdentification, identify_dynam
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
-from rigs.hybrid.network import NetworkIdentification, identify_network
+from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
 Floats = npt.NDArray[np.float64]
 

@@ -24,6 +24,7 @@ from bench.model_file import HybridFile
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
 from bench.runs import RunResult
+from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
     BASE,
     CURRENT,
@@ -41,7 +42,6 @@ from rigs.hybrid.identification import (
     sine_at,
 )
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
-from rigs.hybrid.network import Design
 
 Floats = npt.NDArray[np.float64]
 

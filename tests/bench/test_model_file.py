@@ -35,8 +35,8 @@ from bench.model_file import (
     parse_coupled_model,
     parse_model,
 )
+from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
-from rigs.hybrid.network import Design
 
 LEVELS = uniform_levels(30.0, 70.0, 4)
 INPUTS = np.array([21.0, 84.0, 40.0, 60.0, 55.0])

@@ -12,9 +12,9 @@ from bench.protocol import FastLoop, ProtocolParameters, protocol
 from bench.rig import Rig, load_rig
 from bench.runs import trace_signals
 from rigs.hybrid.control import fine_controller
+from rigs.hybrid.design import Design
 from rigs.hybrid.identification import DEFLECTION
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
-from rigs.hybrid.network import Design
 
 pytestmark = pytest.mark.benchmark
 

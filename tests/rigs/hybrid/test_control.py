@@ -16,9 +16,10 @@ from rigs.hybrid.control import (
     ThermalFeedback,
     fine_controller,
 )
+from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, ThermalNoise, UnscentedEstimate
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_pi, identify_polynomial
-from rigs.hybrid.network import Design, identify_network
+from rigs.hybrid.network_identification import identify_network
 from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9

@@ -13,8 +13,9 @@ from scipy.integrate import solve_ivp
 
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification.dynamics import ThirdOrder
+from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, choose_order, identify_pi, identify_polynomial
-from rigs.hybrid.network import NODES, Design
+from rigs.hybrid.network import NODES
 
 NETWORK = Design().network()
 TIP = NODES.index("tip")

@@ -22,10 +22,10 @@ from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid.control import REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
+from rigs.hybrid.design import Design
 from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
 from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
-from rigs.hybrid.network import Design
 
 WIRED, DIRECT = "hybrid", "hybrid-direct"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
