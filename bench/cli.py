@@ -9,16 +9,18 @@ from __future__ import annotations
 import json
 import sqlite3
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 import typer
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
+from typer.core import TyperGroup
 
+from bench import registry
 from bench.errors import BenchError, ConfigurationError
 
 _EPILOG = (
@@ -28,8 +30,77 @@ _EPILOG = (
 )
 UNSAFE_EXIT_CODE = 7
 
+
+class RegisteredCommands(TyperGroup):
+    """A group of commands with those that packages register in `group`, each loaded when it is asked for."""
+
+    group: ClassVar[registry.Group] = "commands"
+
+    # The types of click are a private part of typer.
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
+        """Return the names of all commands, the registered ones last."""
+        own = super().list_commands(ctx)
+        return [*own, *(name for name in registry.entries(self.group) if name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
+        """Return a command; one that cannot be loaded says so when it is called."""
+        entry = registry.entries(self.group).get(cmd_name)
+        if cmd_name in self.commands or entry is None:
+            return super().get_command(ctx, cmd_name)
+        one = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+        try:
+            callback = self.make_callback(cmd_name, entry.load())
+        except ConfigurationError as error:
+            failure = error
+
+            def callback() -> None:
+                raise failure
+
+            callback.__doc__ = f"Cannot be loaded: {error}"
+        one.command(cmd_name)(callback)
+        return typer.main.get_command(one)
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401
+        """Return the function of a command whose entry point is `part`: that itself."""
+        callback: Callable[..., None] = part
+        return callback
+
+
+class Studies(RegisteredCommands):
+    """The commands of `bench reproduce`, one for each registered study."""
+
+    group = "studies"
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ANN401
+        """Return a function that carries a study out."""
+
+        def carry_out_study(
+            rig: Annotated[
+                str | None,
+                typer.Option("--rig", metavar="RIG", help="Another rig with the same signals."),
+            ] = None,
+            seed: Annotated[
+                int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
+            ] = 0,
+            out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path(
+                "recordings"
+            ),
+            live: Annotated[
+                bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+            ] = False,
+            json_file: JsonOption = None,
+        ) -> None:
+            from bench.campaign import reproduce
+
+            write_json(json_file, reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console))
+
+        carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"
+        return carry_out_study
+
+
 app = typer.Typer(
     name="bench",
+    cls=RegisteredCommands,
     help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
     "identify hysteresis models from what was measured, and apply them.",
     epilog=_EPILOG,
@@ -729,75 +800,15 @@ def _print_table(title: str, rows: dict[str, str]) -> None:
     console.print()
 
 
-reproduce = typer.Typer(
+reproduce_ = typer.Typer(
     help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
     no_args_is_help=True,
+    cls=Studies,
 )
-app.add_typer(reproduce, name="reproduce")
+app.add_typer(reproduce_, name="reproduce")
 
 
-@reproduce.command("vo2")
-def reproduce_vo2_(
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """VO2 microactuator: characterization, identification and validation, the paper's tables beside the measured.
-
-    Zhang et al., Modeling and inverse compensation of nonmonotonic hysteresis in VO2-coated microactuators, 2013.
-    """
-    from bench.reproduce.vo2 import reproduce_vo2
-
-    result = reproduce_vo2(rig="vo2", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)
-
-
-@reproduce.command("sma")
-def reproduce_sma_(
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the emulated laboratory's noise, the voltages and the targets.")
-    ] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.
-
-    Zhang and Yip, Three-dimensional hysteresis modeling of robotic artificial muscles with application to shape
-    memory alloy actuators, 2017.
-    """
-    from bench.reproduce.sma import reproduce_sma
-
-    result = reproduce_sma(rig="sma", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)
-
-
-@reproduce.command("muscles")
-def reproduce_muscles_(
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the emulated laboratories' noise and of the voltages.")
-    ] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """McKibben and super-coiled polymer muscles: the same protocols and models as for the SMA wire.
-
-    The outlook of Zhang and Yip, 2017.
-    """
-    from bench.reproduce.muscles import reproduce_muscles
-
-    write_json(json_file, reproduce_muscles(seed=seed, out=out, live=live, console=console))
-
-
-@reproduce.command("hybrid")
+@reproduce_.command("hybrid")
 def reproduce_hybrid_(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),

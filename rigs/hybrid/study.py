@@ -22,7 +22,7 @@ from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.report import export_run
-from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.campaign import Campaign, make_table, print_end
 from bench.runs import RunResult
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
