@@ -440,8 +440,8 @@ def identify_hybrid_(
     Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
     voltage, third-order dynamics from the fast step.
     """
-    from bench.hybrid_runs import identify_hybrid
     from bench.model_file import HybridFile
+    from rigs.hybrid.identification import identify_hybrid
 
     found = identify_hybrid(steps, static, loops, step, plays=plays)
     dynamics = found.dynamics
@@ -821,7 +821,7 @@ def reproduce_hybrid_(
 
     Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric microactuator, 2010.
     """
-    from bench.reproduce.hybrid import reproduce_hybrid
+    from rigs.hybrid.study import reproduce_hybrid
 
     result = reproduce_hybrid(rig="hybrid", seed=seed, out=out, live=live, console=console)
     write_json(json_file, result)

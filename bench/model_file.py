@@ -40,7 +40,7 @@ from bench.hysteresis import (
     coupled_from_json,
     operator_from_json,
 )
-from bench.identification.hybrid_model import HybridModel
+from rigs.hybrid.model import HybridModel
 
 FORMAT = "bench-model"
 COUPLED_FORMAT = "bench-coupled-model"

@@ -326,7 +326,15 @@ def parameter(
     low, high : float, optional
         The allowed range, both ends included.
     """
-    return Field(default, description=help, ge=low, le=high, json_schema_extra={"unit": unit})
+    # A default that is a text may stand for another type, such as a list of numbers.
+    return Field(
+        default,
+        description=help,
+        ge=low,
+        le=high,
+        json_schema_extra={"unit": unit},
+        validate_default=isinstance(default, str),
+    )
 
 
 @dataclass(frozen=True)
@@ -385,6 +393,8 @@ class ProtocolDefinition:
             allowed = ", ".join(map(str, get_args(info.annotation)))
         elif info.annotation is bool:
             allowed = "true, false"
+        elif get_origin(info.annotation) is tuple:
+            allowed = "numbers with commas between them"
         else:
             allowed = "any text" if info.annotation is str else "any number"
         default = "must be given" if info.default is PydanticUndefined else str(info.default)
@@ -615,9 +625,9 @@ def packaged_protocols() -> dict[str, ProtocolDefinition]:
     """
     found: dict[str, ProtocolDefinition] = {}
     package = importlib.import_module(PROTOCOL_PACKAGE)
-    for module in pkgutil.iter_modules(package.__path__):
+    for module in pkgutil.walk_packages(package.__path__, f"{PROTOCOL_PACKAGE}."):
         try:
-            imported = importlib.import_module(f"{PROTOCOL_PACKAGE}.{module.name}")
+            imported = importlib.import_module(module.name)
         except Exception as error:
             raise ConfigurationError(
                 f"protocol module {module.name} cannot be loaded: {type(error).__name__}: {error}"

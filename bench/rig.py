@@ -48,6 +48,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, ClassVar, Protocol, Self
@@ -191,10 +192,13 @@ class RigFile:
 
 def packaged_rigs() -> tuple[str, ...]:
     """Return the names of the rigs that come with the bench."""
-    folder = resources.files("bench") / "rigs"
-    return tuple(
-        sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    )
+    return tuple(sorted(_packaged()))
+
+
+def _packaged() -> dict[str, Traversable]:
+    folders = [resources.files("bench") / "rigs", *(f for f in resources.files("rigs").iterdir() if f.is_dir())]
+    files = (file for folder in folders for file in folder.iterdir() if file.name.endswith(".toml"))
+    return {file.name.removesuffix(".toml"): file for file in files}
 
 
 def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
@@ -404,7 +408,7 @@ def _read(name: str) -> tuple[str, str]:
             f"there is no rig {name!r}; there are: {', '.join(packaged_rigs())} "
             "(or a file of your own, path/to/rig.toml)"
         )
-    return f"{name}.toml", (resources.files("bench") / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
+    return f"{name}.toml", _packaged()[name].read_text(encoding="utf-8")
 
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:

@@ -12,21 +12,20 @@ from rich.console import Console
 
 from bench.cli import main
 from bench.clock import VirtualClock
-from bench.control.hybrid import HybridController, OpenLoopHybrid, ThermalFeedback
 from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
-from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import Design
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
-from protocols.hybrid_control import REST, moves_of
-from sim_devices.hybrid import ENABLE_LINE, HybridLaboratory
+from protocols.hybrid.control import REST, moves_of
+from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
+from rigs.hybrid.design import Design
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
+from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 WIRED, DIRECT = "hybrid", "hybrid-direct"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
@@ -320,23 +319,35 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("protocol", "settings", "words"),
         [
-            ("current-sine", {"frequencies": ""}, "frequencies = '': expected numbers with commas between them"),
-            ("current-sine", {"frequencies": "0.001, x"}, "frequencies = '0.001, x': expected numbers"),
+            (
+                "current-sine",
+                {"frequencies": ""},
+                "= '' is not allowed; allowed: numbers with commas between them Hz",
+            ),
+            (
+                "current-sine",
+                {"frequencies": "0.001, x"},
+                "frequencies = '0.001, x' is not allowed",
+            ),
             ("current-sine", {"frequencies": "0.06"}, "frequencies: expected more than 0 and at most 0.05 Hz"),
             ("current-sine", {"frequencies": "0.001, -0.001"}, "frequencies: expected more than 0"),
             ("current-sine", {"periods": "1"}, "periods = '1' is not allowed; allowed: 2 to 100"),
             ("current-sine", {"amplitude": "2"}, "amplitude = '2' is not allowed; allowed: 0.001 to 1 A"),
-            ("current-steps", {"levels": "inf"}, "levels = 'inf': expected numbers"),
+            ("current-steps", {"levels": "inf"}, "levels = 'inf' is not allowed; allowed: numbers"),
             ("current-steps", {"on": "0"}, "on = '0' is not allowed; allowed: 1 to 36000 s"),
             ("thermomechanical", {"coldest": "0.1"}, "coldest = '0.1' is not allowed; allowed: -1 to 0 A"),
             ("thermomechanical", {"levels": "1"}, "levels = '1' is not allowed"),
-            ("piezo-loops", {"amplitudes": "40; 20"}, "amplitudes = '40; 20': expected numbers"),
+            ("piezo-loops", {"amplitudes": "40; 20"}, "amplitudes = '40; 20' is not allowed; allowed: numbers"),
             ("piezo-loops", {"frequency": "0"}, "frequency = '0' is not allowed"),
             ("piezo-step", {"rate": "1"}, "rate = '1' is not allowed; allowed: 10 to 1e+06 Hz"),
             ("hybrid-excitation", {"voltage": "-1"}, "voltage = '-1' is not allowed; allowed: 0 to 1000 V"),
             ("hybrid-control", {"controller": "magic"}, "controller = 'magic' is not allowed"),
             ("hybrid-control", {"reference": "circle"}, "reference = 'circle' is not allowed"),
-            ("hybrid-control", {"positions": "1e-6 2e-6"}, "positions = '1e-6 2e-6': expected numbers"),
+            (
+                "hybrid-control",
+                {"positions": "1e-6 2e-6"},
+                "positions = '1e-6 2e-6' is not allowed",
+            ),
             ("hybrid-control", {"positions": "5e-6, -2e-4"}, "expected numbers from -0.000199 to 0.000199 m"),
             ("hybrid-control", {"low": "-2e-4"}, "low = '-2e-4' is not allowed; allowed: -0.000199 to 0.000199 m"),
             ("hybrid-control", {"reference": "staircase", "low": "1e-6", "high": "1e-6"}, "low, high: expected"),

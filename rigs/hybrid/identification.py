@@ -17,10 +17,10 @@ from bench.errors import DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
-from bench.identification.hybrid_model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
-from bench.identification.thermal_network import NetworkIdentification, identify_network
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
+from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
+from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
 Floats = npt.NDArray[np.float64]
 

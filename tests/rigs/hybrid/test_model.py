@@ -12,9 +12,10 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS, ThirdOrder
-from bench.identification.hybrid_model import HybridModel, choose_order, identify_pi, identify_polynomial
-from bench.identification.thermal_network import NODES, Design
+from bench.identification.dynamics import ThirdOrder
+from rigs.hybrid.design import Design
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, choose_order, identify_pi, identify_polynomial
+from rigs.hybrid.network import NODES
 
 NETWORK = Design().network()
 TIP = NODES.index("tip")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.hybrid_runs import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from bench.journal import Record
 from bench.model_file import load_hybrid_model
-from bench.reproduce.hybrid import CONTROLLERS, RESONANCES, Tracking
+from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
+from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
 
 RUNS = {
     "current-sine": 2,

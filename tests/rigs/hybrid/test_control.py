@@ -6,30 +6,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from bench.control.hybrid import (
-    AddedSine,
-    FineController,
-    FineParameters,
+from bench.control.references import AddedSine, SmoothMoves, staircase
+from bench.identification.dynamics import identify_dynamics
+from rigs.hybrid.control import (
     HybridController,
-    HysteresisInverse,
     MidRangingParameters,
     OpenLoopHybrid,
-    SmoothMoves,
     ThermalFeedback,
-    ThermalNoise,
-    _Bending,
-    _LowPass,
-    _Network,
-    _Unscented,
-    staircase,
+    fine_controller,
 )
-from bench.hysteresis import DeadZones, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS, identify_dynamics
-from bench.identification.hybrid_model import HybridModel, identify_pi, identify_polynomial
-from bench.identification.thermal_network import Design, identify_network
+from rigs.hybrid.design import Design
+from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, ThermalNoise, UnscentedEstimate
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_pi, identify_polynomial
+from rigs.hybrid.network_identification import identify_network
 from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9
@@ -221,7 +211,7 @@ def test_comparisons_are_far_worse(model):
 def test_fine_step(model, seed, offset):
     for size in (5 * MICRO, -5 * MICRO):
         settling, overshoot, rest = step_response(
-            FineController(model, step(size)), size, seed, resonance_offset=offset
+            fine_controller(model, step(size)), size, seed, resonance_offset=offset
         )
         assert settling < 12e-3
         assert overshoot < 0.01
@@ -235,7 +225,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
     plant.drive(current)
     plant.advance(600.0)
     place, size = plant.deflection, 5 * MICRO
-    controller = FineController(model, step(place + size, 0.1, place))
+    controller = fine_controller(model, step(place + size, 0.1, place))
     noise = NOISE[0] * np.random.default_rng(9).standard_normal(8000)
     deflections = []
     for k, each in enumerate(noise.tolist()):
@@ -251,7 +241,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
 def test_fine_loop_needs_its_notch(model):
     # With zeros damped as the poles are, it is none; half the gain then rings already.
     without = replace(model, dynamics=replace(model.dynamics, damping=0.7))
-    controller = FineController(without, step(5 * MICRO), FineParameters(integral=150.0))
+    controller = fine_controller(without, step(5 * MICRO), integral=150.0)
     settling, overshoot, _ = step_response(controller, 5 * MICRO, 0)
     assert settling > 20e-3
     assert overshoot > 0.015
@@ -326,7 +316,7 @@ def test_what_is_out_of_reach_does_not_wind_up(model):
 
 def test_fine_integral_does_not_wind_up(model):
     # 30 µm is out of reach of the piezo part; from there back to 2 µm in no more than the usual time.
-    controller = FineController(model, step(2 * MICRO, 0.3, 30 * MICRO))
+    controller = fine_controller(model, step(2 * MICRO, 0.3, 30 * MICRO))
     plant = plant_of(8, 0, ambient_sd=0.0)
     deflections, voltages = [], []
     for k in range(round(0.4 / FAST)):
@@ -382,7 +372,7 @@ def test_missing_readings_hold_and_are_got_over(model, estimator):
 
 
 def test_fine_loop_holds_at_a_missing_reading(model):
-    controller = FineController(model, step(1 * MICRO, 0.0))
+    controller = fine_controller(model, step(1 * MICRO, 0.0))
     assert controller.update(0.0, (math.nan,)) == (0.0,)
     first = [controller.update(FAST * k, (0.0, 25.0)) for k in range(1, 4)]
     assert first[0] != first[2]
@@ -417,88 +407,9 @@ def test_traces(model):
 # Parts.
 
 
-def test_smooth_moves_visit_the_positions():
-    moves = SmoothMoves([10 * MICRO, 40 * MICRO, 39.9 * MICRO], SPEED, hold=7.0, blend=4.0)
-    assert moves.duration == pytest.approx(10.0 + 4.0 + 7.0 + 0.1 / 3.0 + 4.0 + 7.0)
-    assert moves(-1.0) == moves(0.0) == 10 * MICRO
-    assert moves(14.0) == moves(20.9) == 40 * MICRO
-    assert moves(26.0) == moves(1e6) == 39.9 * MICRO
-    assert moves.rate(7.0) == pytest.approx(SPEED)
-    assert moves(7.0) == pytest.approx(25 * MICRO)
-    # Too short for the top speed.
-    assert max(abs(moves.rate(t)) for t in np.linspace(21.0, 25.1, 200)) < 0.1 * SPEED
-    assert [moves.holding(t) for t in (-1.0, 0.0, 13.9, 14.1, 20.9, 21.1, 25.5)] == [False] * 3 + [True] * 2 + [
-        False,
-        True,
-    ]
-    assert moves.holding(16.1, 2.0)
-    assert not moves.holding(15.9, 2.0)
-
-
-@given(
-    st.lists(st.integers(-200, 200), min_size=2, max_size=5),
-    st.floats(0.1, 10.0),
-    st.floats(0.5, 20.0),
-    st.floats(0.0, 20.0),
-)
-def test_rate_of_smooth_moves_is_their_derivative_and_never_above_the_top(places, speed, blend, hold):
-    moves = SmoothMoves(MICRO * np.array(places), speed * MICRO, blend=blend, hold=hold)
-    times = np.linspace(-1.0, moves.duration + 1.0, 200)
-    rates = np.array([moves.rate(t) for t in times])
-    assert np.abs(rates).max() <= speed * MICRO * (1 + 1e-12)
-    h = 1e-4 * blend
-    numeric = np.array([(moves(t + h) - moves(t - h)) / (2 * h) for t in times])
-    assert numeric == pytest.approx(rates, abs=1e-3 * speed * MICRO)
-
-
-def test_staircase_and_sine():
-    stairs = staircase(-10 * MICRO, 10 * MICRO, 2, SPEED, start=3 * MICRO, hold=5.0, blend=2.0)
-    assert stairs(0.0) == 3 * MICRO
-    ends = np.cumsum([13 / 3, 10 / 3, 10 / 3, 10 / 3, 10 / 3]) + 7.0 * np.arange(1, 6)
-    assert [stairs(t - 0.1) for t in ends] == pytest.approx(MICRO * np.array([-10, 0, 10, 0, -10]), abs=1e-15)
-    sine = AddedSine(stairs, 2 * MICRO, 0.5)
-    # The end of the swelling is after four seconds.
-    times = np.linspace(4.0, 30.0, 50)
-    expected = [stairs(t) + 2 * MICRO * math.sin(math.pi * t) for t in times]
-    assert [sine(t) for t in times] == pytest.approx(expected, abs=1e-15)
-    assert sine(0.0) == stairs(0.0)
-    assert abs(sine(0.01) - stairs(0.01)) < 1e-3 * NANO
-
-
-def plays():
-    thresholds = 40.0 * np.arange(15) / 15
-    weights = 0.02 * MICRO * np.exp(-thresholds / 15.0)
-    weights[0], weights[5] = 0.17 * MICRO, 0.0
-    return PrandtlIshlinskii(thresholds, weights, bias=0.3 * MICRO, input_range=(-40.0, 40.0))
-
-
-@given(st.lists(st.floats(-12.0, 12.0), min_size=1, max_size=60))
-def test_inverse_by_samples_equals_the_inverse_operator(wanted):
-    operator = plays()
-    low, high = operator.output_range()
-    stroke = 9 * MICRO
-    bounded = np.clip(MICRO * np.array(wanted), max(low - operator.bias, -stroke), min(high - operator.bias, stroke))
-    inverse = HysteresisInverse(operator, stroke)
-    voltages = []
-    for each, within in zip(wanted, bounded, strict=True):
-        voltages.append(inverse.voltage(each * MICRO))
-        assert inverse.deflection == within
-    assert voltages == pytest.approx(operator.inverse().evaluate(bounded + operator.bias), abs=1e-9)
-    assert operator.evaluate(voltages) - operator.bias == pytest.approx(bounded, abs=1e-6 * NANO)
-    assert np.abs(voltages).max() <= 40.0 + 1e-9
-
-
-def test_inverse_by_samples_does_not_drift():
-    operator, rng = plays(), np.random.default_rng(0)
-    wanted = np.clip(np.cumsum(0.2 * MICRO * rng.standard_normal(50_000)), -8 * MICRO, 8 * MICRO)
-    inverse = HysteresisInverse(operator)
-    voltages = [inverse.voltage(each) for each in wanted.tolist()]
-    assert voltages == pytest.approx(operator.inverse().evaluate(wanted + operator.bias), abs=1e-9)
-
-
 def test_reduced_network_agrees_with_the_whole_one():
     whole = Design().network()
-    reduced = _Network(whole, 22.0)
+    reduced = ReducedNetwork(whole, 22.0)
     rng = np.random.default_rng(0)
     for _ in range(20):
         base, tip, reduced.block = rng.uniform(-20.0, 20.0, 3)
@@ -515,7 +426,7 @@ def test_reduced_network_agrees_with_the_whole_one():
 @pytest.mark.parametrize("current", [-0.15, -0.05, 0.02, 0.1])
 def test_heat_fed_forward_is_that_of_the_steady_state(current):
     whole = Design().network()
-    reduced = _Network(whole, 22.0)
+    reduced = ReducedNetwork(whole, 22.0)
     end, front, base, tip = whole.steady_rises(current, 22.0).tolist()
     reduced.block = front
     assert reduced.current_for(reduced.heat_for(tip, 0.0, base, current), base) == pytest.approx(current, rel=1e-6)
@@ -527,7 +438,7 @@ def test_heat_fed_forward_is_that_of_the_steady_state(current):
 
 
 def test_bending_is_inverted_and_goes_on_straight(model):
-    bending = _Bending(model.polynomial)
+    bending = Bending(model.polynomial)
     for rise in np.linspace(bending.low, bending.high, 50).tolist():
         expected = model.thermal_deflection([rise])[0]
         assert bending.deflection(rise) == pytest.approx(expected, abs=1e-3 * NANO)
@@ -546,15 +457,15 @@ def test_kalman_filter_finds_deflection_and_offset(room):
     network = Design().network()
     rises = np.linspace(-20.0, 25.0, 12)
     polynomial = identify_polynomial(rises, MICRO * (-7.4 * rises - 0.05 * rises**2), 2).model
-    bending = _Bending(polynomial)
+    bending = Bending(polynomial)
     rng = np.random.default_rng(0)
     step_time, count = 0.02, 6000
     currents = np.repeat(rng.uniform(-0.1, 0.1, count // 500), 500)
     truth = network.simulate(currents, step_time, room, start=np.full(4, room)) - 22.0
     deflection = np.array([bending.deflection(tip) for tip in truth[:, 3].tolist()]) + 0.3 * MICRO
-    reduced = _Network(network, 22.0)
-    kalman = _Unscented(bending, reduced, ThermalNoise(), PERIOD, 4)
-    plain = _LowPass(bending, -math.expm1(-PERIOD / 0.15))
+    reduced = ReducedNetwork(network, 22.0)
+    kalman = UnscentedEstimate(bending, reduced, ThermalNoise(), PERIOD, 4)
+    plain = LowPass(bending, -math.expm1(-PERIOD / 0.15))
     errors = []
     for k in range(count):
         base, tip = truth[k, 2:] + 0.02 * rng.standard_normal(2)
@@ -590,18 +501,6 @@ def folded():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: SmoothMoves([0.0], SPEED), "positions: expected at least 2"),
-        (lambda: SmoothMoves([0.0, math.nan], SPEED), "positions: expected finite"),
-        (lambda: SmoothMoves([0.0, 1.0], 0.0), "speed, blend, hold: expected positive"),
-        (lambda: SmoothMoves([0.0, 1.0], SPEED, hold=-1.0), "speed, blend, hold: expected positive"),
-        (lambda: SmoothMoves([0.0, 1.0], SPEED, blend=math.inf), "speed, blend, hold: expected positive"),
-        (lambda: staircase(0.0, 1.0, 0, SPEED), "steps: expected at least 1"),
-        (lambda: staircase(1.0, 0.0, 2, SPEED), "low, high: expected strictly increasing"),
-        (lambda: AddedSine(RANGE, MICRO, 0.0), "frequency: expected a positive"),
-        (lambda: AddedSine(RANGE, math.nan, 1.0), "amplitude: expected a finite"),
-        (lambda: HysteresisInverse(plays(), 0.0), "stroke: expected a positive"),
-        (lambda: HysteresisInverse(replace(plays(), after=DeadZones([0.0], [1.0, 2.0]))), "expected an operator of"),
-        (lambda: FineParameters(rate=0.0), "rate: expected a positive"),
         (lambda: MidRangingParameters(gain=-1.0), "gain: expected a positive"),
         (lambda: MidRangingParameters(integral=100.0), "integral: expected less than 100 1/s"),
         (lambda: ThermalNoise(heat=0.0), "heat: expected a positive"),
@@ -615,7 +514,7 @@ def test_wrong_input_is_named(make, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda m: FineController(m, RANGE, FineParameters(rate=1e3)), "frequency: expected rad/s between"),
+        (lambda m: fine_controller(m, RANGE, rate=1e3), "frequency: expected rad/s between"),
         (lambda m: HybridController(m, RANGE, estimator="none"), "estimator: expected unscented or low-pass"),
         (lambda m: HybridController(m, RANGE).update(0.0, (0.0, 22.0)), "measured: expected deflection and two"),
         (lambda m: HybridController(replace(m, polynomial=folded()), RANGE), "polynomial: expected one that rises"),
@@ -627,8 +526,8 @@ def test_wrong_input_of_a_controller_is_named(model, make, message):
 
 
 def test_published_dynamics_do_as_well(model):
-    """Whoever has not measured the resonance takes the published one."""
+    """The published dynamics serve where the resonance was not measured."""
     published = replace(model, dynamics=PUBLISHED_DYNAMICS)
-    settling, overshoot, _ = step_response(FineController(published, step(5 * MICRO)), 5 * MICRO, 1)
+    settling, overshoot, _ = step_response(fine_controller(published, step(5 * MICRO)), 5 * MICRO, 1)
     assert settling < 12e-3
     assert overshoot < 0.01

@@ -6,6 +6,7 @@ micro-actuator", IEEE Transactions on Robotics 26(6), 2010, eqs. 18 to 22; here 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +18,23 @@ from bench.hysteresis import Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.dynamics import ThirdOrder
 from bench.identification.identify import Identification, Initial, identify
-from bench.identification.thermal_network import NODES, ThermalNetwork
+from rigs.hybrid.network import NODES, ThermalNetwork
 
 # How far beyond the range that a part was fitted on it may be used, as part of that range.
 _BEYOND = 0.05
+
+PUBLISHED_DYNAMICS = ThirdOrder(
+    gain=102.0 * 2.4e8 / (1274.0 * 1.9e7),
+    real_pole=1274.0,
+    frequency=math.sqrt(1.9e7),
+    damping=34.1 / (2.0 * math.sqrt(1.9e7)),
+    numerator=(2.58e4 / 2.4e8, 1.0 / 2.4e8),
+)
+"""D(s) of Rakotondrabe and Ivan 2010, eq. 21, as printed.
+
+The paper calls it delta/U, but its gain is 1.0113 instead of d_p: it is divided by the static deflection. Use
+`normalised` behind a static model.
+"""
 
 
 @dataclass(frozen=True, eq=False)

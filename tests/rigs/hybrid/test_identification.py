@@ -9,7 +9,11 @@ import pytest
 from rich.console import Console
 
 from bench.errors import DataError
-from bench.hybrid_runs import (
+from bench.hysteresis import PrandtlIshlinskii
+from bench.journal import FILE_NAME, Record, Table
+from bench.protocol import find_protocol
+from bench.runs import Run, carry_out
+from rigs.hybrid.identification import (
     BASE,
     CURRENT,
     DEFLECTION,
@@ -23,11 +27,7 @@ from bench.hybrid_runs import (
     read_loops,
     sine_at,
 )
-from bench.hysteresis import PrandtlIshlinskii
-from bench.identification.hybrid_model import identify_pi
-from bench.journal import FILE_NAME, Record, Table
-from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
+from rigs.hybrid.model import identify_pi
 
 # As few and as short as the parts can still be identified from.
 SHORT = {

@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.identification.thermal_network import (
-    FREE_PARAMETERS,
-    NODES,
-    Design,
-    Geometry,
-    Materials,
-    Tec,
-    ThermalNetwork,
-    identify_network,
-)
+from rigs.hybrid.design import Design, Geometry, Materials, Tec
+from rigs.hybrid.network import NODES, ThermalNetwork
+from rigs.hybrid.network_identification import FREE_PARAMETERS, identify_network
 
 KELVIN = 273.15
 NETWORK = Design().network()

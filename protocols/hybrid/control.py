@@ -5,23 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from bench.control.hybrid import (
-    AddedSine,
-    FineController,
-    FineParameters,
+from bench.control.loops import SampledController
+from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
+from bench.model_file import load_hybrid_model
+from bench.number_list import NumberList
+from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from rigs.hybrid.control import (
     HybridController,
     MidRangingParameters,
     OpenLoopHybrid,
-    Reference,
-    SmoothMoves,
     ThermalFeedback,
-    staircase,
+    fine_controller,
 )
-from bench.control.loops import SampledController
-from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS
-from bench.model_file import load_hybrid_model
-from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
-from protocols.muscle import parse_numbers
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -38,8 +34,8 @@ class Parameters(ProtocolParameters):
     model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
     controller: ControllerName = parameter("hybrid", unit="", help="which controller")
     reference: ReferenceName = parameter("moves", unit="", help="what is followed")
-    positions: str = parameter(
-        "60e-6, -50e-6, 90e-6, 85e-6, -120e-6, 0", unit="m", help="of moves: positions, with commas between them"
+    positions: NumberList = parameter(
+        "60e-6, -50e-6, 90e-6, 85e-6, -120e-6, 0", unit="m", help="of moves: positions, one after another"
     )
     low: float = parameter(-50e-6, unit="m", low=-REACH, high=REACH, help="lowest position of the others")
     high: float = parameter(50e-6, unit="m", low=-REACH, high=REACH, help="highest position of the others")
@@ -106,10 +102,8 @@ def fine_step(parameters: StepParameters) -> Messages:
     instruments are called directly.
     """
     model = load_hybrid_model(Path(parameters.model)).model
-    controller = FineController(
-        model,
-        lambda t: parameters.step if t >= parameters.rest else 0.0,
-        FineParameters(rate=parameters.rate),
+    controller = fine_controller(
+        model, lambda t: parameters.step if t >= parameters.rest else 0.0, rate=parameters.rate
     )
     yield Phase("fine step")
     yield FastLoop(
@@ -127,10 +121,9 @@ def moves_of(parameters: Parameters) -> SmoothMoves:
     """Return the moves that a reference consists of, without its sine."""
     p = parameters
     if p.reference == "moves":
-        positions = parse_numbers("positions", p.positions)
-        if max(map(abs, positions)) > REACH:
-            raise ValueError(f"positions = {p.positions!r}: expected numbers from {-REACH:g} to {REACH:g} m")
-        return SmoothMoves([0.0, *positions], p.speed, hold=p.hold)
+        if max(map(abs, p.positions)) > REACH:
+            raise ValueError(f"positions: expected numbers from {-REACH:g} to {REACH:g} m")
+        return SmoothMoves([0.0, *p.positions], p.speed, hold=p.hold)
     if p.reference == "staircase":
         return staircase(p.low, p.high, p.steps, p.speed, hold=p.hold)
     if p.reference == "hold":

@@ -16,10 +16,16 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from bench.campaign import Campaign, make_table, print_end
 from bench.clock import Stopwatch
 from bench.figures import Curve, plot_panels, plot_tracking
-from bench.hybrid_runs import (
+from bench.identification import measure_errors
+from bench.journal import Record
+from bench.model_file import HybridFile
+from bench.report import export_run
+from bench.campaign import Campaign, make_table, print_end
+from bench.runs import RunResult
+from rigs.hybrid.design import Design
+from rigs.hybrid.identification import (
     BASE,
     CURRENT,
     DEFLECTION,
@@ -35,13 +41,7 @@ from bench.hybrid_runs import (
     read_loops,
     sine_at,
 )
-from bench.identification import measure_errors
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.thermal_network import Design
-from bench.journal import Record
-from bench.model_file import HybridFile
-from bench.report import export_run
-from bench.runs import RunResult
+from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 Floats = npt.NDArray[np.float64]
 

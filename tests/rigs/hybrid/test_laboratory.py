@@ -9,7 +9,7 @@ import serial
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from bench.rig import Rig, load_rig
-from sim_devices.hybrid import (
+from rigs.hybrid.laboratory import (
     ENABLE_LINE,
     GAIN,
     REACH,

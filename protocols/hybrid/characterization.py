@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.control.loops import Playback
-from bench.hybrid_runs import BASE, DEFLECTION, TIP
+from bench.number_list import NumberList
 from bench.protocol import Dwell, FastLoop, Messages, Phase, ProtocolParameters, Step, parameter, protocol
-from protocols.muscle import parse_numbers
+from rigs.hybrid.identification import BASE, DEFLECTION, TIP
 
 SENSORS = (DEFLECTION, BASE, TIP)
 THERMAL = ("tec", *SENSORS)
@@ -25,7 +25,7 @@ class CurrentSineParameters(ProtocolParameters):
     """What can be set."""
 
     amplitude: float = parameter(0.1, unit="A", low=0.001, high=1, help="amplitude of the current")
-    frequencies: str = parameter("0.001", unit="Hz", help="frequencies, one after another, with commas between them")
+    frequencies: NumberList = parameter("0.001", unit="Hz", help="frequencies, one after another")
     periods: int = parameter(2, unit="1", low=2, high=100, help="periods at each; the first is the transient")
     rate: float = parameter(0.5, unit="Hz", low=0.01, high=100, help="samples in a second")
 
@@ -37,7 +37,7 @@ def current_sine(parameters: CurrentSineParameters) -> Messages:
     As it is, a sine of 0.1 A at 0.001 Hz, for the static characteristics (Rakotondrabe and Ivan 2010, section V-B,
     Fig. 12); with a small amplitude and several frequencies, for the bandwidth.
     """
-    for frequency in parse_numbers("frequencies", parameters.frequencies):
+    for frequency in parameters.frequencies:
         if not 0 < frequency <= parameters.rate / 10:
             raise ValueError(f"frequencies: expected more than 0 and at most {parameters.rate / 10:g} Hz")
         yield Phase(f"sine of {frequency:g} Hz")
@@ -55,7 +55,7 @@ def current_sine(parameters: CurrentSineParameters) -> Messages:
 class CurrentStepsParameters(ProtocolParameters):
     """What can be set."""
 
-    levels: str = parameter("-0.1, -0.05, -0.025, 0.1", unit="A", help="currents, with commas between them")
+    levels: NumberList = parameter("-0.1, -0.05, -0.025, 0.1", unit="A", help="currents, one after another")
     on: float = parameter(600.0, unit="s", low=1, high=36000, help="how long each is held")
     off: float = parameter(900.0, unit="s", low=1, high=36000, help="how long the current is off after each")
     rate: float = parameter(1.0, unit="Hz", low=0.01, high=100, help="samples in a second")
@@ -68,7 +68,7 @@ def current_steps(parameters: CurrentStepsParameters) -> Messages:
     Steps of 0.1, 0.05 and 0.025 A that cool (Rakotondrabe and Ivan 2010, section V-B, Fig. 13), and one that heats,
     without which the Joule heat cannot be told from the Seebeck effect.
     """
-    levels = parse_numbers("levels", parameters.levels)
+    levels = parameters.levels
     cycle = parameters.on + parameters.off
 
     def current(t: float) -> float:
@@ -113,7 +113,7 @@ def thermomechanical(parameters: ThermomechanicalParameters) -> Messages:
 class PiezoLoopsParameters(ProtocolParameters):
     """What can be set."""
 
-    amplitudes: str = parameter("40, 40, 30, 20, 10", unit="V", help="amplitude of each cycle, with commas")
+    amplitudes: NumberList = parameter("40, 40, 30, 20, 10", unit="V", help="amplitude of each cycle")
     frequency: float = parameter(0.1, unit="Hz", low=1e-3, high=10, help="cycles in a second")
     rate: float = parameter(50.0, unit="Hz", low=1, high=1e5, help="samples in a second")
 
@@ -124,7 +124,7 @@ def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
 
     Rakotondrabe and Ivan 2010, section V-D, Fig. 15: 40 V, 0.1 Hz.
     """
-    amplitudes = parse_numbers("amplitudes", parameters.amplitudes)
+    amplitudes = parameters.amplitudes
     largest = max(map(abs, amplitudes))
 
     def voltage(t: float) -> float:

@@ -1,0 +1,1 @@
+"""Operator scripts of the thermo-piezoelectric hybrid."""
