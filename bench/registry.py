@@ -78,8 +78,8 @@ class Entry:
         # The module of another package may fail in any way.
         except Exception as error:
             raise ConfigurationError(
-                f"entry point {self.name} = {self.reference!r} of bench.{self.group} (package {self.package}) cannot be "
-                f"imported: {type(error).__name__}: {error}; mend the package or uninstall it"
+                f"package {self.package}: entry point {self.name} = {self.reference!r} of bench.{self.group} cannot "
+                f"be imported: {type(error).__name__}: {error}; mend the package or uninstall it"
             ) from error
 
 
@@ -116,7 +116,9 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
     """
     known = entries(group)
     if name not in known:
-        what = group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
+        what = (
+            group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
+        )
         raise ConfigurationError(f"there is no {what} {name!r}; there are: {', '.join(known) or 'none'}")
     return known[name].load()
 

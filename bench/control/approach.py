@@ -1,4 +1,4 @@
-"""A loop that brings the tension of a muscle to a target by moving its end."""
+"""A loop that steps an input until the output meets a target, coming from one side."""
 
 from __future__ import annotations
 
@@ -7,29 +7,28 @@ import math
 from bench.control.tracking import Command, Trace
 
 
-class Stretch:
-    """Move an end until the muscle pulls with a given force; or go on doing so for a time.
+class Approach:
+    """Step the input until the output meets a target; or go on doing so for a time: a `Loop`.
 
-    Input is the position of the end, m, positive when the muscle is longer; output the force, N. Each step is half
-    of the lacking force over the stiffness that the step before it showed. So the force comes to its target from
-    one side, and the memory of the muscle sees no reversal that is not asked for, unless the stiffness doubles
-    within one step. It does where a slack muscle becomes taut: there a small target may be passed, by less than
-    what the greatest stiffness makes of `largest_step`.
+    Each step is half of the error over the slope that the step before showed. So the output comes to its target from
+    one side, and the memory of a hysteretic specimen sees no reversal that is not asked for, unless the slope doubles
+    within one step. Then a target may be passed, by less than the greatest slope makes of `largest_step`.
 
     Parameters
     ----------
-    force : float
-        Target, N.
-    stiffnesses : (float, float)
-        Least and greatest stiffness of muscle and frame together that are believed, N/m.
+    target : float
+        Wanted output, output units.
+    slopes : (float, float)
+        Least and greatest slope of the output over the input that are believed, output units per input
+        unit, positive.
     largest_step : float
-        Longest step of the end, m; also what is taken up of a slack muscle at a time.
+        Longest step of the input, input units; also what is taken at a time where the output does not respond.
     tolerance : float
-        Lacking force that is accepted, N.
+        Error that is accepted, output units.
     period : float
         Time from step to step, s.
     duration : float
-        Time for which the force is held, s; with 0 the loop is done when the target is met.
+        Time for which the target is held, s; with 0 the loop is done when it is met.
 
     Raises
     ------
@@ -39,47 +38,47 @@ class Stretch:
 
     def __init__(
         self,
-        force: float,
+        target: float,
         *,
-        stiffnesses: tuple[float, float] = (0.8e3, 12e3),
-        largest_step: float = 0.2e-3,
-        tolerance: float = 0.03,
+        slopes: tuple[float, float],
+        largest_step: float,
+        tolerance: float,
         period: float = 0.5,
         duration: float = 0.0,
     ) -> None:
-        if not math.isfinite(force):
-            raise ValueError(f"force: expected a finite number, got {force}")
-        if not 0.0 < stiffnesses[0] <= stiffnesses[1]:
-            raise ValueError(f"stiffnesses: expected two positive numbers, the lower one first, got {stiffnesses}")
+        if not math.isfinite(target):
+            raise ValueError(f"target: expected a finite number, got {target}")
+        if not 0.0 < slopes[0] <= slopes[1]:
+            raise ValueError(f"slopes: expected two positive numbers, the lower one first, got {slopes}")
         if not (largest_step > 0 and tolerance > 0 and period > 0 and duration >= 0):
             raise ValueError(
                 "largest_step, tolerance, period: expected positive numbers, duration ≥ 0, got "
                 f"{largest_step}, {tolerance}, {period}, {duration}"
             )
-        self._force = force
-        self._stiffnesses = stiffnesses
+        self._target = target
+        self._slopes = slopes
         self._largest_step = largest_step
         self._tolerance = tolerance
         self._period = period
         self._duration = duration
         self._start = self._setpoint = self._step = 0.0
         self._output = 0.0
-        self.trace = Trace(reference=force)
+        self.trace = Trace(reference=target)
 
     def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Start from where the end is."""
+        """Start from the present input."""
         self._start, self._setpoint, self._step = t, measured_input, 0.0
         return self.update(t, measured_input, output, *others)
 
     def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Take the next step."""
-        lacking = self._force - output
-        met = abs(lacking) <= self._tolerance if self._duration == 0 else t - self._start >= self._duration
+        error = self._target - output
+        met = abs(error) <= self._tolerance if self._duration == 0 else t - self._start >= self._duration
         if not met:
-            softest, stiffest = self._stiffnesses
-            # The first step has nothing to go by, so it is the shortest.
-            seen = (output - self._output) / self._step if self._step else stiffest
-            step = 0.5 * lacking / min(max(seen, softest), stiffest)
+            least, greatest = self._slopes
+            # Without a step before it, the first one is the shortest.
+            slope = (output - self._output) / self._step if self._step else greatest
+            step = 0.5 * error / min(max(slope, least), greatest)
             self._step = min(max(step, -self._largest_step), self._largest_step)
             self._setpoint += self._step
         self._output = output

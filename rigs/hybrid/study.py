@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from bench.campaign import Campaign, make_table, print_end
 from bench.clock import Stopwatch
 from bench.figures import Curve, plot_panels, plot_tracking
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.report import export_run
-from bench.campaign import Campaign, make_table, print_end
 from bench.runs import RunResult
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
