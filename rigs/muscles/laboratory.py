@@ -290,12 +290,15 @@ class _Fault:
         self._laboratory.go_wrong()
 
 
-class SMALaboratorySettings(MuscleLaboratorySettings):
-    """Keys of the laboratory with the SMA wire."""
-
+class _ThermalSettings(MuscleLaboratorySettings):
     ambient_deviation: float = Field(
         default=0.3, ge=0, le=5, description="standard deviation of the room temperature, K"
     )
+
+
+class SMALaboratorySettings(_ThermalSettings):
+    """Keys of the laboratory with the SMA wire."""
+
     specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="which specimen it is")
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
@@ -330,12 +333,8 @@ class McKibbenLaboratory(MuscleLaboratory):
     Settings = McKibbenLaboratorySettings
 
 
-class CoiledPolymerLaboratorySettings(MuscleLaboratorySettings):
+class CoiledPolymerLaboratorySettings(_ThermalSettings):
     """Keys of the laboratory with the super-coiled polymer muscle."""
-
-    ambient_deviation: float = Field(
-        default=0.3, ge=0, le=5, description="standard deviation of the room temperature, K"
-    )
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the muscle."""
