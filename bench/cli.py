@@ -806,22 +806,3 @@ reproduce_ = typer.Typer(
     cls=Studies,
 )
 app.add_typer(reproduce_, name="reproduce")
-
-
-@reproduce_.command("hybrid")
-def reproduce_hybrid_(
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """Thermo-piezoelectric hybrid: its parts, the model of the whole, and control to nanometres over its range.
-
-    Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric microactuator, 2010.
-    """
-    from rigs.hybrid.study import reproduce_hybrid
-
-    result = reproduce_hybrid(rig="hybrid", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)

@@ -116,7 +116,9 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
     """
     known = entries(group)
     if name not in known:
-        what = group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
+        what = (
+            group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
+        )
         raise ConfigurationError(f"there is no {what} {name!r}; there are: {', '.join(known) or 'none'}")
     return known[name].load()
 
