@@ -19,16 +19,11 @@ from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
 Floats = npt.NDArray[np.float64]
-
-CURRENT, VOLTAGE = "tec_setpoint", "piezo_setpoint"
-DEFLECTION = "displacement_position"
-BASE, TIP = "base_temperature", "tip_temperature"
-WITNESS = "witness_position"
-"""The deflection by a sensor beside the loop, where the rig has one, m."""
 
 REFERENCE = 22.0
 """Temperature of the tip from which the polynomial counts, °C: the room's, as far as it is known."""

@@ -20,15 +20,10 @@ from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import HybridFile
 from bench.runs import RunResult
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE, WITNESS
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
-    BASE,
-    CURRENT,
-    DEFLECTION,
     REFERENCE,
-    TIP,
-    VOLTAGE,
-    WITNESS,
     HybridIdentification,
     Samples,
     bandwidth_of,
