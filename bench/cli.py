@@ -379,52 +379,6 @@ def identify_(
     write_json(json_file, found.summary())
 
 
-@app.command("identify-muscle")
-def identify_muscle_(
-    force_run: Annotated[Path, typer.Argument(metavar="FORCE_RUN", help="A run of force-voltage.")],
-    length_runs: Annotated[
-        list[Path], typer.Argument(metavar="LENGTH_RUN...", help="Runs of length-voltage and of length-force.")
-    ],
-    model: Annotated[
-        Literal["two-stage", "two-stage-prandtl-ishlinskii", "summed", "linear"],
-        typer.Option(metavar="NAME", help="two-stage, two-stage-prandtl-ishlinskii, summed or linear."),
-    ] = "two-stage",
-    verify: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="A run, as of length-verification, that the model is tried on.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Identify a model among voltage, force and length of a muscle from the runs that characterized it.
-
-    The two-stage model is length = H2[force - H1[voltage]]; see `bench run length-control --help` for what it is
-    good for. Errors are the average and the RMS in percent of the measured range.
-    """
-    from bench.identification.two_stage import measure_series
-    from bench.muscle_runs import errors_json, identify_muscle, muscle_file, read_resting, read_series
-
-    series = [one for run in length_runs for one in read_series(run)]
-    found = identify_muscle(model, read_resting(force_run), series)
-    errors = dict(found.errors)
-    if verify is not None:
-        errors["verification"] = measure_series(found.model, read_series(verify))
-    rows = [(kind, f"average {e.average_percent:.2f} %, RMS {e.rms_percent:.2f} %") for kind, e in errors.items()]
-    rows += [(f"KKT residual, {stage}", f"{fit.kkt_residual:.1e}") for stage, fit in found.certificates.items()]
-    print_rows(f"{model} from {len(series)} series of lengths", rows)
-    if out is not None:
-        muscle_file(model, found, [force_run, *length_runs]).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
-    write_json(
-        json_file,
-        {
-            "model": model,
-            "series": len(series),
-            "errors": {kind: errors_json(e) for kind, e in errors.items()},
-            "kkt": {stage: fit.kkt_residual for stage, fit in found.certificates.items()},
-        },
-    )
-
-
 @app.command("predict")
 def predict_(
     model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],

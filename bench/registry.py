@@ -78,8 +78,8 @@ class Entry:
         # The module of another package may fail in any way.
         except Exception as error:
             raise ConfigurationError(
-                f"entry point {self.name} = {self.reference!r} of bench.{self.group} (package {self.package}) cannot be "
-                f"imported: {type(error).__name__}: {error}; mend the package or uninstall it"
+                f"package {self.package}: entry point {self.name} = {self.reference!r} of bench.{self.group} cannot "
+                f"be imported: {type(error).__name__}: {error}; mend the package or uninstall it"
             ) from error
 
 

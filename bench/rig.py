@@ -33,7 +33,7 @@ A rig file is TOML::
     ...
 
     [emulation]                                    # only in the rig file of an emulated rig
-    laboratory = "sim_devices.vo2:VO2Laboratory"
+    laboratory = "rigs.vo2.laboratory:VO2Laboratory"
     ...
 
 Unknown keys are errors. A port `emulated://NAME` is wired to the instrument of that name in the emulated
@@ -196,7 +196,7 @@ def packaged_rigs() -> tuple[str, ...]:
 
 
 def _packaged() -> dict[str, Traversable]:
-    folders = [resources.files("bench") / "rigs", *(f for f in resources.files("rigs").iterdir() if f.is_dir())]
+    folders = (folder for folder in resources.files("rigs").iterdir() if folder.is_dir())
     files = (file for folder in folders for file in folder.iterdir() if file.name.endswith(".toml"))
     return {file.name.removesuffix(".toml"): file for file in files}
 

@@ -19,7 +19,7 @@ from bench.figures import Curve, plot_panels
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
 from bench.model_file import CoupledFile
-from bench.muscle_runs import (
+from rigs.muscles.identification import (
     MODELS,
     ModelName,
     Resting,

@@ -22,8 +22,8 @@ from bench.figures import (
 )
 from bench.hysteresis import Preisach, TwoStage
 from bench.identification.two_stage import predict_series
-from bench.muscle_runs import FORCE, LENGTH
 from bench.tracking_results import TargetResults
+from protocols.muscles.parts import FORCE, LENGTH
 from rigs.muscles.characterization import (
     TITLES,
     Characterization,

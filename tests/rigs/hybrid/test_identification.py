@@ -191,9 +191,7 @@ class TestSine:
 
     @pytest.mark.parametrize("count", [1, 50, 150, 198])
     def test_less_than_two_periods_are_refused(self, count):
-        with pytest.raises(
-            DataError, match=r"a sine of 0.1 Hz needs at least two periods"
-        ):
+        with pytest.raises(DataError, match=r"a sine of 0.1 Hz needs at least two periods"):
             sine_at(made_up(0.1, y=np.zeros(count)), "y", 0.1)
 
     def test_of_a_run(self, runs):

@@ -6,35 +6,35 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.number_list import NumberList
 from bench.protocol import Messages, Phase, parameter, protocol
-from protocols.force_voltage import scaled_steps
-from protocols.muscle import (
+from protocols.muscles.force_voltage import scaled_steps
+from protocols.muscles.parts import (
     LOADS,
     ON_WEIGHTS,
-    MuscleParameters,
+    ResetParameters,
     hang,
-    parse_numbers,
     reset_under_weights,
     sample_voltages,
 )
 
 
-class Loaded(MuscleParameters):
-    """What can be set for either sequence of voltages."""
+class Loaded(ResetParameters):
+    """Parameters of either sequence of voltages."""
 
-    loads: str = parameter(
-        ", ".join(f"{load:g}" for load in LOADS), unit="N", help="dead loads, with commas between them"
+    loads: NumberList = parameter(
+        ", ".join(f"{load:g}" for load in LOADS), unit="N", help="dead loads, one after another"
     )
 
 
 class Parameters(Loaded):
-    """What can be set."""
+    """Parameters."""
 
     points: int = parameter(37, unit="1", low=11, high=10000, help="number of voltages at each load")
 
 
 class RandomParameters(Loaded):
-    """What can be set."""
+    """Parameters."""
 
     points: int = parameter(18, unit="1", low=1, high=10000, help="number of voltages at each load")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the voltages")
@@ -63,10 +63,10 @@ def length_verification(parameters: RandomParameters) -> Messages:
 
 
 def _under_loads(parameters: Loaded, voltages: Sequence[float]) -> Messages:
-    loads = parse_numbers("loads", parameters.loads)
-    if min(loads) <= 0:
-        raise ValueError(f"loads = {parameters.loads!r}: expected positive loads")
-    for load in loads:
+    if min(parameters.loads) <= 0:
+        loads = ", ".join(f"{load:g}" for load in parameters.loads)
+        raise ValueError(f"loads = {loads}: expected positive loads")
+    for load in parameters.loads:
         yield from reset_under_weights(parameters)
         yield from hang(load)
         yield Phase(f"length over voltage at {load:g} N")

@@ -12,12 +12,12 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
 from bench.model_file import CoupledFile, ModelFile
-from bench.muscle_runs import FORCE, LENGTH, SAMPLE
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
 from bench.rig import load_rig
 from bench.tracking_results import target_results
-from protocols.force_voltage import scaled_steps
-from protocols.muscle import LOADS, parse_numbers
+from protocols.muscles.force_voltage import scaled_steps
+from protocols.muscles.parts import LOADS
+from rigs.muscles.identification import FORCE, LENGTH, SAMPLE
 
 SMA = ["--rig", "sma", "--clock", "virtual"]
 DEVICES = ("supply", "load_cell", "wire_end", "stage", "fan")
@@ -220,21 +220,19 @@ class TestPlan:
 class TestRefused:
     @pytest.mark.parametrize("text", ["", ",", "1,,2", "1;2", "one", "1, nan", "inf", "1 2"])
     def test_what_are_no_numbers(self, text):
-        with pytest.raises(
-            ValueError, match=r"expected numbers with commas between them, such as 0\.98, 2\.94"
-        ) as caught:
-            parse_numbers("loads", text)
-        assert f"loads = {text!r}" in str(caught.value)
+        with pytest.raises(ConfigurationError, match=r"loads .*is not a finite number"):
+            find_protocol("length-voltage").parse({"loads": text})
 
     def test_numbers(self):
-        assert parse_numbers("loads", " 1, 2.5 ,-3e-1") == (1.0, 2.5, -0.3)
+        parameters = find_protocol("length-voltage").parse({"loads": " 1, 2.5 ,-3e-1"})
+        assert parameters.loads == (1.0, 2.5, -0.3)
 
     @pytest.mark.parametrize(
         ("protocol", "settings", "words"),
         [
             ("length-voltage", ["loads=4.9;2"], ["loads = '4.9;2'", "commas"]),
-            ("length-voltage", ["loads=4.9, -1"], ["loads = '4.9, -1'", "positive"]),
-            ("length-verification", ["loads=0"], ["loads = '0'", "positive"]),
+            ("length-voltage", ["loads=4.9, -1"], ["loads = 4.9, -1", "positive"]),
+            ("length-verification", ["loads=0"], ["loads = 0", "positive"]),
             ("length-voltage", ["points=10"], ["points", "11 to 10000"]),
             ("length-voltage", ["highest=3.3"], ["supply", "3.3 V", "0 to 3.2 V"]),
             ("force-voltage", ["dwell=0.1"], ["dwell", "0.5 to 3600 s"]),

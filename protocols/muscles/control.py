@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from bench.control.muscle import MuscleController, ReachMuscleTarget
-from bench.controllers import MuscleControllerName, load_two_stage_model, make_muscle_controller
+from bench import registry
+from bench.control.loops import Reaching, ReachTarget
+from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
-from bench.muscle_runs import FORCE, LENGTH
+from bench.model_file import load_coupled_model
 from bench.protocol import Control, Dwell, Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
 from bench.tracking_results import REACH, READING
-from protocols.force_voltage import condition
-from protocols.muscle import (
+from protocols.muscles.force_voltage import condition
+from protocols.muscles.parts import (
+    FORCE,
+    LENGTH,
     ON_STAGE,
     ON_WEIGHTS,
-    MuscleParameters,
     Part,
+    ResetParameters,
     StageParameters,
     fasten,
     hang,
@@ -26,6 +30,9 @@ from protocols.muscle import (
     stretch,
 )
 
+ControllerName = Literal["open-loop-inverse", "proportional-integral", "closed-loop-inverse"]
+Output = Literal["length", "force"]
+
 _MARGIN = 0.05
 """Part of the model's range at either end where no target is drawn."""
 _TARGETS_AT_A_LOAD = 5
@@ -33,18 +40,18 @@ _GRACE = 60.0
 
 
 class Controlled(ProtocolParameters):
-    """What can be set for either task."""
+    """Parameters of either task."""
 
     model: str = parameter(..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it")
-    controller: MuscleControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: ControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
     readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
 
 
-class LengthParameters(Controlled, MuscleParameters):
-    """What can be set."""
+class LengthParameters(Controlled, ResetParameters):
+    """Parameters."""
 
     load: float = parameter(4.90, unit="N", low=0.05, high=100, help="weight on the muscle")
     change: float = parameter(
@@ -53,7 +60,7 @@ class LengthParameters(Controlled, MuscleParameters):
 
 
 class ForceParameters(Controlled, StageParameters):
-    """What can be set."""
+    """Parameters."""
 
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
@@ -67,7 +74,7 @@ def length_control(parameters: LengthParameters) -> Messages:
     target is the error that counts. With `change` the operator hangs more on after every five targets, and takes it
     off again after the next five; the controller learns of it by the load cell alone.
     """
-    model = load_two_stage_model(parameters.model)
+    model = _load_model(parameters.model)
     state = model.initial_state()
     ranges = [
         _range(model, _hung(model, state, load), parameters.highest, "length")
@@ -78,14 +85,7 @@ def length_control(parameters: LengthParameters) -> Messages:
         raise ValueError("change: under the two weights the model has no length in common; choose a smaller one")
     yield from reset_under_weights(parameters)
     yield from hang(parameters.load)
-    controller = make_muscle_controller(
-        parameters.controller,
-        model,
-        "length",
-        state=state,
-        limits=(0.0, parameters.highest),
-        duration=parameters.duration,
-    )
+    controller = _make_controller(parameters, model, state, "length")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for i, target in enumerate(_targets(parameters, low, high)):
@@ -103,21 +103,14 @@ def force_control(parameters: ForceParameters) -> Messages:
     The muscle is fastened to the stage, reset, conditioned by cycles of the voltage and stretched to the
     pretension; then the stage stands still. Targets and errors are as in `length-control`.
     """
-    model = load_two_stage_model(parameters.model)
+    model = _load_model(parameters.model)
     state = model.initial_state()
     low, high = _range(model, state, parameters.highest, "force")
     yield from fasten()
     yield from reset_on_stage(parameters)
     yield from condition(parameters, parameters.conditioning)
     yield from stretch(parameters.pretension)
-    controller = make_muscle_controller(
-        parameters.controller,
-        model,
-        "force",
-        state=state,
-        limits=(0.0, parameters.highest),
-        duration=parameters.duration,
-    )
+    controller = _make_controller(parameters, model, state, "force")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for target in _targets(parameters, low, high):
@@ -125,13 +118,30 @@ def force_control(parameters: ForceParameters) -> Messages:
     yield _summary(parameters.controller, np.array(errors), "N")
 
 
+def _load_model(path: str) -> TwoStage:
+    """Read the two-stage model of a muscle, in V, N and m."""
+    model = load_coupled_model(Path(path)).model
+    if not isinstance(model, TwoStage):
+        raise DataError(f"model file {path}: expected a two-stage model, whose inverse is known")
+    units = (model.voltage_unit, model.force_unit, model.length_unit)
+    if units != ("V", "N", "m"):
+        raise DataError(f"model file {path}: expected a model in V, N and m, got {', '.join(map(repr, units))}")
+    return model
+
+
+def _make_controller(
+    parameters: LengthParameters | ForceParameters, model: TwoStage, state: TwoStageState, output: Output
+) -> Reaching:
+    make = registry.load("controllers", f"coupled-{output}.{parameters.controller}")
+    controller: Reaching = make(model, state=state, limits=(0.0, parameters.highest), duration=parameters.duration)
+    return controller
+
+
 def _hung(model: TwoStage, state: TwoStageState, load: float) -> TwoStageState:
     return model.step(state, state.voltage, load)[0]
 
 
-def _range(
-    model: TwoStage, state: TwoStageState, highest: float, output: Literal["length", "force"]
-) -> tuple[float, float]:
+def _range(model: TwoStage, state: TwoStageState, highest: float, output: Output) -> tuple[float, float]:
     """Return the outputs (m or N) between the ends of a full cycle of the voltage, less a margin at either end."""
     values = []
     under = f" under {state.force:g} N" if output == "length" else ""
@@ -154,15 +164,19 @@ def _targets(parameters: Controlled, low: float, high: float) -> list[float]:
 
 
 def _reach(
-    parameters: Controlled, controller: MuscleController, target: float, signal: str, others: tuple[str, ...]
+    parameters: LengthParameters | ForceParameters,
+    controller: Reaching,
+    target: float,
+    signal: str,
+    others: tuple[str, ...],
 ) -> Part[float]:
     """Go to a target and read; return the error (m or N)."""
     yield Control(
-        ReachMuscleTarget(controller, target),
+        ReachTarget(controller, target),
         "supply",
         "supply_voltage",
         signal,
-        controller.limits,
+        (0.0, parameters.highest),
         parameters.duration + _GRACE,
         label=REACH,
         others=others,

@@ -1,7 +1,7 @@
-"""From the runs that characterize an artificial muscle to the models among voltage, force and length.
+"""Identification of the models among voltage, force and length from the runs that characterize a muscle.
 
 A run of `force-voltage` gives the force at resting length, runs of `length-voltage`, `length-force` and
-`length-verification` give one series a load or voltage. Of their readings those with the label `sample` count.
+`length-verification` give one series a load or voltage. Only the readings with the label `sample` count.
 Everything is in V, N and m.
 """
 
@@ -27,14 +27,11 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.model_file import CoupledFile
+from protocols.muscles.parts import FORCE, LENGTH, SAMPLE
 
 Floats = npt.NDArray[np.float64]
 
 VOLTAGE = "supply_setpoint"
-FORCE = "load_cell_force"
-LENGTH = "wire_end_position"
-SAMPLE = "sample"
-"""Label of the readings that count."""
 
 UNITS = ("V", "N", "m")
 
@@ -112,40 +109,23 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         If the data do not determine the model.
     """
     voltages, forces, pretension = resting
-    highest = float(voltages.max())
     force_limit = max(float(each.max()) for each in (forces, *(s.forces for s in series)))
+    common: Any = {
+        "voltage_range": (0.0, float(voltages.max())),
+        "force_limit": force_limit,
+        "pretension": pretension,
+        "units": UNITS,
+    }
     weights = np.ones(voltages.size)
     weights[0] = _COLD_WEIGHT
     try:
         if name == "summed":
-            return identify_summed(
-                series,
-                voltage_range=(0.0, highest),
-                force_limit=force_limit,
-                pretension=pretension,
-                units=UNITS,
-            )
+            return identify_summed(series, **common)
         if name == "linear":
-            return identify_linear(
-                voltages,
-                forces,
-                series,
-                voltage_range=(0.0, highest),
-                force_limit=force_limit,
-                pretension=pretension,
-                units=UNITS,
-            )
+            return identify_linear(voltages, forces, series, **common)
+        second = _plays(force_limit) if name == "two-stage-prandtl-ishlinskii" else None
         return identify_two_stage(
-            voltages,
-            forces,
-            series,
-            weights=weights,
-            second=_plays(force_limit) if name == "two-stage-prandtl-ishlinskii" else None,
-            voltage_range=(0.0, highest),
-            force_limit=force_limit,
-            pretension=pretension,
-            smoothing=_SMOOTHING,
-            units=UNITS,
+            voltages, forces, series, weights=weights, second=second, smoothing=_SMOOTHING, **common
         )
     except ValueError as error:
         raise DataError(f"model {name} cannot be identified: {error}") from error

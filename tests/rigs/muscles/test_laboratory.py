@@ -9,8 +9,7 @@ import serial
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceError
 from bench.rig import Rig, load_rig
-from sim_devices.instruments.dynamixel import VELOCITY_UNIT
-from sim_devices.muscles import (
+from rigs.muscles.laboratory import (
     FAN_LINE,
     LOAD,
     STAGE,
@@ -22,6 +21,7 @@ from sim_devices.muscles import (
     SMALaboratory,
     SMALaboratorySettings,
 )
+from sim_devices.instruments.dynamixel import VELOCITY_UNIT
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 PROFILE_VELOCITY = 112

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.muscle_runs import SAMPLE
+from bench.number_list import NumberList
 from bench.protocol import Dwell, Messages, Phase, Step, parameter, protocol
-from protocols.muscle import (
+from protocols.muscles.parts import (
     ON_STAGE,
+    SAMPLE,
     StageParameters,
     fasten,
-    parse_numbers,
     reset_on_stage,
     stretch,
 )
@@ -19,9 +19,9 @@ _TOLERANCE = 0.05
 
 
 class Parameters(StageParameters):
-    """What can be set."""
+    """Parameters."""
 
-    voltages: str = parameter("0, 0.6, 1.2, 1.8, 2.4, 3", unit="V", help="voltages, with commas between them")
+    voltages: NumberList = parameter("0, 0.6, 1.2, 1.8, 2.4, 3", unit="V", help="voltages, one after another")
     smallest_force: float = parameter(0.3, unit="N", low=0.1, high=100, help="where the muscle is just taut")
     largest_force: float = parameter(10.5, unit="N", low=0.2, high=100, help="where the stage turns")
     points: int = parameter(12, unit="1", low=2, high=1000, help="forces on the way up; one less on the way down")
@@ -40,7 +40,7 @@ def length_force(parameters: Parameters) -> Messages:
     up = np.linspace(parameters.smallest_force, parameters.largest_force, parameters.points)
     forces = [*up, *up[-2::-1]]
     yield from fasten()
-    for voltage in parse_numbers("voltages", parameters.voltages):
+    for voltage in parameters.voltages:
         yield from reset_on_stage(parameters)
         yield Phase(f"length over force at {voltage:g} V")
         yield Step({"stage": parameters.slack}, Dwell(5.0))

@@ -1,4 +1,4 @@
-"""What the protocols for artificial muscles share: the reset, the weights, and the stage that stretches.
+"""Parts of the protocols for artificial muscles: the reset, the weights, and the stage that stretches.
 
 The rig has a `supply` that drives the muscle, a `load_cell` from which it hangs, a sensor at its lower end
 (`wire_end_position`, m, positive when the muscle is longer than at rest), and a `stage` to which that end may be
@@ -8,12 +8,10 @@ Application to Shape Memory Alloy Actuators", Robotics: Science and Systems, 201
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Sequence
 from typing import TypeAlias, TypeVar
 
-from bench.control.stretching import Stretch
-from bench.muscle_runs import FORCE, LENGTH, SAMPLE
+from bench.control.approach import Approach
 from bench.protocol import (
     Control,
     Dwell,
@@ -26,15 +24,24 @@ from bench.protocol import (
     parameter,
 )
 
+FORCE = "load_cell_force"
+LENGTH = "wire_end_position"
+SAMPLE = "sample"
+"""Label of the readings that count."""
+
 ON_WEIGHTS = ("supply", FORCE, LENGTH, "fan")
 ON_STAGE = ("supply", FORCE, LENGTH, "stage", "stage_position")
-"""What a protocol needs of the rig where the muscle carries weights, and where the stage holds it."""
+"""Needs of a protocol where the muscle carries weights, and where the stage holds it."""
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 """Dead loads, N (Zhang and Yip 2017, section II-A)."""
 
 _COOL_SECONDS = 20.0
 _SETTLE_LOAD = Dwell(5.0)
+_STIFFNESSES = (0.8e3, 12e3)
+"""Least and greatest stiffness of muscle and frame together that are believed, N/m."""
+_LARGEST_STEP = 0.2e-3
+"""Longest step of the stage, m. Where a slack muscle becomes taut, its stiffness doubles within one."""
 _STRETCH_TIMEOUT = 900.0
 
 R = TypeVar("R")
@@ -42,41 +49,24 @@ Part: TypeAlias = Generator[Message, Reading, R]
 """A part of a protocol that returns something, such as its last reading."""
 
 
-class MuscleParameters(ProtocolParameters):
-    """What can be set in each of these protocols."""
+class ResetParameters(ProtocolParameters):
+    """Parameters of each of these protocols."""
 
     highest: float = parameter(3.0, unit="V", low=0.1, high=60, help="highest voltage, where the memory is reset")
     dwell: float = parameter(30.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
     pretension: float = parameter(0.3, unit="N", low=0.05, high=10, help="force under which the memory is reset")
 
 
-class StageParameters(MuscleParameters):
-    """What can be set where the stage stretches the muscle."""
+class StageParameters(ResetParameters):
+    """Parameters where the stage stretches the muscle."""
 
     slack: float = parameter(
         -6e-3, unit="m", low=-0.1, high=0, help="position of the stage at which the muscle is slack at any voltage"
     )
 
 
-def parse_numbers(name: str, text: str) -> tuple[float, ...]:
-    """Return the numbers of a parameter such as `0.98, 2.94`.
-
-    Raises
-    ------
-    ValueError
-        If one of them is no finite number, or there is none at all.
-    """
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if not values or not all(map(math.isfinite, values)):
-        raise ValueError(f"{name} = {text!r}: expected numbers with commas between them, such as 0.98, 2.94")
-    return values
-
-
 def hang(load: float) -> Part[Reading]:
-    """Have a load (N) hung on the muscle, and see by the load cell that it was."""
+    """Prompt for a load (N) on the muscle, and verify it with the load cell."""
     tolerance = 0.15 + 0.02 * load
     reading = yield Prompt(
         f"Hang {load:g} N on the muscle, hook and magnet included, and let it come to rest",
@@ -90,10 +80,10 @@ def hang(load: float) -> Part[Reading]:
     return reading
 
 
-def reset_under_weights(parameters: MuscleParameters) -> Part[Reading]:
+def reset_under_weights(parameters: ResetParameters) -> Part[Reading]:
     """Reset the memory: drive the muscle to its highest voltage and back to 0 V under the pretension.
 
-    Nobody shall touch a hot muscle: it cools before the weight is changed.
+    The muscle cools before the weight is changed, as a hot one must not be touched.
     """
     yield Phase("reset")
     yield Step({"supply": 0.0, "fan": 1.0}, Dwell(_COOL_SECONDS), label="reset")
@@ -103,7 +93,7 @@ def reset_under_weights(parameters: MuscleParameters) -> Part[Reading]:
     return (yield from cool(parameters))
 
 
-def cool(parameters: MuscleParameters) -> Part[Reading]:
+def cool(parameters: ResetParameters) -> Part[Reading]:
     """Go to 0 V with the fan on, then let the muscle stand without it."""
     yield Step({"supply": 0.0, "fan": 1.0}, Dwell(_COOL_SECONDS), label="reset")
     reading = yield Step({"fan": 0.0}, Dwell(parameters.dwell), label="reset")
@@ -111,7 +101,7 @@ def cool(parameters: MuscleParameters) -> Part[Reading]:
 
 
 def fasten() -> Part[Reading]:
-    """Have the end of the cold muscle fastened to the stage."""
+    """Prompt for the end of the cold muscle to be fastened to the stage."""
     yield Step({"supply": 0.0, "stage": 0.0}, Dwell(5.0), label="fasten")
     reading = yield Prompt(
         "Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
@@ -128,7 +118,7 @@ def fasten() -> Part[Reading]:
 def stretch(force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> Part[Reading]:
     """Stretch the muscle until it pulls with a force (N); or hold that force for a time (s)."""
     reading = yield Control(
-        Stretch(force, tolerance=tolerance, duration=duration),
+        Approach(force, slopes=_STIFFNESSES, largest_step=_LARGEST_STEP, tolerance=tolerance, duration=duration),
         "stage",
         "stage_position",
         FORCE,
@@ -151,7 +141,7 @@ def reset_on_stage(parameters: StageParameters) -> Part[Reading]:
     return (yield from stretch(parameters.pretension))
 
 
-def sample_voltages(parameters: MuscleParameters, voltages: Sequence[float]) -> Part[Reading]:
+def sample_voltages(parameters: ResetParameters, voltages: Sequence[float]) -> Part[Reading]:
     """Step through voltages (V), with one reading each after the dwell."""
     for voltage in voltages:
         reading = yield Step({"supply": voltage}, Dwell(parameters.dwell), label=SAMPLE)

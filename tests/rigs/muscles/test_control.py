@@ -8,19 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.control.inverse import Reach
-from bench.control.muscle import (
+from bench.control.loops import ReachTarget
+from bench.control.two_stage_inverse import TwoStageInverse
+from bench.identification import Series, identify_two_stage, voltage_steps
+from rigs.muscles.control import (
+    FORCE_GAIN,
+    LENGTH_GAIN,
     ForceTask,
+    InverseControlParameters,
     LengthTask,
     MuscleClosedLoop,
     MuscleOpenLoop,
-    MuscleParameters,
     MuscleProportionalIntegral,
     ProportionalIntegralParameters,
-    ReachMuscleTarget,
     ThermalLag,
 )
-from bench.control.two_stage_inverse import TwoStageInverse
-from bench.identification import Series, identify_two_stage, voltage_steps
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 MILLIMETRE = 1e-3
@@ -29,7 +31,6 @@ LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 HELD = (0.0, 0.6, 1.2, 1.8, 2.4, 3.0)
 FORCES = np.concatenate([np.linspace(0.0, 10.5, 12), np.linspace(10.5, 0.0, 12)[1:]])
 VOLTAGES = voltage_steps()
-LENGTH_GAIN, FORCE_GAIN = -2500.0, 1.0
 
 
 class Wire:
@@ -98,7 +99,7 @@ class Bench:
 
         A load, if given, is hung on after 10 s.
         """
-        loop, start, halfway = ReachMuscleTarget(controller, target), self.wire.t, math.nan
+        loop, start, halfway = ReachTarget(controller, target), self.wire.t, math.nan
         command = loop.begin(*self.read())
         while not command.done:
             assert LIMITS[0] <= command.setpoint <= LIMITS[1]
@@ -281,7 +282,7 @@ def test_length_while_the_load_changes(inverse):
     errors = []
     for seed in SEEDS:
         bench = Bench(seed, loads[-1])
-        controller = MuscleClosedLoop(LengthTask(inverse), parameters=MuscleParameters(duration=30.0))
+        controller = MuscleClosedLoop(LengthTask(inverse), parameters=InverseControlParameters(duration=30.0))
         targets = low + (high - low) * np.random.default_rng([seed, 6]).uniform(0.05, 0.95, 12)
         for n, target in enumerate(targets.tolist()):
             # The force is all that tells the controller.
@@ -379,7 +380,7 @@ def test_trace_of_the_closed_loop(inverse):
     assert trace.disturbance == pytest.approx(2e-3 - model, abs=1e-9)
     assert trace.predicted == pytest.approx(2e-3, abs=1e-9)
     assert 0.0 < trace.uncertainty < 0.02 * MILLIMETRE
-    loop = ReachMuscleTarget(controller, 1e-3)
+    loop = ReachTarget(controller, 1e-3)
     assert loop.trace == trace
 
 
@@ -443,7 +444,7 @@ def test_proportional_integral_steps():
 @pytest.mark.parametrize("name", ["closed-loop-inverse", "proportional-integral", "open-loop-inverse"])
 def test_lasts_its_time_and_then_holds(inverse, name):
     controller = controllers(inverse, 4.9)[name]()
-    loop, t = ReachMuscleTarget(controller, 1e-3), 7.0
+    loop, t = ReachTarget(controller, 1e-3), 7.0
     command, commands = loop.begin(t, 0.0, 2e-3, 4.9), 1
     while not command.done:
         # Late by 0.3 s each time: the next period is the shorter.
@@ -473,8 +474,8 @@ def test_lasts_its_time_and_then_holds(inverse, name):
         (lambda: ThermalLag().lead(1.0, 0.0, LIMITS), "horizon: expected a positive"),
         (lambda: ThermalLag().lead(1.0, 2.0, (3.0, 0.0)), "limits: expected two finite"),
         (lambda: ThermalLag().lead(1.0, 2.0, (-1.0, 3.0)), "limits: expected two finite"),
-        (lambda: MuscleParameters(horizon=0.0), "horizon: expected a positive"),
-        (lambda: MuscleParameters(duration=math.inf), "duration: expected a positive"),
+        (lambda: InverseControlParameters(horizon=0.0), "horizon: expected a positive"),
+        (lambda: InverseControlParameters(duration=math.inf), "duration: expected a positive"),
         (lambda: ProportionalIntegralParameters(0.0), "gain: expected a number other than 0"),
         (lambda: ProportionalIntegralParameters(1.0, 0.0), "integral_time: expected a positive"),
         (lambda: MuscleProportionalIntegral((-1.0, 3.0), ProportionalIntegralParameters(1.0)), "limits: expected"),

@@ -1,15 +1,16 @@
-"""Length and force of a wire that a voltage heats, such as a shape-memory-alloy muscle: to one target after another.
+"""Control of a muscle that a voltage drives, such as a shape-memory-alloy wire: its length or its force.
 
-Three controllers: two use the two-stage model among voltage, force and length, in open and in closed loop; the third
-is proportional-integral, the comparison without a model. All are sampled at a fixed period for a fixed time
-at each target, keep their state from one target to the next, and serve two tasks: the length at a measured force,
+Two of the three controllers use the two-stage model among voltage, force and length, in open and in closed loop; the
+third is proportional-integral, for comparison without a model. Each samples at a fixed period, spends a fixed time at
+each target, keeps its state from one target to the next, and serves two tasks: the length under a measured force,
 which may change, and the force between fixed ends.
 
 Units are those of the model; the defaults are in metres, newtons and volts.
 
-A reading that is missing (nan, or much beyond what the model knows): a voltage is taken to be that set last, a force
-to be the last one; without an output the estimate of the disturbance stands while the model goes on, since a wire
-that is driven ahead of its lag must not be left at that voltage. The controller without a model holds.
+A reading may be missing (nan, or far beyond the range of the model). A missing voltage is replaced by the last
+set-point, a missing force by the last force. Without an output the estimate of the disturbance is kept while the
+model goes on, as a wire that is driven ahead of its lag must not be left at that voltage; the controller without a
+model holds its set-point.
 
 Model and thermal lag: Zhang and Yip, "Three-Dimensional Hysteresis Modeling of Robotic Artificial Muscles with
 Application to Shape Memory Alloy Actuators", Robotics: Science and Systems, 2017; here "Zhang and Yip 2017".
@@ -19,8 +20,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from bench.control.baselines import saturation
 from bench.control.estimators import DisturbanceEstimator
@@ -28,7 +30,8 @@ from bench.control.inverse import Reach
 from bench.control.loops import SHORTEST_WAIT
 from bench.control.tracking import Actuator, Command, Trace, check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
-from bench.hysteresis import TwoStageState, _checks
+from bench.errors import DataError
+from bench.hysteresis import TwoStage, TwoStageState, _checks
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,62 +113,20 @@ class ThermalLag:
         return math.sqrt(square), False
 
 
-class Task(Protocol):
-    """What is controlled, how the model sees it, and how good model and sensor are."""
-
-    @property
-    def inverse(self) -> TwoStageInverse:
-        """The model and its inverse."""
-        ...
-
-    @property
-    def walk_variance(self) -> float:
-        """Variance by which the model's error changes within one period, output units squared."""
-        ...
-
-    @property
-    def reading_variance(self) -> float:
-        """Variance of one reading of the output, output units squared."""
-        ...
-
-    @property
-    def slopes(self) -> tuple[float, float]:
-        """Range of slopes of the output over the voltage that are believed, output units per V; without 0."""
-        ...
-
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after it has come to a voltage, with further signals."""
-        ...
-
-    def output(self, state: TwoStageState) -> float:
-        """Return the model's output."""
-        ...
-
-    def output_range(self) -> tuple[float, float]:
-        """Return the range of the model's output."""
-        ...
-
-    def invert(self, state: TwoStageState, target: float) -> TwoStageInversion:
-        """Return what leads the model's output to a target."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class LengthTask:
-    """The length at a measured force, which may change; the one further signal is that force.
-
-    Noise of a load cell of some 0.02 N needs no dead band: what its small reversals do to the memory is
-    measured as disturbance, and the errors are the same without it.
+class Task(ABC):
+    """What is controlled, how the model sees it, and how good model and sensor are.
 
     Parameters
     ----------
     inverse : TwoStageInverse
         The model and its inverse.
     walk_variance, reading_variance : float
-        As in `DisturbanceEstimator`, length units squared. The defaults are 2e-2 mm² for each period, as the
-        model's error and not the sensor's noise dominates, and noise of 0.01 mm beside rounding to 0.04 mm.
+        As in `DisturbanceEstimator`, output units squared: the change of the model's error in one period, and the
+        noise of one reading.
     slopes : tuple of float
-        Range of slopes over the voltage that are believed, see `MuscleClosedLoop`; length units per V, negative.
+        Range of slopes of the output over the voltage that are believed, see `MuscleClosedLoop`; output units per V,
+        of one sign.
 
     Raises
     ------
@@ -174,20 +135,53 @@ class LengthTask:
     """
 
     inverse: TwoStageInverse
-    walk_variance: float = 2e-8
-    reading_variance: float = 0.04e-3**2 / 12 + 0.01e-3**2
-    slopes: tuple[float, float] = (-2e-3, -1e-3)
+    walk_variance: float
+    reading_variance: float
+    slopes: tuple[float, float]
+    _sign: ClassVar[float]
 
     def __post_init__(self) -> None:
         check_positive(self, "walk_variance", "reading_variance")
-        _, greatest = _checks.increasing("slopes", self.slopes).tolist()
-        if greatest >= 0.0:
-            raise ValueError(f"slopes: expected negative numbers, got {self.slopes}")
+        if min(self._sign * slope for slope in _checks.increasing("slopes", self.slopes).tolist()) <= 0.0:
+            raise ValueError(
+                f"slopes: expected {'positive' if self._sign > 0 else 'negative'} numbers, got {self.slopes}"
+            )
+
+    @abstractmethod
+    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
+        """Return the model's state after it has come to a voltage, with further signals."""
+
+    @abstractmethod
+    def output(self, state: TwoStageState) -> float:
+        """Return the model's output."""
+
+    @abstractmethod
+    def output_range(self) -> tuple[float, float]:
+        """Return the range of the model's output."""
+
+    @abstractmethod
+    def invert(self, state: TwoStageState, target: float) -> TwoStageInversion:
+        """Return what leads the model's output to a target."""
+
+
+@dataclass(frozen=True, eq=False)
+class LengthTask(Task):
+    """The length at a measured force, which may change; the one further signal is that force.
+
+    Noise of a load cell of some 0.02 N needs no dead band: the effect of its small reversals on the memory is
+    estimated as disturbance, and the errors are the same without it. The default variances are 2e-2 mm² for each
+    period, as the error of the model dominates, and noise of 0.01 mm beside rounding to 0.04 mm.
+    """
+
+    walk_variance: float = 2e-8
+    reading_variance: float = 0.04e-3**2 / 12 + 0.01e-3**2
+    slopes: tuple[float, float] = (-2e-3, -1e-3)
+    _sign = -1.0
 
     def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
         """Return the model's state after force and voltage have come to new values, the force first.
 
-        A force that is missing is taken to be the last one.
+        A missing force is replaced by the last one.
 
         Raises
         ------
@@ -214,34 +208,13 @@ class LengthTask:
 
 
 @dataclass(frozen=True, eq=False)
-class ForceTask:
-    """The force between fixed ends; there are no further signals.
+class ForceTask(Task):
+    """The force between fixed ends, without further signals; the default reading variance is for noise of 0.02 N."""
 
-    Parameters
-    ----------
-    inverse : TwoStageInverse
-        The model and its inverse.
-    walk_variance, reading_variance : float
-        As in `DisturbanceEstimator`, force units squared. The default of the second is for noise of 0.02 N.
-    slopes : tuple of float
-        Range of slopes over the voltage that are believed, see `MuscleClosedLoop`; force units per V, positive.
-
-    Raises
-    ------
-    ValueError
-        If a variance is not positive, or the slopes are not in order or of the wrong sign.
-    """
-
-    inverse: TwoStageInverse
     walk_variance: float = 2e-2
     reading_variance: float = 4e-4
     slopes: tuple[float, float] = (5.0, 10.0)
-
-    def __post_init__(self) -> None:
-        check_positive(self, "walk_variance", "reading_variance")
-        least, _ = _checks.increasing("slopes", self.slopes).tolist()
-        if least <= 0.0:
-            raise ValueError(f"slopes: expected positive numbers, got {self.slopes}")
+    _sign = 1.0
 
     def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
         """Return the model's state after the voltage has come to a new value; the argument of H2 stays.
@@ -269,8 +242,8 @@ class ForceTask:
 
 
 @dataclass(frozen=True)
-class MuscleParameters:
-    """Numbers of the controllers with a model.
+class InverseControlParameters:
+    """Parameters of the controllers with a model.
 
     Parameters
     ----------
@@ -296,7 +269,7 @@ class MuscleParameters:
 
 
 class MuscleController(ABC):
-    """What the controllers share: limits, the last set-point, a fixed period and a fixed time at each target."""
+    """Base of the controllers: limits, the last set-point, a fixed period and a fixed time at each target."""
 
     def __init__(self, limits: tuple[float, float], period: float, duration: float) -> None:
         self._low, self._high = limits
@@ -323,7 +296,7 @@ class MuscleController(ABC):
     @property
     @abstractmethod
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """The present estimates of the controller."""
 
     def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Start towards a new target and return the first command.
@@ -383,16 +356,16 @@ class MuscleController(ABC):
 
 
 class _Modelled(MuscleController):
-    """What the controllers with a model share: its memory, moved by what the wire did, and the thermal lag."""
+    """Base of the controllers with a model: its memory, which follows the measured voltage, and the thermal lag."""
 
     def __init__(
         self,
         task: Task,
         state: TwoStageState | None = None,
         limits: tuple[float, float] | None = None,
-        parameters: MuscleParameters | None = None,
+        parameters: InverseControlParameters | None = None,
     ) -> None:
-        self._parameters = p = parameters or MuscleParameters()
+        self._parameters = p = parameters or InverseControlParameters()
         model = task.inverse.model
         super().__init__(Actuator(model.first.input_range, limits).limits, p.period, p.duration)
         self._task = task
@@ -428,7 +401,7 @@ class _Modelled(MuscleController):
 
 
 class MuscleOpenLoop(_Modelled):
-    """Sets once for each target the steady voltage that the inverse says; no feedback of the output.
+    """Set once for each target the steady voltage of the inverse, without feedback of the output.
 
     The memory follows the thermal lag, and in the length task the measured force.
 
@@ -441,8 +414,8 @@ class MuscleOpenLoop(_Modelled):
         that after a reset.
     limits : tuple of float or None
         Least and greatest voltage, V, at least 0; default the range of the model.
-    parameters : MuscleParameters or None
-        Numbers of the controller; the horizon is not used.
+    parameters : InverseControlParameters or None
+        Of the controller; the horizon is not used.
 
     Raises
     ------
@@ -452,7 +425,7 @@ class MuscleOpenLoop(_Modelled):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """The present estimates of the controller."""
         return Trace(reference=self._target, predicted=self._task.output(self._state))
 
     def _decide(self, output: float, *, first: bool) -> float:  # noqa: ARG002
@@ -460,13 +433,13 @@ class MuscleOpenLoop(_Modelled):
 
 
 class MuscleClosedLoop(_Modelled):
-    """Feedforward by the inverse, ahead of the thermal lag; feedback by the disturbance that it is found to have.
+    """Feedforward by the inverse, ahead of the thermal lag; feedback by an estimate of the disturbance.
 
-    At each reading: the thermal lag gives the steady voltage v of the present temperature from what the supply
-    really put out, and with it the model moves on. The disturbance, the measured output less the model's, goes
-    through a Kalman filter. The inverse at target less disturbance gives the next v, and the lag the voltage
-    that leads there. As temperature and disturbance are computed from what was measured and nothing is summed
-    up, nothing winds up while the voltage is at a limit.
+    At each reading: from the measured voltage the thermal lag gives the steady voltage v of the present temperature,
+    with which the model moves on. The disturbance, the measured output less the model's, goes through a Kalman
+    filter. The inverse at target less disturbance gives the next v, and the lag the voltage that leads there. As
+    temperature and disturbance are computed from measurements and nothing is summed up, nothing winds up while the
+    voltage is at a limit.
 
     Each move of v is that of the inverse, but no more and no less than a slope of the output over v within
     `Task.slopes` would take for the present error. After a reversal a model with cells is flat over part of a cell
@@ -484,7 +457,7 @@ class MuscleClosedLoop(_Modelled):
         task: Task,
         state: TwoStageState | None = None,
         limits: tuple[float, float] | None = None,
-        parameters: MuscleParameters | None = None,
+        parameters: InverseControlParameters | None = None,
     ) -> None:
         super().__init__(task, state, limits, parameters)
         self._estimator = DisturbanceEstimator(
@@ -493,7 +466,7 @@ class MuscleClosedLoop(_Modelled):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """The present estimates of the controller."""
         disturbance = self._estimator.value
         return Trace(
             reference=self._target,
@@ -519,9 +492,7 @@ class MuscleClosedLoop(_Modelled):
 
 @dataclass(frozen=True)
 class ProportionalIntegralParameters:
-    """Numbers of the proportional-integral controller.
-
-    For a wire of 5 s that moves by 1.5 mm/V and pulls 3.8 N/V over 0 to 3 V, -2500 V²/m and 1 V²/N serve well.
+    """Parameters of the proportional-integral controller.
 
     Parameters
     ----------
@@ -547,11 +518,11 @@ class ProportionalIntegralParameters:
 
 
 class MuscleProportionalIntegral(MuscleController):
-    """Proportional-integral control without a model: the comparison for what model and inverse are worth.
+    """Proportional-integral control without a model, for comparison.
 
     It sets the square of the voltage, in which the temperature is linear, and moves that on from its present
     value, which is within the limits: so it leaves a limit at once when the error turns, and cannot wind up.
-    Further signals are not looked at.
+    Further signals are ignored.
 
     Parameters
     ----------
@@ -574,7 +545,7 @@ class MuscleProportionalIntegral(MuscleController):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """The present estimates of the controller."""
         return Trace(reference=self._target)
 
     def _observe(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
@@ -594,30 +565,59 @@ class MuscleProportionalIntegral(MuscleController):
         return math.sqrt(max(square, 0.0))
 
 
-class ReachMuscleTarget:
-    """Bring length or force to one target: a `Loop`.
+LENGTH_GAIN, FORCE_GAIN = -2500.0, 1.0
+"""Gains of the proportional-integral control, V²/m and V²/N: the best that were found on the emulated SMA wire.
 
-    Parameters
-    ----------
-    controller : MuscleController
-        Keeps its state from one target to the next.
-    target : float
-        Output units.
-    """
+Its time constant is 5 s, and over 0 to 3 V it moves by 1.5 mm/V and pulls 3.8 N/V. The paper has no control.
+"""
 
-    def __init__(self, controller: MuscleController, target: float) -> None:
-        self._controller = controller
-        self._target = target
 
-    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Aim at the target."""
-        return self._controller.aim(self._target, t, measured_input, output, *others)
+class MakeController(Protocol):
+    """A controller by name: an entry of the group `bench.controllers`."""
 
-    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Go on towards it."""
-        return self._controller.update(t, measured_input, output, *others)
+    def __call__(
+        self, model: TwoStage, *, state: TwoStageState, limits: tuple[float, float], duration: float
+    ) -> MuscleController:
+        """Make it, for the memory at the start, voltages that it may ask for (V), and the time for each target (s).
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks."""
-        return self._controller.trace
+        Raises
+        ------
+        DataError
+            If the model cannot be inverted.
+        """
+
+
+def _with_inverse(
+    controller: Callable[..., MuscleController], task: Callable[[TwoStageInverse], Task]
+) -> MakeController:
+    def make(
+        model: TwoStage, *, state: TwoStageState, limits: tuple[float, float], duration: float
+    ) -> MuscleController:
+        try:
+            inverse = TwoStageInverse(model)
+        except ValueError as error:
+            raise DataError(f"the two-stage model has no inverse: {error}") from error
+        return controller(task(inverse), state, limits, InverseControlParameters(duration=duration))
+
+    return make
+
+
+def _with_gain(gain: float) -> MakeController:
+    def make(
+        model: TwoStage,  # noqa: ARG001 - for comparison without a model
+        *,
+        state: TwoStageState,  # noqa: ARG001
+        limits: tuple[float, float],
+        duration: float,
+    ) -> MuscleController:
+        return MuscleProportionalIntegral(limits, ProportionalIntegralParameters(gain, duration=duration))
+
+    return make
+
+
+LENGTH_OPEN_LOOP = _with_inverse(MuscleOpenLoop, LengthTask)
+LENGTH_CLOSED_LOOP = _with_inverse(MuscleClosedLoop, LengthTask)
+LENGTH_PROPORTIONAL_INTEGRAL = _with_gain(LENGTH_GAIN)
+FORCE_OPEN_LOOP = _with_inverse(MuscleOpenLoop, ForceTask)
+FORCE_CLOSED_LOOP = _with_inverse(MuscleClosedLoop, ForceTask)
+FORCE_PROPORTIONAL_INTEGRAL = _with_gain(FORCE_GAIN)

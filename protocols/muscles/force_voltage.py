@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from bench.identification.two_stage import voltage_steps
 from bench.protocol import Dwell, Messages, Phase, Step, parameter, protocol
-from protocols.muscle import ON_STAGE, StageParameters, fasten, reset_on_stage, sample_voltages, stretch
+from protocols.muscles.parts import ON_STAGE, StageParameters, fasten, reset_on_stage, sample_voltages, stretch
 
 
 class Parameters(StageParameters):
-    """What can be set."""
+    """Parameters."""
 
     points: int = parameter(37, unit="1", low=11, high=10000, help="number of voltages")
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")

@@ -12,7 +12,10 @@ from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoSta
 from bench.identification.two_stage import measure_series, predict_series
 from bench.journal import FILE_NAME, Record
 from bench.model_file import load_coupled_model
-from bench.muscle_runs import (
+from bench.protocol import find_protocol
+from bench.runs import Run, carry_out
+from protocols.muscles.force_voltage import scaled_steps
+from rigs.muscles.identification import (
     FORCE,
     LENGTH,
     MODELS,
@@ -25,9 +28,6 @@ from bench.muscle_runs import (
     read_resting,
     read_series,
 )
-from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
-from protocols.force_voltage import scaled_steps
 
 LOADS = (0.98, 4.9, 8.82)
 VOLTAGES = (0.0, 1.5, 3.0)
