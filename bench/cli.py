@@ -379,60 +379,6 @@ def identify_(
     write_json(json_file, found.summary())
 
 
-@app.command("identify-hybrid")
-def identify_hybrid_(
-    steps: Annotated[Path, typer.Argument(metavar="STEPS_RUN", help="A run of current-steps.")],
-    static: Annotated[Path, typer.Argument(metavar="STATIC_RUN", help="A run of thermomechanical.")],
-    loops: Annotated[Path, typer.Argument(metavar="LOOPS_RUN", help="A run of piezo-loops.")],
-    step: Annotated[Path, typer.Argument(metavar="STEP_RUN", help="A run of piezo-step.")],
-    plays: Annotated[int, typer.Option(min=1, max=200, help="Number of play operators.")] = 15,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Identify the model of a thermo-piezoelectric hybrid, each part from the run that characterized it.
-
-    Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
-    voltage, third-order dynamics from the fast step.
-    """
-    from bench.model_file import HybridFile
-    from rigs.hybrid.identification import identify_hybrid
-
-    found = identify_hybrid(steps, static, loops, step, plays=plays)
-    dynamics = found.dynamics
-    rows = [
-        ("network, RMS of base and tip", f"{found.network.base.rms:.3f} and {found.network.tip.rms:.3f} K"),
-        *(
-            (name, f"{getattr(found.network.network, name):.4g} ± {found.network.uncertainties[name]:.2g}")
-            for name in found.network.uncertainties
-            if name != "ambient"
-        ),
-        (f"polynomial of order {found.order.order}, RMS", f"{found.polynomial.errors.rms * 1e6:.3f} µm"),
-        (f"{plays} plays, RMS", f"{found.piezo.errors.rms_percent:.2f} % of {found.piezo.errors.span * 1e6:.1f} µm"),
-        *(
-            (
-                name.replace("_", " "),
-                f"{getattr(dynamics.model, name):.5g} ± {dynamics.uncertainties[name]:.2g} {unit}",
-            )
-            for name, unit in (("real_pole", "rad/s"), ("frequency", "rad/s"), ("damping", ""))
-        ),
-    ]
-    print_rows("hybrid", rows)
-    if out is not None:
-        HybridFile(found.model, {"sources": [run.name for run in (steps, static, loops, step)]}).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
-    write_json(
-        json_file,
-        {
-            "network_rms_K": {"base": found.network.base.rms, "tip": found.network.tip.rms},
-            "polynomial_order": found.order.order,
-            "polynomial_rms_um": found.polynomial.errors.rms * 1e6,
-            "prandtl_ishlinskii_rms_percent": found.piezo.errors.rms_percent,
-            "poles_rad_s": {"real": dynamics.model.real_pole, "resonance": dynamics.model.frequency},
-            "damping": dynamics.model.damping,
-        },
-    )
-
-
 @app.command("predict")
 def predict_(
     model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
@@ -760,22 +706,3 @@ reproduce_ = typer.Typer(
     cls=Studies,
 )
 app.add_typer(reproduce_, name="reproduce")
-
-
-@reproduce_.command("hybrid")
-def reproduce_hybrid_(
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """Thermo-piezoelectric hybrid: its parts, the model of the whole, and control to nanometres over its range.
-
-    Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric microactuator, 2010.
-    """
-    from rigs.hybrid.study import reproduce_hybrid
-
-    result = reproduce_hybrid(rig="hybrid", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)

@@ -15,7 +15,7 @@ import numpy as np
 from bench.control.loops import Playback
 from bench.number_list import NumberList
 from bench.protocol import Dwell, FastLoop, Messages, Phase, ProtocolParameters, Step, parameter, protocol
-from rigs.hybrid.identification import BASE, DEFLECTION, TIP
+from protocols.hybrid import BASE, DEFLECTION, TIP
 
 SENSORS = (DEFLECTION, BASE, TIP)
 THERMAL = ("tec", *SENSORS)

@@ -5,19 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from bench.control.loops import SampledController
+from bench import registry
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
 from bench.model_file import load_hybrid_model
 from bench.number_list import NumberList
 from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
-from rigs.hybrid.control import (
-    HybridController,
-    MidRangingParameters,
-    OpenLoopHybrid,
-    ThermalFeedback,
-    fine_controller,
-)
-from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS
+from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -59,17 +52,7 @@ def hybrid_control(parameters: Parameters) -> Messages:
     """
     model = load_hybrid_model(Path(parameters.model)).model
     reference, duration = _reference(parameters)
-    controller: SampledController
-    numbers = MidRangingParameters(period=1.0 / parameters.rate, every=max(1, round(0.02 * parameters.rate)))
-    if parameters.controller == "open-loop":
-        controller = OpenLoopHybrid(model, reference, numbers)
-    elif parameters.controller == "thermal-feedback":
-        controller = ThermalFeedback(model, reference)
-    else:
-        estimator: Literal["unscented", "low-pass"] = (
-            "low-pass" if parameters.controller == "hybrid-low-pass" else "unscented"
-        )
-        controller = HybridController(model, reference, numbers, estimator=estimator)
+    controller = registry.load("controllers", f"hybrid.{parameters.controller}")(model, reference, parameters.rate)
     yield Phase(parameters.controller)
     yield FastLoop(
         controller,
@@ -102,8 +85,8 @@ def fine_step(parameters: StepParameters) -> Messages:
     instruments are called directly.
     """
     model = load_hybrid_model(Path(parameters.model)).model
-    controller = fine_controller(
-        model, lambda t: parameters.step if t >= parameters.rest else 0.0, rate=parameters.rate
+    controller = registry.load("controllers", "hybrid.fine")(
+        model, lambda t: parameters.step if t >= parameters.rest else 0.0, parameters.rate
     )
     yield Phase("fine step")
     yield FastLoop(

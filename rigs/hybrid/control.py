@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import numpy as np
 
@@ -114,6 +114,11 @@ class MidRangingParameters:
         check_positive(self)
         if not 2.0 * self.integral * self.period < 1.0:
             raise ValueError(f"integral: expected less than {0.5 / self.period:g} 1/s, got {self.integral}")
+
+    @classmethod
+    def at_rate(cls, rate: float) -> Self:
+        """Return the settings for a number of calls per second, with a new current every 20 ms or call."""
+        return cls(period=1.0 / rate, every=max(1, round(0.02 * rate)))
 
     def share(self, period: float) -> float:
         """Return the share of a new value that a low-pass of `filter_time` takes in after a period (s)."""
@@ -290,9 +295,27 @@ class ThermalFeedback(_MidRanging):
         super().__init__(model, reference, p, lambda bending, _: LowPass(bending, p.share(p.period)), piezo=False)
 
 
-def fine_controller(
-    model: HybridModel, reference: Reference, *, rate: float = 20e3, integral: float = 300.0
-) -> NotchLoop:
+def make_hybrid(model: HybridModel, reference: Reference, rate: float) -> HybridController:
+    """Return the mid-ranging controller with the Kalman filter, called at a rate (Hz)."""
+    return HybridController(model, reference, MidRangingParameters.at_rate(rate))
+
+
+def make_low_pass(model: HybridModel, reference: Reference, rate: float) -> HybridController:
+    """Return the mid-ranging controller with the low-pass, called at a rate (Hz)."""
+    return HybridController(model, reference, MidRangingParameters.at_rate(rate), estimator="low-pass")
+
+
+def make_open_loop(model: HybridModel, reference: Reference, rate: float) -> OpenLoopHybrid:
+    """Return the inverse of the model, called at a rate (Hz)."""
+    return OpenLoopHybrid(model, reference, MidRangingParameters.at_rate(rate))
+
+
+def make_thermal_feedback(model: HybridModel, reference: Reference, rate: float) -> ThermalFeedback:
+    """Return the feedback to the thermal part alone, called at a rate (Hz)."""
+    return ThermalFeedback(model, reference, replace(MidRangingParameters.at_rate(rate), gain=_THERMAL_GAIN))
+
+
+def make_fine(model: HybridModel, reference: Reference, rate: float = 20e3, *, integral: float = 300.0) -> NotchLoop:
     """Return the loop of the piezo part alone, at a rate (Hz) that resolves the resonance; integral gain in 1/s."""
     dynamics = model.dynamics
     parameters = NotchLoopParameters(rate=rate, integral=integral, stroke=STROKE)

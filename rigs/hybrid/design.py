@@ -140,8 +140,8 @@ class Tec:
     electrical_resistance : float
         R_p, Ohm. Missing from the table; 4.8 gives a figure of merit of 2.5e-3 1/K, usual for bismuth telluride.
     capacity : float
-        Heat capacity at the cantilever's face, J/K: plate, clamp, thermistor. The paper has none, and without it
-        the bandwidth is 90 mHz; 0.5 gives the 4 mHz of its table III.
+        Heat capacity at the cantilever's face, J/K: plate, clamp, thermistor. The paper has none; without it the
+        bandwidth is 90 mHz, and 0.5 gives the 4 mHz of its table III.
 
     Raises
     ------
@@ -160,7 +160,7 @@ class Tec:
 
 @dataclass(frozen=True)
 class Design:
-    """The hybrid actuator as it is built, and what follows from that.
+    """The hybrid actuator as built.
 
     Parameters
     ----------

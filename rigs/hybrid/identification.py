@@ -1,7 +1,7 @@
-"""From the runs that characterize the thermo-piezoelectric hybrid to its models.
+"""Identification of the thermo-piezoelectric hybrid from the runs that characterize it.
 
-The runs are fast loops on the rig's signals: what their samples measured stands in the telemetry, at their rate.
-Everything is in SI units; temperatures are in °C and a positive current heats.
+The runs are loops at a fixed rate; their samples are in the telemetry. Units are SI; temperatures are in °C and a
+positive current heats.
 """
 
 from __future__ import annotations
@@ -19,27 +19,22 @@ from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
 Floats = npt.NDArray[np.float64]
 
-CURRENT, VOLTAGE = "tec_setpoint", "piezo_setpoint"
-DEFLECTION = "displacement_position"
-BASE, TIP = "base_temperature", "tip_temperature"
-WITNESS = "witness_position"
-"""The deflection by a sensor beside the loop, where the rig has one, m."""
-
 REFERENCE = 22.0
-"""Temperature of the tip from which the polynomial counts, °C: the room's, as far as it is known."""
+"""Reference of the polynomial, °C: the nominal temperature of the room."""
 
 _DRIFT_PASSES = 64
-"""Operator and parabola are fitted in turn; more passes than these change nothing beyond the sensor's noise."""
+"""Passes in which operator and parabola are fitted in turn; more change less than the sensor's noise."""
 
 
 @dataclass(frozen=True)
 class HybridIdentification:
-    """The model of a hybrid, part by part from a run each, and what speaks for it.
+    """The model of a hybrid, part by part from a run each, with the evidence for it.
 
     Attributes
     ----------
@@ -48,7 +43,7 @@ class HybridIdentification:
     network : NetworkIdentification
         From the steps of the current.
     order : OrderChoice
-        RMS of the polynomial of each order, and which was chosen.
+        RMS of the polynomial of each order, and the order chosen.
     polynomial : Identification
         From the static curve.
     piezo : PiezoIdentification
@@ -67,7 +62,7 @@ class HybridIdentification:
 
 @dataclass(frozen=True)
 class PiezoIdentification:
-    """The operator of the piezo, its errors, and the voltages (V) and deflections (m) that it is from."""
+    """The operator of the piezo, its errors, and the voltages (V) and deflections (m) that it was fitted to."""
 
     operator: PrandtlIshlinskii
     errors: Errors
@@ -82,9 +77,9 @@ class Samples:
     Attributes
     ----------
     table : Table
-        Signals by name; set-points are those that were sent upon the sample.
+        Signals by name; set-points are those sent after the sample was read.
     period : float
-        From sample to sample, s.
+        Time between two samples, s.
     """
 
     table: Table
@@ -133,16 +128,16 @@ def read_loops(run: Path) -> dict[str, Samples]:
 def sine_at(samples: Samples, signal: str, frequency: float) -> complex:
     """Return the complex amplitude of a signal at a frequency (Hz), over the last whole periods but the first.
 
-    The first period is left out, as the transient is in it.
+    The first period is left out: it holds the transient.
     """
     period = 1.0 / (frequency * samples.period)
     # A period need not be a whole number of samples.
     periods = math.floor((len(samples.table) + 1) / period) - 1
     if periods < 1:
-        raise DataError(f"a sine of {frequency:g} Hz takes two periods at least, the first of which does not count")
+        raise DataError(f"a sine of {frequency:g} Hz needs at least two periods; the first is left out")
     last = slice(len(samples.table) - round(periods * period), None)
     times, values = samples.times[last], samples[signal][last]
-    # With what drifts from period to period as further columns.
+    # Offset and drift are fitted beside the sine.
     angle = 2.0 * np.pi * frequency * times
     columns = np.column_stack([np.cos(angle), np.sin(angle), np.ones_like(times), times - times.mean()])
     cosine, sine, *_ = np.linalg.lstsq(columns, values, rcond=None)[0]
@@ -216,7 +211,7 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
 def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
     """Return the Prandtl-Ishlinskii operator of slow loops.
 
-    What the room's temperature bends the beam meanwhile is taken for a parabola in time and taken off.
+    Thermal drift is modelled as a parabola in time and subtracted.
     """
     # A sample is read before its set-point is sent.
     applied = np.append(0.0, samples[VOLTAGE][:-1])

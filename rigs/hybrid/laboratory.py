@@ -4,8 +4,8 @@ A cantilever of piezo-ceramic and copper on a Peltier element. A TEC controller 
 source; a high-voltage amplifier, set and enabled by a LabJack T7, drives the piezo. An optical sensor sees the
 tip; two thermistors are at the base and the tip.
 
-The classes whose names begin with `Direct` stand in a rig file where a driver would: they are the emulated
-instruments themselves, without a wire, for loops of many kHz on the virtual clock.
+The classes whose names begin with `Direct` take the place of drivers in a rig file: the emulated instruments
+themselves, without a wire, for loops of many kHz on the virtual clock.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -69,20 +69,19 @@ FaultName = Literal[
 ]
 
 _direct: dict[str, Device] = {}
-
-D = TypeVar("D", bound=Device)
+"""Instruments of the open laboratory with `direct` by name: one such rig at a time in a process."""
 
 
 class HybridLaboratorySettings(LaboratorySettings):
-    """What a rig file may say of this laboratory."""
+    """Settings of this laboratory in a rig file."""
 
     ambient_deviation: float = Field(
         default=HybridParameters.ambient_sd, ge=0, le=5, description="standard deviation of the room temperature, K"
     )
     ambient_step: float = Field(default=0.0, ge=-20, le=20, description="step of the room temperature, K")
-    ambient_step_time: float = Field(default=0.0, ge=0, description="when the room temperature steps, s")
+    ambient_step_time: float = Field(default=0.0, ge=0, description="time of that step, s")
     resonance_offset: float = Field(
-        default=0.0, ge=-0.1, le=0.1, description="how far the resonance is from the paper's, as a share"
+        default=0.0, ge=-0.1, le=0.1, description="deviation of the resonance from the paper's, as a share"
     )
     current_limit: float = Field(
         default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
@@ -92,10 +91,10 @@ class HybridLaboratorySettings(LaboratorySettings):
     )
     fault: FaultName = Field(
         default="none",
-        description="what goes wrong at `fault_time`: open-thermistor, shorted-thermistor, out-of-range (of the "
+        description="fault at `fault_time`: open-thermistor, shorted-thermistor, out-of-range (of the "
         "displacement sensor), tec-over-current, tec-over-temperature, amplifier-trips (if it is on then)",
     )
-    fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
+    fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
 
 class HybridLaboratory:
@@ -116,7 +115,7 @@ class HybridLaboratory:
     Settings = HybridLaboratorySettings
 
     def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
-        # One stream a source of noise: how often one instrument is asked must not change what another says.
+        # One stream a source of noise: reading one instrument must not change the noise of another.
         plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
         self._settings = settings
         self._clock = clock
@@ -124,7 +123,7 @@ class HybridLaboratory:
             HybridParameters(ambient_sd=settings.ambient_deviation, resonance_offset=settings.resonance_offset), plant
         )
         self.world = World(self.plant, clock)
-        self.tec = EmulatedTEC("tec", self.world, self.plant.peltier, rng=tec)
+        self.tec = DirectTEC("tec", self.world, self.plant.peltier, rng=tec)
         self.tec.write_parameter(_CURRENT_LIMIT_PARAMETER, settings.current_limit)
         self.tec.write_parameter(_COLDEST_PARAMETER, _COLDEST)
         self._beyond = 0.0
@@ -191,28 +190,27 @@ class HybridLaboratory:
         self._opened.close()
 
     def _open_directly(self) -> dict[str, str]:
-        # A rig has its own laboratory, and a process one rig at a time.
         if _direct:
             raise ConfigurationError("another rig with directly called instruments is open in this process")
         self.tec.select_mode(TECMode.CURRENT)
         _direct.update(
             {
                 "tec": self.tec,
-                "displacement": EmulatedPositionSensor(
+                "displacement": DirectPositionSensor(
                     "displacement",
                     self.t7,
                     channels=(DISPLACEMENT_INPUT,),
                     volts_per_metre=5e4,
                     position_limits=(-REACH, REACH),
                 ),
-                "base": EmulatedTemperatureSensor("base", self.t7, channels=BASE_INPUTS),
-                "tip": EmulatedTemperatureSensor("tip", self.t7, channels=TIP_INPUTS),
-                "piezo": EmulatedHighVoltageSupply(
+                "base": DirectTemperatureSensor("base", self.t7, channels=BASE_INPUTS),
+                "tip": DirectTemperatureSensor("tip", self.t7, channels=TIP_INPUTS),
+                "piezo": DirectHighVoltageSupply(
                     "piezo", self.t7, line=ENABLE_LINE, channels=AMPLIFIER_INPUTS, gain=GAIN
                 ),
+                "witness": DirectWitness("witness", self.world, self.plant),
             }
         )
-        _direct["witness"] = DirectWitness("witness", self.world, self.plant)
         return {name: name for name in _direct}
 
     def _step_room(self) -> None:
@@ -235,7 +233,7 @@ class HybridLaboratory:
 
 
 class _Event:
-    """Something that happens once, at its time; a `Timed` part of the world."""
+    """An event that happens once, at its time; a `Timed` part of the world."""
 
     def __init__(self, instant: float, happen: Callable[[], None]) -> None:
         self._due = instant
@@ -252,45 +250,57 @@ class _Event:
 
 
 class DirectSettings(DriverSettings):
-    """What a rig file says of an instrument that is called directly."""
+    """Settings of an instrument that is called directly."""
 
     port: str = Field(description="emulated://NAME of an instrument of a laboratory with `direct`")
 
 
-def _connected(name: str, settings: DirectSettings, kind: type[D]) -> D:
-    device = _direct.get(settings.port)
-    if not isinstance(device, kind):
-        known = ", ".join(port for port, each in _direct.items() if isinstance(each, kind))
-        raise DeviceConnectionError(
-            name,
-            f"no such instrument at {settings.port}; "
-            f"there are: {known or 'none: the table [emulation] needs direct = true'}",
-        )
-    # Its signals are named after it, and the rig would look for them under its own name.
-    if name != device.name:
-        raise DeviceConnectionError(name, f"is called directly and has to be named {device.name}, as it is there")
-    return device
-
-
-class DirectTEC(EmulatedTEC):
-    """The TEC controller in current mode, without its wire."""
+class Direct(Device):
+    """Base of the instruments that are called directly: the laboratory's own instance, without a wire."""
 
     Settings: ClassVar[type[DirectSettings]] = DirectSettings
 
     @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> EmulatedTEC:  # noqa: ARG003
-        """Return the laboratory's own.
+    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> Self:  # noqa: ARG003
+        """Return the instrument of the laboratory that is open.
 
         Raises
         ------
         DeviceConnectionError
-            If the laboratory has none.
+            If the laboratory has no such instrument, or one of another name.
         """
-        return _connected(name, settings, EmulatedTEC)
+        device = _direct.get(settings.port)
+        if not isinstance(device, cls):
+            known = ", ".join(port for port, each in _direct.items() if isinstance(each, cls))
+            raise DeviceConnectionError(
+                name,
+                f"no such instrument at {settings.port}; "
+                f"there are: {known or 'none: the table [emulation] needs direct = true'}",
+            )
+        # Its signals carry its name, and the rig expects them under its own.
+        if name != device.name:
+            raise DeviceConnectionError(name, f"is called directly and has to be named {device.name}, as it is there")
+        return device
 
 
-class DirectWitness(PositionSensor):
-    """The deflection itself, without noise: what a far better sensor beside the loop would say of it.
+class DirectTEC(Direct, EmulatedTEC):
+    """The TEC controller in current mode, without its wire."""
+
+
+class DirectPositionSensor(Direct, EmulatedPositionSensor):
+    """The displacement sensor on the T7, without its wire."""
+
+
+class DirectTemperatureSensor(Direct, EmulatedTemperatureSensor):
+    """A thermistor on the T7, without its wire."""
+
+
+class DirectHighVoltageSupply(Direct, EmulatedHighVoltageSupply):
+    """The amplifier on the T7, without its wire."""
+
+
+class DirectWitness(Direct, PositionSensor):
+    """The deflection itself, without noise: an ideal sensor beside the loop.
 
     Parameters
     ----------
@@ -302,21 +312,14 @@ class DirectWitness(PositionSensor):
         The cantilever.
     """
 
-    Settings: ClassVar[type[DirectSettings]] = DirectSettings
-
     def __init__(self, name: str, world: World, plant: HybridCantilever) -> None:
         super().__init__(name, world.clock)
         self._world = world
         self._plant = plant
 
-    @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> DirectWitness:  # noqa: ARG003
-        """Return the laboratory's own; see `DirectTEC`."""
-        return _connected(name, settings, DirectWitness)
-
     @property
     def identity(self) -> Identity:
-        """There is no such instrument to buy."""
+        """Made up: no such instrument is sold."""
         return Identity("emulated", "witness", "0", "0")
 
     def measure(self) -> dict[str, float]:
@@ -330,36 +333,3 @@ class DirectWitness(PositionSensor):
 
     def close(self) -> None:
         """Do nothing: there is no line."""
-
-
-class DirectPositionSensor(EmulatedPositionSensor):
-    """The displacement sensor on the T7, without its wire."""
-
-    Settings: ClassVar[type[DirectSettings]] = DirectSettings
-
-    @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> EmulatedPositionSensor:  # noqa: ARG003
-        """Return the laboratory's own; see `DirectTEC`."""
-        return _connected(name, settings, EmulatedPositionSensor)
-
-
-class DirectTemperatureSensor(EmulatedTemperatureSensor):
-    """A thermistor on the T7, without its wire."""
-
-    Settings: ClassVar[type[DirectSettings]] = DirectSettings
-
-    @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> EmulatedTemperatureSensor:  # noqa: ARG003
-        """Return the laboratory's own; see `DirectTEC`."""
-        return _connected(name, settings, EmulatedTemperatureSensor)
-
-
-class DirectHighVoltageSupply(EmulatedHighVoltageSupply):
-    """The amplifier on the T7, without its wire."""
-
-    Settings: ClassVar[type[DirectSettings]] = DirectSettings
-
-    @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> EmulatedHighVoltageSupply:  # noqa: ARG003
-        """Return the laboratory's own; see `DirectTEC`."""
-        return _connected(name, settings, EmulatedHighVoltageSupply)

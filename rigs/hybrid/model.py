@@ -20,7 +20,7 @@ from bench.identification.dynamics import ThirdOrder
 from bench.identification.identify import Identification, Initial, identify
 from rigs.hybrid.network import NODES, ThermalNetwork
 
-# How far beyond the range that a part was fitted on it may be used, as part of that range.
+# Allowed use of a part beyond the range that it was fitted on, as a share of that range.
 _BEYOND = 0.05
 
 PUBLISHED_DYNAMICS = ThirdOrder(
@@ -39,14 +39,14 @@ The paper calls it delta/U, but its gain is 1.0113 instead of d_p: it is divided
 
 @dataclass(frozen=True, eq=False)
 class HybridResponse:
-    """What the hybrid model does.
+    """Response of the hybrid model.
 
     Parameters
     ----------
     deflections : ndarray, shape (N,)
         Deflection of the tip from rest, m: the sum of the next two.
     thermal, piezo : ndarray, shape (N,)
-        Parts of the cooler and of the voltage, m.
+        Shares of the thermal and the piezo part, m.
     temperatures : ndarray, shape (N, 4)
         Temperature of each of `NODES`, °C.
     """
@@ -59,16 +59,16 @@ class HybridResponse:
 
 @dataclass(frozen=True, eq=False)
 class HybridModel:
-    """From current and voltage to the deflection of the tip (Rakotondrabe and Ivan 2010, eq. 22, put right).
+    """From current and voltage to the deflection of the tip (Rakotondrabe and Ivan 2010, eq. 22, corrected).
 
     deflection = p(T_L - T_r) - p(0) + D(s)/D(0) (P(U) - its bias)
 
     The temperature T_L of the tip comes from the thermal network, p is the thermomechanical polynomial and P the
-    Prandtl-Ishlinskii operator from volts to metres: each play follows the voltage with a memory of its own,
-    where (20) of the paper lets every one start from the total deflection. D is divided by its gain, 1.011 in
-    (21), since P is the static deflection already. What p and P give at rest is the zero of the sensor that they
-    were fitted to, and is taken off. Where (22) has the air's present temperature, a constant T_r stands: a
-    cantilever that has followed the room to another temperature is bent, with a current or without.
+    Prandtl-Ishlinskii operator from volts to metres: each play follows the voltage with a memory of its own, whereas
+    in (20) every play starts from the total deflection. D is divided by its gain, 1.011 in (21), since P is the
+    static deflection already. The values of p and P at rest, the zero of the sensor, are subtracted. T_r is constant,
+    where (22) has the present temperature of the air: a cantilever that has followed the room to another temperature
+    is bent, with a current or without.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class HybridModel:
     ) -> HybridResponse:
         """Return the response to currents and voltages that are held for dt each, exactly.
 
-        Before, every temperature is the first of the air, and the piezo layer is relaxed.
+        At the start every temperature is that of the air, and the piezo layer is relaxed.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class HybridModel:
 
 @dataclass(frozen=True)
 class OrderChoice:
-    """How good polynomials of each order are, and which is enough.
+    """Errors of polynomials of each order, and the order chosen.
 
     Parameters
     ----------
@@ -202,9 +202,9 @@ def choose_order(
 ) -> OrderChoice:
     """Return the least order beyond which the error of the polynomial does not decrease substantially.
 
-    As Rakotondrabe and Ivan 2010, section V-C, who arrive at four, with a number for substantially: no greater
-    order lowers the RMS error by more than a fraction of the range of the deflections. A single order that does
-    not help (an even one, for an odd curve) does not end the search.
+    As Rakotondrabe and Ivan 2010, section V-C (order 4), with a criterion: no higher order lowers the RMS error by
+    more than a fraction of the range of the deflections. A single order without effect (an even one, for an odd
+    curve) does not end the search.
 
     Parameters
     ----------
@@ -213,9 +213,9 @@ def choose_order(
     deflections : array_like, shape (N,)
         m.
     maximum : int
-        Greatest order tried, at least 1.
+        Highest order tried, at least 1.
     fraction : float
-        What counts as substantial, between 0 and 1.
+        Substantial decrease as a share of the range, between 0 and 1.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def choose_order(
 def identify_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int | None = None) -> Identification:
     """Return the thermomechanical polynomial that fits best (Rakotondrabe and Ivan 2010, eqs. 18 and 19).
 
-    The offset is free, as a sensor has its own zero; `HybridModel` takes it off.
+    The offset is free, as a sensor has its own zero; `HybridModel` subtracts it.
 
     Parameters
     ----------

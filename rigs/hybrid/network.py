@@ -4,8 +4,8 @@ Source: Rakotondrabe and Ivan, "Development and dynamic modeling of a new hybrid
 micro-actuator", IEEE Transactions on Robotics 26(6), 2010; here "Rakotondrabe and Ivan 2010". A cantilever of PZT
 on copper is clamped to one face of a thermoelectric cooler; a block of aluminium is glued to the other.
 
-The network is what Kirchhoff's laws give for the paper's Fig. 10, in absolute temperature and with the Peltier
-heat of each face taken at that face's own temperature. The printed equations differ from it in these points:
+The network follows from Kirchhoff's laws for the paper's Fig. 10, in absolute temperature, with the Peltier heat of
+each face at that face's own temperature. The printed equations differ from it in these points:
 
 - c_sf of (15) has one R_c too many: with it, the block rests 40 K below the room without any current.
 - One Peltier source, alpha T_act0 i, serves both faces in Fig. 10: the electrical power alpha (T_h - T_c) i is lost.
@@ -33,7 +33,7 @@ from bench.hysteresis._checks import Floats
 Node: TypeAlias = Literal["block end", "block front", "base", "tip"]
 
 NODES: tuple[Node, ...] = ("block end", "block front", "base", "tip")
-"""The nodes with a heat capacity, in the order of every array of temperatures.
+"""The nodes with a heat capacity, in the order of all arrays of temperatures.
 
 The insulated end and the front of the block (the paper's T_so, T_sf), the clamped base of the cantilever, which
 is also the cooler's face (T_act0), and its tip (T_actL).
@@ -131,7 +131,7 @@ class ThermalNetwork:
         return np.array([block, block + ends[0], beam, beam + ends[1]])
 
     def rates(self, temperatures: ArrayLike, current: float, ambient: float) -> Floats:
-        """Return how fast each temperature changes, K/s, shape (4,).
+        """Return the rate of change of each temperature, K/s, shape (4,).
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class ThermalNetwork:
         return self._matrix(current), joule + (ambient - ABSOLUTE_ZERO) * peltier
 
     def _forcing(self, current: float) -> tuple[Floats, Floats]:
-        """Return what the current does at rest: rates by Joule heat, K/s, and by Peltier heat, per kelvin of air."""
+        """Return the rates due to the current at rest: by Joule heat, K/s, and by Peltier heat, per kelvin of air."""
         joule, peltier = 0.5 * self.electrical_resistance * current**2, self.seebeck * current
         back = 1.0 / self._node_conductance(current)
         both = np.zeros((2, 4))
@@ -166,7 +166,7 @@ class ThermalNetwork:
         return both[0], both[1]
 
     def _node_conductance(self, current: float) -> float:
-        """Return what the massless node sees, 1/R_c + 1/R_th + alpha i, W/K."""
+        """Return the conductance at the massless node, 1/R_c + 1/R_th + alpha i, W/K."""
         total = 1.0 / self.glue_resistance + 1.0 / self.tec_resistance + self.seebeck * current
         if not total > 0.0:
             limit = -(1.0 / self.glue_resistance + 1.0 / self.tec_resistance) / self.seebeck
@@ -184,7 +184,7 @@ class ThermalNetwork:
             flows[[one, other], [other, one]] += 1.0 / resistance
             flows[[one, other], [one, other]] -= 1.0 / resistance
         flows[np.diag_indices(4)] -= self.air_conductances
-        # The massless node is a star of two branches; the Peltier heat it takes is proportional to its temperature.
+        # The massless node is a star of two branches; its Peltier heat is proportional to its temperature.
         glue, cooler = 1.0 / self.glue_resistance, 1.0 / self.tec_resistance
         total = self._node_conductance(current)
         flows[_BLOCK_FRONT, _BLOCK_FRONT] += glue**2 / total - glue
@@ -201,7 +201,7 @@ class ThermalNetwork:
         return float(flow / self._node_conductance(current))
 
     def steady_rises(self, current: float, ambient: float = 22.0) -> Floats:
-        """Return how far above the air each node settles under a constant current, K, shape (4,).
+        """Return the steady rise of each node above the air under a constant current, K, shape (4,).
 
         One linear solve: no iteration, and exactly 0 without current.
 
@@ -227,7 +227,7 @@ class ThermalNetwork:
         return float(self.air_conductances @ rises)
 
     def electrical_power(self, temperatures: ArrayLike, current: float) -> float:
-        """Return R_p i² + alpha (T_0 - T_x) i, what the cooler takes from its supply, W."""
+        """Return the power that the cooler draws from its supply, R_p i² + alpha (T_0 - T_x) i, W."""
         nodes, i = _nodes("temperatures", temperatures), _checks.number("current", current)
         difference = nodes[_BASE] - ABSOLUTE_ZERO - self._back_face(nodes, i)
         return float(self.electrical_resistance * i**2 + self.seebeck * difference * i)
@@ -255,13 +255,13 @@ class ThermalNetwork:
     def bandwidth(self, node: Node = "tip", current: float = 0.0, ambient: float = 22.0) -> float:
         """Return the frequency at which small changes of a temperature have fallen by 3 dB, Hz.
 
-        The first such frequency, relative to constant changes of the current. That of the tip is also that of
-        the thermal deflection, which follows the tip's temperature at once (Rakotondrabe and Ivan 2010, eq. 11).
+        The lowest such frequency, relative to constant changes of the current. The bandwidth of the tip is also that
+        of the thermal deflection, which follows it without lag (Rakotondrabe and Ivan 2010, eq. 11).
 
         Parameters
         ----------
         node : {"block end", "block front", "base", "tip"}
-            Where the temperature is taken.
+            Node of the temperature.
         current : float
             Constant current about which it changes, A.
         ambient : float
@@ -371,7 +371,7 @@ def _powers(step: Floats, start: Floats, count: int) -> Floats:
 
 
 def _runs(currents: Floats, ambient: Floats) -> Iterator[tuple[int, int]]:
-    """Yield first and stop of each stretch over which nothing changes."""
+    """Yield first and stop of each stretch with constant current and air."""
     edges = np.flatnonzero((np.diff(currents) != 0.0) | (np.diff(ambient) != 0.0)) + 1
     bounds = [0, *edges.tolist(), currents.size]
     yield from pairwise(bounds)

@@ -84,15 +84,14 @@ def identify_network(
     """Return the network that follows measured steps of the current best in the least-squares sense.
 
     Fitted are the logarithms of the free parameters, so that they stay positive, and the ambient temperature,
-    which all nodes have at the first sample. Temperatures tell heat capacities, conductances, alpha and R_p up to
-    one common factor only; what is held sets it. By default that is what is known best, the heat capacity of the
-    block, a solid piece of metal. Held with it are the capacity of the cantilever, and what two thermistors
-    cannot tell from the rest: the resistances of glue, along the block and of its front (in parallel with its
-    sides), and that of the cantilever's end face (1.7 % of its loss). For the others a series needs steps of both
-    signs, since alpha is what is odd in the current and R_p what is even, held for as long as the block takes
-    to warm (about 7 min), and sampled within the lag of the tip (about 2 s). The block is seen by its slow share of
-    a few kelvin: a room that wanders meanwhile shifts the common factor by more than the uncertainties say, while
-    temperatures and bandwidth stay right.
+    which all nodes have at the first sample. Temperatures determine heat capacities, conductances, alpha and R_p up
+    to one common factor; a held parameter sets it. By default that is the best known one, the heat capacity of the
+    block, a solid piece of metal. Also held are the capacity of the cantilever and the parameters that two
+    thermistors cannot resolve: the resistances of the glue, along the block and of its front (in parallel with its
+    sides), and that of the cantilever's end face (1.7 % of its loss). The others need steps of both signs, since
+    alpha acts oddly in the current and R_p evenly, held until the block is warm (about 7 min), and sampled faster
+    than the lag of the tip (about 2 s). The block shows as a slow share of a few kelvin: a room that drifts meanwhile
+    shifts the common factor by more than the stated uncertainties, but not temperatures and bandwidth.
 
     Parameters
     ----------
@@ -103,7 +102,7 @@ def identify_network(
     dt : float
         Sampling time, s.
     start : ThermalNetwork or None
-        Network from which the search starts and which provides what is held; default that of `Design`.
+        Start of the search, with the values of the held parameters; default that of `Design`.
     free : sequence of str
         Names of the parameters to fit.
 

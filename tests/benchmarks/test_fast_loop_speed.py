@@ -11,9 +11,9 @@ from bench.journal import FILE_NAME, Journal
 from bench.protocol import FastLoop, ProtocolParameters, protocol
 from bench.rig import Rig, load_rig
 from bench.runs import trace_signals
-from rigs.hybrid.control import fine_controller
+from protocols.hybrid import DEFLECTION
+from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
-from rigs.hybrid.identification import DEFLECTION
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 pytestmark = pytest.mark.benchmark
@@ -34,7 +34,7 @@ def make_controller():
     )
     polynomial = Polynomial([-7.363e-6 * 25.0], (-25.0, 25.0))
     model = HybridModel(Design().network(), polynomial, hysteresis, PUBLISHED_DYNAMICS)
-    return fine_controller(model, lambda t: STEP if t >= 0.05 else 0.0, rate=RATE)
+    return make_fine(model, lambda t: STEP if t >= 0.05 else 0.0, rate=RATE)
 
 
 def through_the_engine(folder, record_every):

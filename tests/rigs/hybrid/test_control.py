@@ -14,7 +14,7 @@ from rigs.hybrid.control import (
     MidRangingParameters,
     OpenLoopHybrid,
     ThermalFeedback,
-    fine_controller,
+    make_fine,
 )
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, ThermalNoise, UnscentedEstimate
@@ -210,9 +210,7 @@ def test_comparisons_are_far_worse(model):
 @pytest.mark.parametrize("seed", range(4))
 def test_fine_step(model, seed, offset):
     for size in (5 * MICRO, -5 * MICRO):
-        settling, overshoot, rest = step_response(
-            fine_controller(model, step(size)), size, seed, resonance_offset=offset
-        )
+        settling, overshoot, rest = step_response(make_fine(model, step(size)), size, seed, resonance_offset=offset)
         assert settling < 12e-3
         assert overshoot < 0.01
         assert rest < 4 * NANO
@@ -225,7 +223,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
     plant.drive(current)
     plant.advance(600.0)
     place, size = plant.deflection, 5 * MICRO
-    controller = fine_controller(model, step(place + size, 0.1, place))
+    controller = make_fine(model, step(place + size, 0.1, place))
     noise = NOISE[0] * np.random.default_rng(9).standard_normal(8000)
     deflections = []
     for k, each in enumerate(noise.tolist()):
@@ -241,7 +239,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
 def test_fine_loop_needs_its_notch(model):
     # With zeros damped as the poles are, it is none; half the gain then rings already.
     without = replace(model, dynamics=replace(model.dynamics, damping=0.7))
-    controller = fine_controller(without, step(5 * MICRO), integral=150.0)
+    controller = make_fine(without, step(5 * MICRO), integral=150.0)
     settling, overshoot, _ = step_response(controller, 5 * MICRO, 0)
     assert settling > 20e-3
     assert overshoot > 0.015
@@ -316,7 +314,7 @@ def test_what_is_out_of_reach_does_not_wind_up(model):
 
 def test_fine_integral_does_not_wind_up(model):
     # 30 µm is out of reach of the piezo part; from there back to 2 µm in no more than the usual time.
-    controller = fine_controller(model, step(2 * MICRO, 0.3, 30 * MICRO))
+    controller = make_fine(model, step(2 * MICRO, 0.3, 30 * MICRO))
     plant = plant_of(8, 0, ambient_sd=0.0)
     deflections, voltages = [], []
     for k in range(round(0.4 / FAST)):
@@ -372,7 +370,7 @@ def test_missing_readings_hold_and_are_got_over(model, estimator):
 
 
 def test_fine_loop_holds_at_a_missing_reading(model):
-    controller = fine_controller(model, step(1 * MICRO, 0.0))
+    controller = make_fine(model, step(1 * MICRO, 0.0))
     assert controller.update(0.0, (math.nan,)) == (0.0,)
     first = [controller.update(FAST * k, (0.0, 25.0)) for k in range(1, 4)]
     assert first[0] != first[2]
@@ -514,7 +512,7 @@ def test_wrong_input_is_named(make, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda m: fine_controller(m, RANGE, rate=1e3), "frequency: expected rad/s between"),
+        (lambda m: make_fine(m, RANGE, rate=1e3), "frequency: expected rad/s between"),
         (lambda m: HybridController(m, RANGE, estimator="none"), "estimator: expected unscented or low-pass"),
         (lambda m: HybridController(m, RANGE).update(0.0, (0.0, 22.0)), "measured: expected deflection and two"),
         (lambda m: HybridController(replace(m, polynomial=folded()), RANGE), "polynomial: expected one that rises"),
@@ -528,6 +526,6 @@ def test_wrong_input_of_a_controller_is_named(model, make, message):
 def test_published_dynamics_do_as_well(model):
     """The published dynamics serve where the resonance was not measured."""
     published = replace(model, dynamics=PUBLISHED_DYNAMICS)
-    settling, overshoot, _ = step_response(fine_controller(published, step(5 * MICRO)), 5 * MICRO, 1)
+    settling, overshoot, _ = step_response(make_fine(published, step(5 * MICRO)), 5 * MICRO, 1)
     assert settling < 12e-3
     assert overshoot < 0.01

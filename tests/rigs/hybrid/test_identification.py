@@ -13,12 +13,8 @@ from bench.hysteresis import PrandtlIshlinskii
 from bench.journal import FILE_NAME, Record, Table
 from bench.protocol import find_protocol
 from bench.runs import Run, carry_out
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.identification import (
-    BASE,
-    CURRENT,
-    DEFLECTION,
-    TIP,
-    VOLTAGE,
     Samples,
     bandwidth_of,
     identify_hybrid,
@@ -195,9 +191,7 @@ class TestSine:
 
     @pytest.mark.parametrize("count", [1, 50, 150, 198])
     def test_less_than_two_periods_are_refused(self, count):
-        with pytest.raises(
-            DataError, match=r"a sine of 0.1 Hz takes two periods at least, the first of which does not"
-        ):
+        with pytest.raises(DataError, match=r"a sine of 0.1 Hz needs at least two periods"):
             sine_at(made_up(0.1, y=np.zeros(count)), "y", 0.1)
 
     def test_of_a_run(self, runs):

@@ -20,10 +20,11 @@ from bench.model_file import HybridFile
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
+from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 from protocols.hybrid.control import REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
 from rigs.hybrid.design import Design
-from rigs.hybrid.identification import BASE, DEFLECTION, TIP, WITNESS, read_loop, read_loops
+from rigs.hybrid.identification import read_loop, read_loops
 from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 

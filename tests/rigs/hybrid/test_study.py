@@ -9,7 +9,8 @@ import pytest
 from bench.cli import main
 from bench.journal import Record
 from bench.model_file import load_hybrid_model
-from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
+from protocols.hybrid import CURRENT, DEFLECTION, VOLTAGE, WITNESS
+from rigs.hybrid.identification import read_loop
 from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
 
 RUNS = {
