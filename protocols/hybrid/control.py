@@ -9,7 +9,7 @@ from bench import registry
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
 from bench.model_file import load_hybrid_model
 from bench.number_list import NumberList
-from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
 from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
@@ -54,12 +54,12 @@ def hybrid_control(parameters: Parameters) -> Messages:
     reference, duration = _reference(parameters)
     controller = registry.load("controllers", f"hybrid.{parameters.controller}")(model, reference, parameters.rate)
     yield Phase(parameters.controller)
-    yield FastLoop(
-        controller,
-        parameters.rate,
-        duration,
-        (DEFLECTION, BASE, TIP),
-        ("tec", "piezo"),
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=duration,
+        inputs=(DEFLECTION, BASE, TIP),
+        actuators=("tec", "piezo"),
         watched=(WITNESS,) if parameters.witness else (),
         record_every=max(1, round(parameters.rate / parameters.record_rate)),
         label=parameters.reference,
@@ -89,12 +89,12 @@ def fine_step(parameters: StepParameters) -> Messages:
         model, lambda t: parameters.step if t >= parameters.rest else 0.0, parameters.rate
     )
     yield Phase("fine step")
-    yield FastLoop(
-        controller,
-        parameters.rate,
-        parameters.rest + parameters.duration,
-        (DEFLECTION,),
-        ("piezo",),
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=parameters.rest + parameters.duration,
+        inputs=(DEFLECTION,),
+        actuators=("piezo",),
         watched=(WITNESS,) if parameters.witness else (),
         label="fine step",
     )

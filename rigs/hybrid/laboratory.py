@@ -21,7 +21,7 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.devices import Device, DriverSettings, Identity, PositionSensor, TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import (
     DisplacementSensor,

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.dynamixel import COUNT, EmulatedDrum, EmulatedMX28, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7, RatiometricSensor

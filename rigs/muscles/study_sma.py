@@ -23,7 +23,6 @@ from bench.figures import (
 from bench.hysteresis import Preisach, TwoStage
 from bench.identification.two_stage import predict_series
 from bench.tracking_results import TargetResults
-from protocols.muscles.parts import FORCE, LENGTH
 from rigs.muscles.characterization import (
     TITLES,
     Characterization,
@@ -32,6 +31,7 @@ from rigs.muscles.characterization import (
     json_key,
     plot_lengths,
 )
+from rigs.muscles.identification import FORCE, LENGTH
 
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
 LOAD_CHANGE = 1.96

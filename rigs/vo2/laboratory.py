@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.labjack_t7 import EmulatedT7, NormalisedPSD
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory

@@ -317,7 +317,7 @@ def test_error_is_cleared_by_a_reboot_and_by_recover(bench):
     bench.device.set(0.01).wait()
     bench.servo.trip(HardwareError.OVERLOAD)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"stage: .*overload.*recover"):
+    with pytest.raises(DeviceError, match=r"stage: .*overload.*off and on"):
         bench.connect()
     device = bench.connect(DynamixelDrum.recover)
     device.set(-0.01).wait()

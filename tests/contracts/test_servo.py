@@ -434,7 +434,7 @@ def test_nothing_is_worn_out(bench):
 def test_hardware_error_is_told_and_cleared_by_a_reboot(bench):
     bench.device.set(5.0).wait()
     bench.instrument.trip(HardwareError.OVERLOAD | HardwareError.OVERHEATING)
-    with pytest.raises(DeviceError, match=r"0x24 \(overheating, overload; 12\.0 V, 25 °C\): .*reboot"):
+    with pytest.raises(DeviceError, match=r"0x24 \(overheating, overload; 12\.0 V, 25 °C\): .*off and on"):
         bench.device.measure()
     with pytest.raises(RequestRefusedError) as refused:
         bench.instrument.write_item(64, 1)
@@ -461,7 +461,7 @@ def test_cause_that_is_still_there_survives_the_reboot(bench):
 def test_error_of_before_is_refused_and_recovered(bench):
     bench.instrument.trip(HardwareError.ELECTRICAL_SHOCK)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"electrical shock.*recover"):
+    with pytest.raises(DeviceError, match=r"electrical shock.*off and on"):
         bench.connect()
     device = bench.connect(DynamixelMX28.recover)
     device.set(5.0).wait()

@@ -406,7 +406,7 @@ def test_error_of_before_is_refused_and_recovered(bench):
     bench.device.set(60.0)
     bench.instrument.trip(183)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"error 183 .*watchdog.*recover"):
+    with pytest.raises(DeviceError, match=r"error 183 .*watchdog.*off and on"):
         bench.connect()
     settings = bench.device._settings
     device = MeerstetterTEC.recover("tec", settings, bench.clock)

@@ -608,7 +608,7 @@ def test_emergency_stop_stays_until_it_is_released(bench):
     bench.device.set(6.0)
     bench.device.emergency_stop()
     assert bench.load.voltage == 0.0
-    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+    with pytest.raises(DeviceError, match=r"emergency stop; .*off and on"):
         bench.device.set(5.0)
     with pytest.raises(DeviceError, match="emergency stop"):
         bench.device.measure()
@@ -623,7 +623,7 @@ def test_emergency_stop_of_before_is_refused_and_recovered(bench):
     bench.device.set(6.0)
     bench.instrument.write_object(0x200C, 1)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+    with pytest.raises(DeviceError, match=r"emergency stop; .*off and on"):
         bench.connect()
     applied = len(bench.load.applied)
     device = bench.recover()

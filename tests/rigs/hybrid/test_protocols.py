@@ -17,8 +17,9 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
 from bench.model_file import HybridFile
-from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
-from bench.rig import Rig, load_rig
+from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 from protocols.hybrid.control import REST, moves_of
@@ -98,7 +99,7 @@ def dry(protocol, **settings):
 
 
 def loops(protocol, **settings):
-    return [message for message in dry(protocol, **settings) if isinstance(message, FastLoop)]
+    return [message for message in dry(protocol, **settings) if isinstance(message, FixedRate)]
 
 
 def setpoints(loop, actuator=0):
@@ -402,7 +403,13 @@ def flat(text):
 def record(folder, protocol, rig, **settings):
     definition, parameters = parsed(protocol, settings)
     run = Run(
-        protocol=definition, parameters=parameters, rig=rig, folder=folder, seed=1, clock="virtual", recording=False
+        protocol=definition,
+        settings=parameters.model_dump(),
+        rig=rig,
+        folder=folder,
+        seed=1,
+        clock="virtual",
+        recording=False,
     )
     result = carry_out(run, Console(file=io.StringIO(), width=200))
     assert result.outcome.status == "completed", result.outcome.reason

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from bench.cli import main
+from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
 from bench.model_file import CoupledFile, ModelFile
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
-from bench.rig import load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.tracking_results import target_results
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import LOADS
@@ -42,10 +44,19 @@ def assignments(option, values):
     return [part for key, value in values.items() for part in (option, f"{key}={value}")]
 
 
+def bound(protocol, settings):
+    """A protocol with its parameters and its slots on the rig `sma`."""
+    definition, file = find_protocol(protocol), load_rig("sma")
+    texts = {key: str(value) for key, value in settings.items()}
+    parameters = definition.parse(texts, file.roles, file.protocols.get(protocol))
+    with Rig(file, VirtualClock(), 0) as rig:
+        return definition, parameters, rig.slots(definition)
+
+
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
-    definition = find_protocol(protocol)
-    messages = definition.generator(definition.parse({key: str(value) for key, value in settings.items()}))
+    definition, parameters, slots = bound(protocol, settings)
+    messages = definition.start(parameters, slots)
     zeros = dict.fromkeys((FORCE, LENGTH), 0.0)
     found, reading = [], None
     while True:
@@ -71,8 +82,7 @@ def samples_by_phase(messages):
 
 
 def planned(protocol, **settings):
-    definition = find_protocol(protocol)
-    return plan(definition, definition.parse({key: str(value) for key, value in settings.items()}))
+    return plan(*bound(protocol, settings))
 
 
 def preisach(low, high, least, greatest, units):
@@ -134,11 +144,11 @@ class TestPlan:
         found = samples_by_phase(messages)
         assert [set(voltages) for voltages in found.values()] == [{0.0}, {0.6}, {1.2}, {1.8}, {2.4}, {3.0}]
         assert [len(voltages) for voltages in found.values()] == [23] * 6
-        asked = [message.loop.trace.reference for message in messages if isinstance(message, Control)]
+        asked = [message.task.trace.reference for message in messages if isinstance(message, Control)]
         assert max(asked) == 10.5
         assert min(asked) == 0.3
         start = messages.index(Phase("length over force at 0 V"))
-        one = [m.loop.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
+        one = [m.task.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
         np.testing.assert_allclose(np.diff(one), [*[(10.5 - 0.3) / 11] * 11, *[-(10.5 - 0.3) / 11] * 11])
 
     def test_verification_has_the_paper_s_90_samples(self):
@@ -208,8 +218,8 @@ class TestPlan:
             reach = [m for m in messages if isinstance(m, Control) and m.actuator == "supply"]
             targets = []
             for message in reach:
-                message.loop.begin(0.0, 0.0, 1.0)
-                targets.append(message.loop.trace.reference)
+                message.task.begin(0.0, 0.0, 1.0)
+                targets.append(message.task.trace.reference)
             references.append(targets)
         assert references[0] == references[1] != references[2]
         assert len(references[0]) == 30
@@ -224,7 +234,7 @@ class TestRefused:
             find_protocol("length-voltage").parse({"loads": text})
 
     def test_numbers(self):
-        parameters = find_protocol("length-voltage").parse({"loads": " 1, 2.5 ,-3e-1"})
+        _, parameters, _ = bound("length-voltage", {"loads": " 1, 2.5 ,-3e-1"})
         assert parameters.loads == (1.0, 2.5, -0.3)
 
     @pytest.mark.parametrize(
@@ -293,8 +303,9 @@ class TestRefused:
         code, _, err = bench("run", protocol, "--rig", "vo2", "--clock", "virtual", *settings, "--out", tmp_path)
         assert code == 2
         on_weights = protocol in ("length-voltage", "length-verification", "length-control")
-        last = "fan" if on_weights else "stage, stage_position"
-        assert f"needs supply, load_cell_force, wire_end_position, {last}, which rig vo2 does not have" in err
+        missing = "[roles.force], [roles.load], [roles.cooling]" if on_weights else "[roles.force], [roles.stage]"
+        text = re.sub(r"\s+", " ", err)
+        assert f"vo2.toml: protocol {protocol} needs {missing}; the file binds: drive, response" in text
         assert not list(tmp_path.iterdir())
 
     def test_forces_out_of_order(self):
