@@ -13,7 +13,7 @@ from bench.controllers import FollowerName, load_model_for, make_follower
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.measurements import read_columns
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
-from bench.tracking_results import FOLLOW
+from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
 _DRIVE = unit_of("drive")

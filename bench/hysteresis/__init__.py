@@ -1,5 +1,6 @@
 """Hysteresis operators: immutable models, explicit memory, numbers only."""
 
+from bench.hysteresis.density import Density
 from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.operator import Operator, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
@@ -18,6 +19,7 @@ from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage, TwoSta
 __all__ = [
     "Coupled",
     "DeadZones",
+    "Density",
     "Linear",
     "MemoryCurve",
     "Operator",

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
 from bench.hysteresis.regressor import Regressor
 
 S = TypeVar("S")
@@ -67,6 +68,10 @@ class Operator(Protocol[S]):
 
     def output_range(self) -> tuple[float, float]:
         """Return least and greatest output over all reachable states."""
+        ...
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return the operator's Preisach density, for drawing; nothing if it has none."""
         ...
 
     def to_json(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
 from bench.hysteresis.regressor import Regressor
 
 
@@ -102,6 +103,10 @@ class Polynomial:
         points = np.concatenate([[-1.0, 1.0], np.clip(real, -1.0, 1.0)])
         values = chebyshev.chebval(points, coefficients)
         return float(values.min()), float(values.max())
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return nothing: the operator has no density on a Preisach plane."""
+        return ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the polynomial as a JSON object."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
 from bench.hysteresis.regressor import Regressor
 
 PlayState: TypeAlias = tuple[float, ...]
@@ -397,6 +398,10 @@ class PrandtlIshlinskii:
         weighted = self.weights * z
         beyond = np.append(np.cumsum(weighted[:0:-1])[::-1], 0.0)
         return tuple((self._sums * z + beyond).tolist())
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return nothing: the operator has no density on a Preisach plane."""
+        return ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the operator as a JSON object."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
 from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import Reversible, reversible_from_json
@@ -162,6 +163,10 @@ class Preisach:
         matrix = np.full((self.order, self.order), np.nan)
         matrix[np.tril_indices(self.order)] = self.density
         return matrix
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return the density, for drawing."""
+        return (Density("", self.levels, self.density_matrix(), self.input_unit, self.output_unit),)
 
     @cached_property
     def lattice(self) -> Lattice:

@@ -11,7 +11,7 @@ elongated.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
 from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.operator import Operator, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
@@ -60,6 +61,10 @@ class Coupled(Protocol[S]):
 
     def advance(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> S:
         """Return the state after a sequence."""
+        ...
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return the densities of the stages that have one, for drawing."""
         ...
 
     def to_json(self) -> dict[str, Any]:
@@ -296,6 +301,10 @@ class TwoStage:
         second = _advanced(self.second, before.second, path[:-1])
         return self._arrived(float(v[-1]), float(f[-1]), first, second, float(blocked[-1]), float(path[-1]))[0]
 
+    def densities(self) -> tuple[Density, ...]:
+        """Return the densities of the stages that have one, for drawing."""
+        return _densities("H1", self.first) + _densities("H2", self.second, measured=False)
+
     def to_json(self) -> dict[str, Any]:
         """Return the model as a JSON object."""
         return {
@@ -426,6 +435,10 @@ class Summed:
             _advanced(self.by_voltage, before.by_voltage, v),
         )
 
+    def densities(self) -> tuple[Density, ...]:
+        """Return the densities of the stages that have one, for drawing."""
+        return _densities("H3", self.by_force) + _densities("H4", self.by_voltage)
+
     def to_json(self) -> dict[str, Any]:
         """Return the model as a JSON object."""
         return {
@@ -548,6 +561,10 @@ class Linear:
         """
         return self.two_stage.advance(voltages, forces, state)
 
+    def densities(self) -> tuple[Density, ...]:
+        """Return the densities of the stages that have one, for drawing."""
+        return _densities("H5", self.operator, measured=False)
+
     def to_json(self) -> dict[str, Any]:
         """Return the model as a JSON object."""
         return {
@@ -596,6 +613,10 @@ def coupled_from_json(document: Mapping[str, Any]) -> TwoStage | Summed | Linear
     if kind not in kinds:
         raise ValueError(f"coupled model: expected type {' or '.join(map(repr, kinds))}, got {kind!r}")
     return kinds[kind].from_json(document)
+
+
+def _densities(title: str, stage: Stage, *, measured: bool = True) -> tuple[Density, ...]:
+    return tuple(replace(density, title=title, measured=measured) for density in stage.densities())
 
 
 def _agree(name: str, unit: str, other: str) -> None:

@@ -24,7 +24,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
-from bench.tracking_results import REACH, READING
+from bench.results.tracking import REACH, READING
 from protocols.muscles.parts import (
     ON_STAGE,
     ON_WEIGHTS,

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult
-from bench.figures import Curve, plot_panels, plot_tracking
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import HybridFile
+from bench.results.figures import Curve, plot_panels, plot_tracking
 from bench.runs import RunResult
 from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE, WITNESS
 from rigs.hybrid.design import Design

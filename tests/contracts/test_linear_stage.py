@@ -11,13 +11,9 @@ from bench.clock import VirtualClock
 from bench.devices import LinearStage, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.dynamixel import DynamixelDrum
-from sim_devices.instruments.dynamixel import (
-    COUNT,
-    VELOCITY_UNIT,
-    EmulatedDrum,
-    EmulatedMX28,
-    HardwareError,
-)
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_drum import EmulatedDrum
+from sim_devices.instruments.dynamixel_table import COUNT, VELOCITY_UNIT, HardwareError
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World

@@ -15,15 +15,15 @@ from bench.clock import VirtualClock, WallClock
 from bench.devices import Servo, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.dynamixel import DynamixelMX28
-from sim_devices.instruments.dynamixel import (
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_table import (
     ACCELERATION_UNIT,
     COUNT,
     VELOCITY_UNIT,
-    EmulatedMX28,
     ErrorNumber,
     HardwareError,
-    RequestRefusedError,
 )
+from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World

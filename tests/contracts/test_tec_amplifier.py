@@ -12,7 +12,8 @@ from bench.clock import VirtualClock
 from bench.devices import TECAmplifier, TECMode, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.meerstetter import MeerstetterTEC
-from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
+from sim_devices.instruments.meerstetter_table import DeviceStatus
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.mecom import MeComServer

@@ -23,8 +23,10 @@ from drivers.labjack_t7.registers import (
     TEST_FLOAT32,
     LabJackT7,
 )
-from sim_devices.instruments.labjack_t7 import EmulatedT7, PiezoAmplifier
-from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings

@@ -22,7 +22,7 @@ from rigs.muscles.laboratory import (
     SMALaboratory,
     SMALaboratorySettings,
 )
-from sim_devices.instruments.dynamixel import VELOCITY_UNIT
+from sim_devices.instruments.dynamixel_table import VELOCITY_UNIT
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 PROFILE_VELOCITY = 112
