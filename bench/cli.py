@@ -9,16 +9,19 @@ from __future__ import annotations
 import json
 import sqlite3
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 import typer
 from rich.console import Console
 from rich.markdown import Markdown
+from rich.markup import escape
 from rich.table import Table
+from typer.core import TyperGroup
 
+from bench import registry
 from bench.errors import BenchError, ConfigurationError
 
 _EPILOG = (
@@ -28,8 +31,77 @@ _EPILOG = (
 )
 UNSAFE_EXIT_CODE = 7
 
+
+class RegisteredCommands(TyperGroup):
+    """A group of commands with those that packages register in `group`, each loaded when it is asked for."""
+
+    group: ClassVar[registry.Group] = "commands"
+
+    # The types of click are a private part of typer.
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
+        """Return the names of all commands, the registered ones last."""
+        own = super().list_commands(ctx)
+        return [*own, *(name for name in registry.entries(self.group) if name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
+        """Return a command; one that cannot be loaded says so when it is called."""
+        entry = registry.entries(self.group).get(cmd_name)
+        if cmd_name in self.commands or entry is None:
+            return super().get_command(ctx, cmd_name)
+        one = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+        try:
+            callback = self.make_callback(cmd_name, entry.load())
+        except ConfigurationError as error:
+            failure = error
+
+            def callback() -> None:
+                raise failure
+
+            callback.__doc__ = f"Cannot be loaded: {error}"
+        one.command(cmd_name)(callback)
+        return typer.main.get_command(one)
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401
+        """Return the function of a command whose entry point is `part`: that itself."""
+        callback: Callable[..., None] = part
+        return callback
+
+
+class Studies(RegisteredCommands):
+    """The commands of `bench reproduce`, one for each registered study."""
+
+    group = "studies"
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ANN401
+        """Return a function that carries a study out."""
+
+        def carry_out_study(
+            rig: Annotated[
+                str | None,
+                typer.Option("--rig", metavar="RIG", help="Another rig with the same signals."),
+            ] = None,
+            seed: Annotated[
+                int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
+            ] = 0,
+            out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path(
+                "recordings"
+            ),
+            live: Annotated[
+                bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+            ] = False,
+            json_file: JsonOption = None,
+        ) -> None:
+            from bench.campaign import reproduce
+
+            write_json(json_file, reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console))
+
+        carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"
+        return carry_out_study
+
+
 app = typer.Typer(
     name="bench",
+    cls=RegisteredCommands,
     help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
     "identify hysteresis models from what was measured, and apply them.",
     epilog=_EPILOG,
@@ -66,7 +138,7 @@ def fail(error: BenchError) -> NoReturn:
 
 def _print_error(error: BenchError) -> None:
     for line in str(error).splitlines():
-        _errors.print("[bold red]error:[/]", line, highlight=False, markup=True, soft_wrap=True)
+        _errors.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
 
 
 @app.command("list")
@@ -295,7 +367,7 @@ def identify_(
         console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
-        _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
+        _errors.print("[yellow]warning:[/]", escape(warning), highlight=False, soft_wrap=True)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
     if out is not None:
         found.file.save(out)
@@ -306,106 +378,6 @@ def identify_(
         for path in draw_identification(found, figures):
             console.print(f"figure: {path}", highlight=False, soft_wrap=True)
     write_json(json_file, found.summary())
-
-
-@app.command("identify-muscle")
-def identify_muscle_(
-    force_run: Annotated[Path, typer.Argument(metavar="FORCE_RUN", help="A run of force-voltage.")],
-    length_runs: Annotated[
-        list[Path], typer.Argument(metavar="LENGTH_RUN...", help="Runs of length-voltage and of length-force.")
-    ],
-    model: Annotated[
-        Literal["two-stage", "two-stage-prandtl-ishlinskii", "summed", "linear"],
-        typer.Option(metavar="NAME", help="two-stage, two-stage-prandtl-ishlinskii, summed or linear."),
-    ] = "two-stage",
-    verify: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="A run, as of length-verification, that the model is tried on.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Identify a model among voltage, force and length of a muscle from the runs that characterized it.
-
-    The two-stage model is length = H2[force - H1[voltage]]; see `bench run length-control --help` for what it is
-    good for. Errors are the average and the RMS in percent of the measured range.
-    """
-    from bench.identification.two_stage import measure_series
-    from bench.muscle_runs import errors_json, identify_muscle, muscle_file, read_resting, read_series
-
-    series = [one for run in length_runs for one in read_series(run)]
-    found = identify_muscle(model, read_resting(force_run), series)
-    errors = dict(found.errors)
-    if verify is not None:
-        errors["verification"] = measure_series(found.model, read_series(verify))
-    rows = [(kind, f"average {e.average_percent:.2f} %, RMS {e.rms_percent:.2f} %") for kind, e in errors.items()]
-    rows += [(f"KKT residual, {stage}", f"{fit.kkt_residual:.1e}") for stage, fit in found.certificates.items()]
-    print_rows(f"{model} from {len(series)} series of lengths", rows)
-    if out is not None:
-        muscle_file(model, found, [force_run, *length_runs]).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
-    write_json(
-        json_file,
-        {
-            "model": model,
-            "series": len(series),
-            "errors": {kind: errors_json(e) for kind, e in errors.items()},
-            "kkt": {stage: fit.kkt_residual for stage, fit in found.certificates.items()},
-        },
-    )
-
-
-@app.command("identify-hybrid")
-def identify_hybrid_(
-    steps: Annotated[Path, typer.Argument(metavar="STEPS_RUN", help="A run of current-steps.")],
-    static: Annotated[Path, typer.Argument(metavar="STATIC_RUN", help="A run of thermomechanical.")],
-    loops: Annotated[Path, typer.Argument(metavar="LOOPS_RUN", help="A run of piezo-loops.")],
-    step: Annotated[Path, typer.Argument(metavar="STEP_RUN", help="A run of piezo-step.")],
-    plays: Annotated[int, typer.Option(min=1, max=200, help="Number of play operators.")] = 15,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Identify the model of a thermo-piezoelectric hybrid, each part from the run that characterized it.
-
-    Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
-    voltage, third-order dynamics from the fast step.
-    """
-    from bench.hybrid_runs import identify_hybrid
-    from bench.model_file import HybridFile
-
-    found = identify_hybrid(steps, static, loops, step, plays=plays)
-    dynamics = found.dynamics
-    rows = [
-        ("network, RMS of base and tip", f"{found.network.base.rms:.3f} and {found.network.tip.rms:.3f} K"),
-        *(
-            (name, f"{getattr(found.network.network, name):.4g} ± {found.network.uncertainties[name]:.2g}")
-            for name in found.network.uncertainties
-            if name != "ambient"
-        ),
-        (f"polynomial of order {found.order.order}, RMS", f"{found.polynomial.errors.rms * 1e6:.3f} µm"),
-        (f"{plays} plays, RMS", f"{found.piezo.errors.rms_percent:.2f} % of {found.piezo.errors.span * 1e6:.1f} µm"),
-        *(
-            (
-                name.replace("_", " "),
-                f"{getattr(dynamics.model, name):.5g} ± {dynamics.uncertainties[name]:.2g} {unit}",
-            )
-            for name, unit in (("real_pole", "rad/s"), ("frequency", "rad/s"), ("damping", ""))
-        ),
-    ]
-    print_rows("hybrid", rows)
-    if out is not None:
-        HybridFile(found.model, {"sources": [run.name for run in (steps, static, loops, step)]}).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
-    write_json(
-        json_file,
-        {
-            "network_rms_K": {"base": found.network.base.rms, "tip": found.network.tip.rms},
-            "polynomial_order": found.order.order,
-            "polynomial_rms_um": found.polynomial.errors.rms * 1e6,
-            "prandtl_ishlinskii_rms_percent": found.piezo.errors.rms_percent,
-            "poles_rad_s": {"real": dynamics.model.real_pole, "resonance": dynamics.model.frequency},
-            "damping": dynamics.model.damping,
-        },
-    )
 
 
 @app.command("predict")
@@ -439,7 +411,7 @@ def predict_(
     inputs = columns.values[input_column]
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
-        _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
+        _errors.print("[yellow]warning:[/]", escape(warning), highlight=False, soft_wrap=True)
     predicted = predict(model, inputs, continue_memory=continue_memory)
     write_csv(out, [input_column, "predicted"], [inputs, predicted])
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
@@ -729,88 +701,9 @@ def _print_table(title: str, rows: dict[str, str]) -> None:
     console.print()
 
 
-reproduce = typer.Typer(
+reproduce_ = typer.Typer(
     help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
     no_args_is_help=True,
+    cls=Studies,
 )
-app.add_typer(reproduce, name="reproduce")
-
-
-@reproduce.command("vo2")
-def reproduce_vo2_(
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """VO2 microactuator: characterization, identification and validation, the paper's tables beside the measured.
-
-    Zhang et al., Modeling and inverse compensation of nonmonotonic hysteresis in VO2-coated microactuators, 2013.
-    """
-    from bench.reproduce.vo2 import reproduce_vo2
-
-    result = reproduce_vo2(rig="vo2", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)
-
-
-@reproduce.command("sma")
-def reproduce_sma_(
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the emulated laboratory's noise, the voltages and the targets.")
-    ] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.
-
-    Zhang and Yip, Three-dimensional hysteresis modeling of robotic artificial muscles with application to shape
-    memory alloy actuators, 2017.
-    """
-    from bench.reproduce.sma import reproduce_sma
-
-    result = reproduce_sma(rig="sma", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)
-
-
-@reproduce.command("muscles")
-def reproduce_muscles_(
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the emulated laboratories' noise and of the voltages.")
-    ] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """McKibben and super-coiled polymer muscles: the same protocols and models as for the SMA wire.
-
-    The outlook of Zhang and Yip, 2017.
-    """
-    from bench.reproduce.muscles import reproduce_muscles
-
-    write_json(json_file, reproduce_muscles(seed=seed, out=out, live=live, console=console))
-
-
-@reproduce.command("hybrid")
-def reproduce_hybrid_(
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulated laboratory's noise.")] = 0,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """Thermo-piezoelectric hybrid: its parts, the model of the whole, and control to nanometres over its range.
-
-    Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric microactuator, 2010.
-    """
-    from bench.reproduce.hybrid import reproduce_hybrid
-
-    result = reproduce_hybrid(rig="hybrid", seed=seed, out=out, live=live, console=console)
-    write_json(json_file, result)
+app.add_typer(reproduce_, name="reproduce")

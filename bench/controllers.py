@@ -10,35 +10,19 @@ from bench.control.baselines import IntegralControl, LookUp
 from bench.control.following import ClosedLoopFollower, IntegralFollower, OpenLoopFollower
 from bench.control.inverse import Inverse
 from bench.control.latched import Latched
-from bench.control.muscle import (
-    ForceTask,
-    LengthTask,
-    MuscleClosedLoop,
-    MuscleController,
-    MuscleOpenLoop,
-    MuscleParameters,
-    MuscleProportionalIntegral,
-    ProportionalIntegralParameters,
-)
 from bench.control.tracking import (
     ClosedLoopInverse,
     Follower,
     OpenLoopInverse,
     TargetController,
 )
-from bench.control.two_stage_inverse import TwoStageInverse
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, TwoStage, TwoStageState
-from bench.model_file import ModelFile, load_coupled_model, load_model
+from bench.hysteresis import MemoryCurve, Polynomial, Preisach
+from bench.model_file import ModelFile, load_model
 
 Policy = Literal["nearest", "paper"]
 TargetControllerName = Literal["open-loop-inverse", "polynomial", "integral", "closed-loop-inverse", "latched"]
 FollowerName = Literal["open-loop-inverse", "integral", "closed-loop-inverse"]
-MuscleControllerName = Literal["open-loop-inverse", "proportional-integral", "closed-loop-inverse"]
-
-LENGTH_GAIN = -2500.0
-FORCE_GAIN = 1.0
-"""Gains of the proportional-integral control of the SMA wire, V²/m and V²/N: the best that were found."""
 
 
 def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile:
@@ -125,66 +109,6 @@ def make_follower(
     if name == "open-loop-inverse":
         return OpenLoopFollower(inverse, state, limits)
     return ClosedLoopFollower(inverse, state, limits)
-
-
-def load_two_stage_model(path: str) -> TwoStage:
-    """Read the two-stage model of a muscle, in V, N and m.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is of another kind or in other units.
-    """
-    model = load_coupled_model(Path(path)).model
-    if not isinstance(model, TwoStage):
-        raise DataError(f"model file {path}: expected a two-stage model, whose inverse is known")
-    units = (model.voltage_unit, model.force_unit, model.length_unit)
-    if units != ("V", "N", "m"):
-        raise DataError(f"model file {path}: expected a model in V, N and m, got {', '.join(map(repr, units))}")
-    return model
-
-
-def make_muscle_controller(
-    name: MuscleControllerName,
-    model: TwoStage,
-    output: Literal["length", "force"],
-    *,
-    state: TwoStageState,
-    limits: tuple[float, float],
-    duration: float,
-) -> MuscleController:
-    """Make a controller of a muscle's length under a measured force, or of its force between fixed ends.
-
-    Parameters
-    ----------
-    name : str
-        Which.
-    model : TwoStage
-        In V, N and m; `proportional-integral` uses none.
-    output : {"length", "force"}
-        What is controlled.
-    state : TwoStageState
-        The muscle's memory at the start.
-    limits : (float, float)
-        Voltages that it may ask for.
-    duration : float
-        Time for each target, s.
-
-    Raises
-    ------
-    DataError
-        If the model cannot be inverted.
-    """
-    if name == "proportional-integral":
-        gain = LENGTH_GAIN if output == "length" else FORCE_GAIN
-        return MuscleProportionalIntegral(limits, ProportionalIntegralParameters(gain, duration=duration))
-    try:
-        inverse = TwoStageInverse(model)
-    except ValueError as error:
-        raise DataError(f"controller {name}: {error}") from error
-    task = LengthTask(inverse) if output == "length" else ForceTask(inverse)
-    make = MuscleOpenLoop if name == "open-loop-inverse" else MuscleClosedLoop
-    return make(task, state, limits, MuscleParameters(duration=duration))
 
 
 def saturated_below(model: ModelFile, value: float) -> bool:

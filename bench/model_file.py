@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bench import registry
 from bench.errors import DataError
 from bench.hysteresis import (
     Linear,
@@ -40,7 +41,6 @@ from bench.hysteresis import (
     coupled_from_json,
     operator_from_json,
 )
-from bench.identification.hybrid_model import HybridModel
 
 FORMAT = "bench-model"
 COUPLED_FORMAT = "bench-coupled-model"
@@ -134,13 +134,13 @@ class HybridFile:
 
     Attributes
     ----------
-    model : HybridModel
+    model : the class registered as `hybrid` in `bench.models`
         The model.
     provenance : mapping
         Where it comes from.
     """
 
-    model: HybridModel
+    model: Any
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -194,7 +194,9 @@ def load_hybrid_model(path: Path) -> HybridFile:
     source = str(path)
     document = _checked(_read(path), source, HYBRID_FORMAT)
     try:
-        return HybridFile(HybridModel.from_json(document["model"]), dict(document["provenance"]))
+        return HybridFile(
+            registry.load("models", "hybrid").from_json(document["model"]), dict(document["provenance"])
+        )
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
-from bench.control.tracking import Command, Follower, TargetController, Trace
+from bench.control.tracking import Command, Follower, Trace
 
 SHORTEST_WAIT = 1e-3
 """Least time between two commands of a loop that is late, s."""
@@ -61,32 +61,49 @@ class Playback:
         return tuple(setpoint(t) for setpoint in self._setpoints)
 
 
+class Reaching(Protocol):
+    """A controller that is aimed at one target after another, such as a `TargetController`.
+
+    Both calls take time, measured input and output, and the further signals that the controller needs, if any; `aim`
+    takes the target before them.
+    """
+
+    @property
+    def aim(self) -> Callable[..., Command]: ...  # noqa: D102
+
+    @property
+    def update(self) -> Callable[..., Command]: ...  # noqa: D102
+
+    @property
+    def trace(self) -> Trace: ...  # noqa: D102
+
+
 class ReachTarget:
     """Bring the output to one target.
 
     Parameters
     ----------
-    controller : TargetController
+    controller : Reaching
         Keeps its state from one target to the next.
     target : float
         Output units.
     """
 
-    def __init__(self, controller: TargetController, target: float) -> None:
+    def __init__(self, controller: Reaching, target: float) -> None:
         self._controller = controller
         self._target = target
 
-    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
+    def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Aim at the target."""
-        return self._controller.aim(self._target, t, measured_input, output)
+        return self._controller.aim(self._target, t, measured_input, output, *others)
 
-    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
+    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Go on towards it."""
-        return self._controller.update(t, measured_input, output)
+        return self._controller.update(t, measured_input, output, *others)
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
+        """The controller's estimates."""
         return self._controller.trace
 
 

@@ -1,9 +1,12 @@
-"""References for tracking: targets one after another, a moving reference, and whether an actuator can follow it."""
+"""References for tracking: sequences of targets, moving references, and the input rate that a reference needs."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +14,9 @@ from numpy.typing import ArrayLike
 from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, _checks
 from bench.hysteresis._checks import Floats
+
+Reference: TypeAlias = Callable[[float], float]
+"""Wanted output at a time in s from the start; also defined before 0 and after the end."""
 
 
 def tracking_targets(rng: np.random.Generator, low: float, high: float, count: int = 60) -> Floats:
@@ -86,6 +92,141 @@ def modulated_sine(times: ArrayLike, low: float, high: float, period: float, dep
     envelope = 1.0 - depth * np.sin(phase / 8.6) ** 2
     reference = 0.5 * (bottom + top) + 0.5 * (top - bottom) * envelope * np.sin(phase)
     return np.asarray(np.clip(reference, bottom, top))
+
+
+def _blend(x: float) -> float:
+    """Return the share of the top speed after the share x of the blend: the minimum-jerk curve."""
+    if x <= 0.0:
+        return 0.0
+    return x**3 * (10.0 + x * (6.0 * x - 15.0)) if x < 1.0 else 1.0
+
+
+def _blended(x: float) -> float:
+    """Return the integral of `_blend`."""
+    if x <= 0.0:
+        return 0.0
+    return x**4 * (2.5 + x * (x - 3.0)) if x < 1.0 else x - 0.5
+
+
+class SmoothMoves:
+    """A reference that moves from position to position on S-curves of a given top speed and holds at each.
+
+    Speed rises and falls on minimum-jerk curves, so that position, speed and acceleration are continuous. A move
+    too short to reach the top speed is slower.
+
+    Parameters
+    ----------
+    positions : sequence of float
+        Output units; the first is where it starts, without a hold.
+    speed : float
+        Top speed, output units per second.
+    hold : float
+        Time at each position but the first, s, >= 0.
+    blend : float
+        Time to the top speed, s.
+
+    Raises
+    ------
+    ValueError
+        If there are not two positions, one is not finite, or a number is out of range.
+    """
+
+    def __init__(self, positions: Sequence[float], speed: float, *, hold: float = 60.0, blend: float = 10.0) -> None:
+        places = _checks.samples("positions", positions)
+        if places.size < 2:
+            raise ValueError(f"positions: expected at least 2, got {places.size}")
+        if not (0.0 < speed < math.inf and 0.0 < blend < math.inf and 0.0 <= hold < math.inf):
+            raise ValueError(
+                f"speed, blend, hold: expected positive numbers (hold may be 0), got {speed}, {blend} and {hold}"
+            )
+        self._blend = blend
+        self._places: list[float] = places.tolist()
+        moves = np.diff(places)
+        self._speeds: list[float] = (np.sign(moves) * speed).tolist()
+        self._cruises: list[float] = (np.abs(moves) / speed).tolist()
+        # A move takes its time at top speed and one blend.
+        ends = np.cumsum(np.abs(moves) / speed + blend + hold)
+        self._starts: list[float] = [0.0, *ends.tolist()[:-1]]
+        self.duration = float(ends[-1])
+        """Time to the end of the last hold, s."""
+
+    def _move(self, t: float) -> int:
+        """Return the number of the last move that has begun."""
+        return max(bisect_right(self._starts, t) - 1, 0)
+
+    def __call__(self, t: float) -> float:
+        """Return the position at a time (s), output units; it rests before the start and after the end."""
+        k = self._move(t)
+        x, cruise = (t - self._starts[k]) / self._blend, self._cruises[k] / self._blend
+        if x >= cruise + 1.0:
+            return self._places[k + 1]
+        return self._places[k] + self._speeds[k] * self._blend * (_blended(x) - _blended(x - cruise))
+
+    def rate(self, t: float) -> float:
+        """Return the speed at a time (s), output units per second."""
+        k = self._move(t)
+        x, cruise = (t - self._starts[k]) / self._blend, self._cruises[k] / self._blend
+        return self._speeds[k] * (_blend(x) - _blend(x - cruise))
+
+    def holding(self, t: float, settling: float = 0.0) -> bool:
+        """Return whether the last move ended at least a settling time (s) before a time (s)."""
+        k = self._move(t)
+        return t - self._starts[k] >= self._cruises[k] + self._blend + settling
+
+
+def staircase(
+    low: float,
+    high: float,
+    steps: int,
+    speed: float,
+    *,
+    start: float = 0.0,
+    hold: float = 60.0,
+    blend: float = 10.0,
+) -> SmoothMoves:
+    """Return a reference from the start to low, to high and back in equal steps; others as `SmoothMoves`.
+
+    Raises
+    ------
+    ValueError
+        If there is no step, low and high are not increasing, or as `SmoothMoves`.
+    """
+    bottom, top = _checks.increasing("low, high", [low, high]).tolist()
+    if steps < 1:
+        raise ValueError(f"steps: expected at least 1, got {steps}")
+    up = np.linspace(bottom, top, steps + 1)
+    return SmoothMoves([start, *up.tolist(), *up[-2::-1].tolist()], speed, hold=hold, blend=blend)
+
+
+class AddedSine:
+    """A sine on top of another reference, with an amplitude that rises within its first two periods.
+
+    Parameters
+    ----------
+    base : callable
+        The other reference.
+    amplitude : float
+        Output units.
+    frequency : float
+        Hz.
+
+    Raises
+    ------
+    ValueError
+        If the amplitude is not finite or the frequency not positive.
+    """
+
+    def __init__(self, base: Reference, amplitude: float, frequency: float) -> None:
+        if not 0.0 < frequency < math.inf:
+            raise ValueError(f"frequency: expected a positive number of Hz, got {frequency}")
+        self._base = base
+        self._amplitude = _checks.number("amplitude", amplitude)
+        self._frequency = frequency
+
+    def __call__(self, t: float) -> float:
+        """Return the position at a time (s), output units."""
+        periods = self._frequency * t
+        return self._base(t) + self._amplitude * _blend(0.5 * periods) * math.sin(2.0 * math.pi * periods)
 
 
 @dataclass(frozen=True)

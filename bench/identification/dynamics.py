@@ -1,9 +1,7 @@
-"""The third-order dynamics of the piezo cantilever: as a model, from a measured step, and the notch against it.
+"""Third-order dynamics of a resonant actuator: the model, and its identification from a measured step.
 
-Source: Rakotondrabe and Ivan, "Development and dynamic modeling of a new hybrid thermo-piezoelectric
-micro-actuator", IEEE Transactions on Robotics 26(6), 2010, section V-D; here "Rakotondrabe and Ivan 2010". The
-prediction error method is that of Ljung, "System Identification: Theory for the User", 2nd ed. 1999, with an
-output error structure: white noise is added to the output of the sensor, and predicting it best is simulating.
+Source: Ljung, "System Identification: Theory for the User", 2nd ed. 1999: prediction error method with an output
+error structure. White noise is added to the output of the sensor, so that the best prediction is the simulation.
 """
 
 from __future__ import annotations
@@ -278,20 +276,6 @@ class ThirdOrder:
         return cls(*[_checks.json_field(document, each.name, "third-order dynamics") for each in fields(cls)])
 
 
-PUBLISHED_DYNAMICS = ThirdOrder(
-    gain=102.0 * 2.4e8 / (1274.0 * 1.9e7),
-    real_pole=1274.0,
-    frequency=math.sqrt(1.9e7),
-    damping=34.1 / (2.0 * math.sqrt(1.9e7)),
-    numerator=(2.58e4 / 2.4e8, 1.0 / 2.4e8),
-)
-"""D(s) of Rakotondrabe and Ivan 2010, eq. 21, as printed.
-
-It is called delta/U there, but its gain is 1.0113 instead of d_p: it has been divided by the static deflection, and
-`normalised` is what belongs behind a static model.
-"""
-
-
 @dataclass(frozen=True, eq=False)
 class DynamicsIdentification:
     """Third-order dynamics fitted to a step response, with the evidence for them.
@@ -497,45 +481,3 @@ def _onset(outputs: Floats, at: int) -> int:
     change = np.abs(outputs[at:] - before.mean())
     threshold = max(6.0 * float(before.std()), 0.005 * float(change.max()))
     return max(int(np.argmax(change > threshold)) - 1, 0)
-
-
-def notch(frequency: float, rate: float, zero_damping: float, pole_damping: float = 0.7) -> Floats:
-    """Return a notch against a resonance as second-order section, in the form of `scipy.signal.sosfilt`.
-
-    (s² + 2 zero_damping ω s + ω²) / (s² + 2 pole_damping ω s + ω²), by the bilinear transform, which is exact at
-    ω (prewarping). The zeros take the place of the resonant poles, and constants pass unchanged.
-
-    Parameters
-    ----------
-    frequency : float
-        Natural frequency ω, rad/s, below half the rate.
-    rate : float
-        Sampling rate, Hz.
-    zero_damping : float
-        Damping ratio of the zeros, >= 0: that of the resonance.
-    pole_damping : float
-        Damping ratio of the poles, > 0.
-
-    Returns
-    -------
-    ndarray, shape (6,)
-        b0, b1, b2, 1, a1, a2.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of its range.
-    """
-    if not 0.0 < _checks.number("frequency", frequency) < math.pi * _checks.number("rate", rate):
-        raise ValueError(f"frequency: expected rad/s between 0 and pi times the rate {rate:g} Hz, got {frequency:g}")
-    if not _checks.number("zero_damping", zero_damping) >= 0.0:
-        raise ValueError(f"zero_damping: expected a number >= 0, got {zero_damping}")
-    if not _checks.number("pole_damping", pole_damping) > 0.0:
-        raise ValueError(f"pole_damping: expected a positive number, got {pole_damping}")
-    # s/ω becomes c (z - 1)/(z + 1).
-    c = 1.0 / math.tan(0.5 * frequency / rate)
-    numerator, denominator = (
-        np.array([c**2 + 2.0 * d * c + 1.0, 2.0 - 2.0 * c**2, c**2 - 2.0 * d * c + 1.0])
-        for d in (zero_damping, pole_damping)
-    )
-    return np.asarray(np.concatenate([numerator, denominator]) / denominator[0])

@@ -93,7 +93,15 @@ def parameter(
     if isinstance(default, FromSlot):
         extra["default"] = default
         default = ...
-    return Field(default, description=help, ge=low, le=high, json_schema_extra=extra)
+    return Field(
+        default,
+        description=help,
+        ge=low,
+        le=high,
+        json_schema_extra=extra,
+        # A default that is a text may stand for another type, such as a list of numbers.
+        validate_default=isinstance(default, str),
+    )
 
 
 @dataclass(frozen=True)
@@ -250,6 +258,8 @@ class ProtocolDefinition:
             allowed = ", ".join(map(str, get_args(info.annotation)))
         elif info.annotation is bool:
             allowed = "true, false"
+        elif get_origin(info.annotation) is tuple:
+            allowed = "numbers with commas between them"
         else:
             allowed = "any text" if info.annotation is str else "any number"
         source = extra.get("default")

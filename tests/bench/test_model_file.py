@@ -20,9 +20,6 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import Design
 from bench.model_file import (
     COUPLED_FORMAT,
     FORMAT,
@@ -38,6 +35,8 @@ from bench.model_file import (
     parse_coupled_model,
     parse_model,
 )
+from rigs.hybrid.design import Design
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 LEVELS = uniform_levels(30.0, 70.0, 4)
 INPUTS = np.array([21.0, 84.0, 40.0, 60.0, 55.0])

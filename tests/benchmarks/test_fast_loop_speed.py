@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 
 from bench.clock import Stopwatch, VirtualClock
-from bench.control.hybrid import FineController, FineParameters
 from bench.engine import Engine
-from bench.hybrid_runs import DEFLECTION
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification.dynamics import PUBLISHED_DYNAMICS
-from bench.identification.hybrid_model import HybridModel
-from bench.identification.thermal_network import Design
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import FixedRate, ProtocolParameters, protocol
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import trace_signals
+from protocols.hybrid import DEFLECTION
+from rigs.hybrid.control import make_fine
+from rigs.hybrid.design import Design
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 pytestmark = pytest.mark.benchmark
 
@@ -36,7 +35,7 @@ def make_controller():
     )
     polynomial = Polynomial([-7.363e-6 * 25.0], (-25.0, 25.0))
     model = HybridModel(Design().network(), polynomial, hysteresis, PUBLISHED_DYNAMICS)
-    return FineController(model, lambda t: STEP if t >= 0.05 else 0.0, FineParameters(rate=RATE))
+    return make_fine(model, lambda t: STEP if t >= 0.05 else 0.0, rate=RATE)
 
 
 def through_the_engine(folder, record_every):

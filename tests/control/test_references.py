@@ -8,8 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.control.inverse import Inverse
-from bench.control.references import fastest_slope, modulated_sine, tracking_targets
+from bench.control.references import (
+    AddedSine,
+    SmoothMoves,
+    fastest_slope,
+    modulated_sine,
+    staircase,
+    tracking_targets,
+)
 from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
+
+MICRO, NANO = 1e-6, 1e-9
+SPEED = 3 * MICRO
 
 
 class TestTargets:
@@ -95,3 +105,70 @@ class TestFastestSlope:
             fastest_slope(Inverse(models.film), [0.0, 1.0, 2.0], [100.0, 200.0])
         with pytest.raises(ValueError, match="times"):
             fastest_slope(Inverse(models.film), [0.0, 2.0, 1.0], [100.0, 200.0, 100.0])
+
+
+def test_smooth_moves_visit_the_positions():
+    moves = SmoothMoves([10 * MICRO, 40 * MICRO, 39.9 * MICRO], SPEED, hold=7.0, blend=4.0)
+    assert moves.duration == pytest.approx(10.0 + 4.0 + 7.0 + 0.1 / 3.0 + 4.0 + 7.0)
+    assert moves(-1.0) == moves(0.0) == 10 * MICRO
+    assert moves(14.0) == moves(20.9) == 40 * MICRO
+    assert moves(26.0) == moves(1e6) == 39.9 * MICRO
+    assert moves.rate(7.0) == pytest.approx(SPEED)
+    assert moves(7.0) == pytest.approx(25 * MICRO)
+    # Too short for the top speed.
+    assert max(abs(moves.rate(t)) for t in np.linspace(21.0, 25.1, 200)) < 0.1 * SPEED
+    assert [moves.holding(t) for t in (-1.0, 0.0, 13.9, 14.1, 20.9, 21.1, 25.5)] == [False] * 3 + [True] * 2 + [
+        False,
+        True,
+    ]
+    assert moves.holding(16.1, 2.0)
+    assert not moves.holding(15.9, 2.0)
+
+
+@given(
+    st.lists(st.integers(-200, 200), min_size=2, max_size=5),
+    st.floats(0.1, 10.0),
+    st.floats(0.5, 20.0),
+    st.floats(0.0, 20.0),
+)
+def test_rate_of_smooth_moves_is_their_derivative_and_never_above_the_top(places, speed, blend, hold):
+    moves = SmoothMoves(MICRO * np.array(places), speed * MICRO, blend=blend, hold=hold)
+    times = np.linspace(-1.0, moves.duration + 1.0, 200)
+    rates = np.array([moves.rate(t) for t in times])
+    assert np.abs(rates).max() <= speed * MICRO * (1 + 1e-12)
+    h = 1e-4 * blend
+    numeric = np.array([(moves(t + h) - moves(t - h)) / (2 * h) for t in times])
+    assert numeric == pytest.approx(rates, abs=1e-3 * speed * MICRO)
+
+
+def test_staircase_and_sine():
+    stairs = staircase(-10 * MICRO, 10 * MICRO, 2, SPEED, start=3 * MICRO, hold=5.0, blend=2.0)
+    assert stairs(0.0) == 3 * MICRO
+    ends = np.cumsum([13 / 3, 10 / 3, 10 / 3, 10 / 3, 10 / 3]) + 7.0 * np.arange(1, 6)
+    assert [stairs(t - 0.1) for t in ends] == pytest.approx(MICRO * np.array([-10, 0, 10, 0, -10]), abs=1e-15)
+    sine = AddedSine(stairs, 2 * MICRO, 0.5)
+    # The end of the swelling is after four seconds.
+    times = np.linspace(4.0, 30.0, 50)
+    expected = [stairs(t) + 2 * MICRO * math.sin(math.pi * t) for t in times]
+    assert [sine(t) for t in times] == pytest.approx(expected, abs=1e-15)
+    assert sine(0.0) == stairs(0.0)
+    assert abs(sine(0.01) - stairs(0.01)) < 1e-3 * NANO
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SmoothMoves([0.0], SPEED), "positions: expected at least 2"),
+        (lambda: SmoothMoves([0.0, math.nan], SPEED), "positions: expected finite"),
+        (lambda: SmoothMoves([0.0, 1.0], 0.0), "speed, blend, hold: expected positive"),
+        (lambda: SmoothMoves([0.0, 1.0], SPEED, hold=-1.0), "speed, blend, hold: expected positive"),
+        (lambda: SmoothMoves([0.0, 1.0], SPEED, blend=math.inf), "speed, blend, hold: expected positive"),
+        (lambda: staircase(0.0, 1.0, 0, SPEED), "steps: expected at least 1"),
+        (lambda: staircase(1.0, 0.0, 2, SPEED), "low, high: expected strictly increasing"),
+        (lambda: AddedSine(abs, MICRO, 0.0), "frequency: expected a positive"),
+        (lambda: AddedSine(abs, math.nan, 1.0), "amplitude: expected a finite"),
+    ],
+)
+def test_wrong_input_of_moves_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -7,7 +7,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import Record
-from bench.muscle_runs import MODELS, SAMPLE
+from rigs.muscles.identification import MODELS, SAMPLE
 
 MUSCLES = ("mckibben", "coiled_polymer")
 SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "length-verification": 90}

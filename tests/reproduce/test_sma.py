@@ -10,8 +10,8 @@ from bench.identification import measure_errors
 from bench.identification.two_stage import measure_series
 from bench.journal import Record
 from bench.model_file import load_coupled_model
-from bench.muscle_runs import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 from bench.results.tracking import target_results
+from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 
 CONTROLLERS = ("open_loop_inverse", "proportional_integral", "closed_loop_inverse")
 LENGTHS = ("length_4.9N", "length_8.82N", "length_changing_load")

@@ -1,0 +1,263 @@
+"""Studies: series of runs on emulated rigs, with what they give as values, tables and figures.
+
+A package registers a `Study` as an entry point of the group `bench.studies`; `bench reproduce NAME` carries it out.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from bench.clock import Stopwatch
+from bench.errors import BenchError, ConfigurationError, DataError
+from bench.journal import Record
+from bench.protocol import find_protocol
+from bench.results.report import export_run
+from bench.results.tracking import TargetResults, target_results
+from bench.runs import Run, RunResult, carry_out
+
+
+@dataclass
+class Campaign:
+    """A series of runs on one rig, on the virtual clock, each with noise of its own.
+
+    Attributes
+    ----------
+    rig : str
+        Name of the rig, or path of a rig file.
+    folder : Path
+        Where the runs go; made if it is not there.
+    seed : int
+        From which the seeds of the runs come; no two runs of any two seeds below 50 000 share theirs.
+    live : bool
+        Whether to serve the live view.
+    console : Console
+        Where to print.
+    runs : list of RunResult
+        What was carried out so far, in the parts of this campaign as well.
+    """
+
+    rig: str
+    folder: Path
+    seed: int
+    live: bool
+    console: Console
+    runs: list[RunResult] = field(default_factory=list)
+    _seeds: Iterator[int] = field(init=False)
+    _whole: Campaign | None = None
+
+    def __post_init__(self) -> None:
+        (self.folder / "figures").mkdir(parents=True, exist_ok=True)
+        self._seeds = (2 * self.seed + k % 2 + 100_000 * (k // 2) for k in itertools.count())
+
+    def part(self, name: str, rig: str) -> Campaign:
+        """Return a campaign on another rig, in a folder of its own below this one."""
+        return Campaign(rig, self.folder / name, self.seed, self.live, self.console, _whole=self)
+
+    def figure(self, name: str) -> Path:
+        """Return the file of a figure, without its ending in `name`."""
+        return self.folder / "figures" / f"{name}.png"
+
+    def run(
+        self,
+        protocol: str,
+        settings: Mapping[str, str],
+        overrides: Mapping[str, str] | None = None,
+        *,
+        rig: str | None = None,
+    ) -> RunResult:
+        """Carry out one protocol, on another rig than the campaign's if one is given.
+
+        Raises
+        ------
+        BenchError
+            If it did not complete, or the safe state was not confirmed; its record is kept.
+        """
+        definition = find_protocol(protocol)
+        result = carry_out(
+            Run(
+                protocol=definition,
+                settings=settings,
+                rig=rig or self.rig,
+                overrides=overrides or {},
+                seed=next(self._seeds),
+                clock="virtual",
+                folder=self.folder,
+                live=self.live,
+                # Made from the journal afterwards, when the density is known and can be drawn with it.
+                recording=False,
+            ),
+            self.console,
+        )
+        if result.outcome.error is not None:
+            raise result.outcome.error
+        if not result.outcome.is_safe:
+            raise BenchError(f"{protocol}: the safe state was not confirmed: {dict(result.outcome.safe_state)}")
+        self.runs.append(result)
+        if self._whole is not None:
+            self._whole.runs.append(result)
+        return result
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """One table of a study.
+
+    Attributes
+    ----------
+    title : str
+        Line above it.
+    columns : sequence of str
+        Heads.
+    rows : sequence of sequence of str
+        Cells. Each is a format string over the values of the study, such as `{validation[linear][rms]:.1f}`.
+    note : str
+        Line below it, a format string as well; empty for none.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def print(self, values: Mapping[str, Any], console: Console) -> None:
+        """Print it, with the first column aligned left and all others right."""
+        table = Table(title=self.title.format_map(values), title_justify="left")
+        for i, column in enumerate(self.columns):
+            table.add_column(column, justify="left" if i == 0 else "right")
+        for row in self.rows:
+            table.add_row(*(cell.format_map(values) for cell in row))
+        console.print(table)
+        if self.note:
+            console.print(self.note.format_map(values), highlight=False)
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """What a study gives.
+
+    Attributes
+    ----------
+    values : mapping
+        Results for programs, by name; all that JSON can hold. Units are in the names.
+    tables : tuple of ResultTable
+        Results for people, in the order in which they are printed.
+    figures : tuple of Path
+        Files that were drawn.
+    """
+
+    values: Mapping[str, Any]
+    tables: tuple[ResultTable, ...]
+    figures: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class Study:
+    """What `bench reproduce NAME` carries out.
+
+    Attributes
+    ----------
+    rig : str or None
+        Rig on which it runs; None if it runs on several of its own.
+    summary : str
+        One line for lists.
+    description : str
+        For its help: what is done, and the source.
+    carry_out : callable
+        Runs the protocols of a campaign and evaluates them. Raises `BenchError` if a run did not complete.
+    """
+
+    rig: str | None
+    summary: str
+    description: str
+    carry_out: Callable[[Campaign], StudyResult]
+
+
+def reproduce(
+    name: str, study: Study, *, rig: str | None = None, seed: int, out: Path, live: bool, console: Console
+) -> dict[str, Any]:
+    """Carry out a study, export the recordings of its runs, and print its tables.
+
+    Parameters
+    ----------
+    name : str
+        Name of the study; names the folder `reproduce-NAME-seed-SEED`.
+    study : Study
+        What to carry out.
+    rig : str, optional
+        Another rig with the same devices and signals; the study's own if not given.
+    seed : int
+        Seed of the noise of the emulated laboratory, and of random sequences.
+    out : Path
+        Where that folder is made.
+    live : bool
+        Whether to serve the live view.
+    console : Console
+        Where to print.
+
+    Returns
+    -------
+    dict
+        `seed`, the values of the study, `laboratory_seconds`, `wall_seconds`, `folder`, `figures`, `recordings`.
+
+    Raises
+    ------
+    ConfigurationError
+        If a rig is given to a study that runs on several.
+    BenchError
+        If a run did not complete; its record is kept.
+    """
+    if rig is not None and study.rig is None:
+        raise ConfigurationError(f"--rig {rig}: the study {name} runs on several rigs of its own")
+    stopwatch = Stopwatch()
+    campaign = Campaign(rig or study.rig or "", out / f"reproduce-{name}-seed-{seed}", seed, live, console)
+    found = study.carry_out(campaign)
+    recordings = [export_run(run.folder, "rrd", None)[0] for run in campaign.runs]
+    values = {
+        "seed": seed,
+        **found.values,
+        "laboratory_seconds": sum(run.outcome.laboratory_seconds for run in campaign.runs),
+        "wall_seconds": stopwatch.seconds(),
+        "folder": str(campaign.folder),
+        "figures": [str(path) for path in found.figures],
+        "recordings": [str(path) for path in recordings],
+    }
+    for table in found.tables:
+        table.print(values, console)
+    _print_end(values, console)
+    return values
+
+
+def reached_targets(run: RunResult, signal: str) -> TargetResults:
+    """Return how well a run brought a signal to its targets.
+
+    Raises
+    ------
+    DataError
+        If it had no targets.
+    """
+    with Record(run.folder) as record:
+        results = target_results(record, signal)
+    if results is None:
+        raise DataError(f"{run.folder}: has no targets")
+    return results
+
+
+def _print_end(values: Mapping[str, Any], console: Console) -> None:
+    laboratory, wall = values["laboratory_seconds"], values["wall_seconds"]
+    console.print(
+        f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
+        highlight=False,
+    )
+    console.print(f"runs, models and recordings: {values['folder']}", highlight=False, soft_wrap=True)
+    for folder in dict.fromkeys(str(Path(path).parent) for path in values["figures"]):
+        console.print(f"figures: {folder}", highlight=False, soft_wrap=True)
+    console.print("open a recording with `rerun FILE`:", highlight=False)
+    for path in values["recordings"]:
+        console.print(f"  {path}", highlight=False, soft_wrap=True)

@@ -1,0 +1,161 @@
+"""A fast loop for a resonant actuator with hysteresis: integral, notch, and inverse of the hysteresis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.control.play_inverse import PlayInverse
+from bench.control.references import Reference
+from bench.control.tracking import Trace, check_positive
+from bench.hysteresis import PrandtlIshlinskii, _checks
+from bench.hysteresis._checks import Floats
+
+
+def notch(frequency: float, rate: float, zero_damping: float, pole_damping: float = 0.7) -> Floats:
+    """Return a notch against a resonance as second-order section, in the form of `scipy.signal.sosfilt`.
+
+    (s² + 2 zero_damping ω s + ω²) / (s² + 2 pole_damping ω s + ω²), by the bilinear transform, which is exact at
+    ω (prewarping). The zeros take the place of the resonant poles, and constants pass unchanged.
+
+    Parameters
+    ----------
+    frequency : float
+        Natural frequency ω, rad/s, below half the rate.
+    rate : float
+        Sampling rate, Hz.
+    zero_damping : float
+        Damping ratio of the zeros, >= 0: that of the resonance.
+    pole_damping : float
+        Damping ratio of the poles, > 0.
+
+    Returns
+    -------
+    ndarray, shape (6,)
+        b0, b1, b2, 1, a1, a2.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range.
+    """
+    if not 0.0 < _checks.number("frequency", frequency) < math.pi * _checks.number("rate", rate):
+        raise ValueError(f"frequency: expected rad/s between 0 and pi times the rate {rate:g} Hz, got {frequency:g}")
+    if not _checks.number("zero_damping", zero_damping) >= 0.0:
+        raise ValueError(f"zero_damping: expected a number >= 0, got {zero_damping}")
+    if not _checks.number("pole_damping", pole_damping) > 0.0:
+        raise ValueError(f"pole_damping: expected a positive number, got {pole_damping}")
+    # s/ω becomes c (z - 1)/(z + 1).
+    c = 1.0 / math.tan(0.5 * frequency / rate)
+    numerator, denominator = (
+        np.array([c**2 + 2.0 * d * c + 1.0, 2.0 - 2.0 * c**2, c**2 - 2.0 * d * c + 1.0])
+        for d in (zero_damping, pole_damping)
+    )
+    return np.asarray(np.concatenate([numerator, denominator]) / denominator[0])
+
+
+@dataclass(frozen=True)
+class NotchLoopParameters:
+    """Settings of the loop.
+
+    Parameters
+    ----------
+    rate : float
+        Sampling rate, Hz; well above twice the resonance.
+    integral : float
+        Gain of the integral, 1/s.
+    stroke : float
+        Largest output of either sign, output units from rest.
+    pole_damping : float
+        Damping ratio of the poles that the notch puts in place of the resonance.
+
+    Raises
+    ------
+    ValueError
+        If a setting is not positive.
+    """
+
+    rate: float
+    integral: float
+    stroke: float
+    pole_damping: float = 0.7
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+
+
+class NotchLoop:
+    """A `SampledController` of one actuator at a rate that resolves its resonance.
+
+    Only the integral acts on the reference: fed forward, a step would ring. The notch stands behind the integral and
+    before the inverse, so that inverse and actuator together are linear to it. The first reading is the output;
+    others are ignored. A missing reading holds the set-point.
+
+    Parameters
+    ----------
+    hysteresis : PrandtlIshlinskii
+        Static output of the actuator.
+    frequency, damping : float
+        Natural frequency (rad/s) and damping ratio of the resonance.
+    reference : callable
+        Wanted output, output units from rest; its time starts at the first complete reading.
+    parameters : NotchLoopParameters
+        Settings of the loop.
+
+    Raises
+    ------
+    ValueError
+        If the resonance lies beyond half the rate, or the hysteresis has no inverse.
+    """
+
+    def __init__(
+        self,
+        hysteresis: PrandtlIshlinskii,
+        frequency: float,
+        damping: float,
+        reference: Reference,
+        parameters: NotchLoopParameters,
+    ) -> None:
+        p = parameters
+        self._reference = reference
+        self._inverse = PlayInverse(hysteresis, p.stroke)
+        self._gain = p.integral / p.rate
+        section = notch(frequency, p.rate, damping, p.pole_damping).tolist()
+        self._b0, self._b1, self._b2, _, self._a1, self._a2 = section
+        self._s1 = self._s2 = 0.0
+        self._integral = 0.0
+        self._start = math.nan
+        self._wanted = math.nan
+        self._setpoint = self._inverse.input(0.0)
+        self._measured = math.nan
+
+    def update(self, t: float, measured: tuple[float, ...]) -> tuple[float]:
+        """Take the output (first of the readings) at a time (s) and return the set-point."""
+        y = measured[0]
+        if not math.isfinite(y):
+            return (self._setpoint,)
+        if math.isnan(self._start):
+            self._start = t
+        self._wanted = wanted = self._reference(t - self._start)
+        self._measured = y
+        inverse = self._inverse
+        # Held within the stroke, the integral does not wind up.
+        x = self._integral + self._gain * (wanted - y)
+        x = inverse.low if x < inverse.low else inverse.high if x > inverse.high else x
+        self._integral = x
+        out = self._b0 * x + self._s1
+        self._s1 = self._b1 * x - self._a1 * out + self._s2
+        self._s2 = self._b2 * x - self._a2 * out
+        self._setpoint = inverse.input(out)
+        return (self._setpoint,)
+
+    @property
+    def trace(self) -> Trace:
+        """State of the loop; the disturbance is the part of the output that the set-point does not explain."""
+        return Trace(
+            reference=self._wanted,
+            predicted=self._measured,
+            disturbance=self._measured - self._inverse.output,
+        )

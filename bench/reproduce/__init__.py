@@ -1,1 +1,0 @@
-"""The papers' results, reproduced on the emulated rigs at the wire level: one module a paper."""

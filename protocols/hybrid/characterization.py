@@ -1,0 +1,207 @@
+"""Characterization of the thermo-piezoelectric hybrid, part by part.
+
+Rakotondrabe and Ivan, "Development and Dynamic Modeling of a New Hybrid Thermopiezoelectric Microactuator", IEEE
+Transactions on Robotics 26(6), 2010, section V; here "Rakotondrabe and Ivan 2010". Positive currents heat, so that
+the paper's steps of 0.1, 0.05 and 0.025 A, which cool, are negative.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.control.loops import Playback
+from bench.number_list import NumberList
+from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Step, parameter, protocol
+from protocols.hybrid import BASE, DEFLECTION, TIP
+
+SENSORS = (DEFLECTION, BASE, TIP)
+THERMAL = ("tec", *SENSORS)
+
+
+class CurrentSineParameters(ProtocolParameters):
+    """What can be set."""
+
+    amplitude: float = parameter(0.1, unit="A", low=0.001, high=1, help="amplitude of the current")
+    frequencies: NumberList = parameter("0.001", unit="Hz", help="frequencies, one after another")
+    periods: int = parameter(2, unit="1", low=2, high=100, help="periods at each; the first is the transient")
+    rate: float = parameter(0.5, unit="Hz", low=0.01, high=100, help="samples in a second")
+
+
+@protocol(needs=THERMAL, controls=DEFLECTION)
+def current_sine(parameters: CurrentSineParameters) -> Messages:
+    """Drive the Peltier element by a slow sine, and watch temperatures and deflection.
+
+    As it is, a sine of 0.1 A at 0.001 Hz, for the static characteristics (Rakotondrabe and Ivan 2010, section V-B,
+    Fig. 12); with a small amplitude and several frequencies, for the bandwidth.
+    """
+    for frequency in parameters.frequencies:
+        if not 0 < frequency <= parameters.rate / 10:
+            raise ValueError(f"frequencies: expected more than 0 and at most {parameters.rate / 10:g} Hz")
+        yield Phase(f"sine of {frequency:g} Hz")
+        yield FixedRate(
+            controller=Playback(_sine(parameters.amplitude, frequency)),
+            rate=parameters.rate,
+            duration=parameters.periods / frequency,
+            inputs=SENSORS,
+            actuators=("tec",),
+            limits=((-parameters.amplitude, parameters.amplitude),),
+            label=f"{frequency:g} Hz",
+        )
+
+
+class CurrentStepsParameters(ProtocolParameters):
+    """What can be set."""
+
+    levels: NumberList = parameter("-0.1, -0.05, -0.025, 0.1", unit="A", help="currents, one after another")
+    on: float = parameter(600.0, unit="s", low=1, high=36000, help="how long each is held")
+    off: float = parameter(900.0, unit="s", low=1, high=36000, help="how long the current is off after each")
+    rate: float = parameter(1.0, unit="Hz", low=0.01, high=100, help="samples in a second")
+
+
+@protocol(needs=THERMAL, controls=DEFLECTION)
+def current_steps(parameters: CurrentStepsParameters) -> Messages:
+    """Step the current of the Peltier element, and watch temperatures and deflection.
+
+    Steps of 0.1, 0.05 and 0.025 A that cool (Rakotondrabe and Ivan 2010, section V-B, Fig. 13), and one that heats,
+    without which the Joule heat cannot be told from the Seebeck effect.
+    """
+    levels = parameters.levels
+    cycle = parameters.on + parameters.off
+
+    def current(t: float) -> float:
+        number, within = divmod(t, cycle)
+        return levels[min(int(number), len(levels) - 1)] if within < parameters.on else 0.0
+
+    yield Phase("steps of the current")
+    yield FixedRate(
+        controller=Playback(current),
+        rate=parameters.rate,
+        duration=len(levels) * cycle,
+        inputs=SENSORS,
+        actuators=("tec",),
+        limits=((min(0.0, *levels), max(0.0, *levels)),),
+        label="current steps",
+    )
+
+
+class ThermomechanicalParameters(ProtocolParameters):
+    """What can be set."""
+
+    coldest: float = parameter(-0.15, unit="A", low=-1, high=0, help="lowest current, which cools most")
+    hottest: float = parameter(0.1, unit="A", low=0, high=1, help="highest current")
+    levels: int = parameter(9, unit="1", low=2, high=1000, help="currents on each way")
+    dwell: float = parameter(240.0, unit="s", low=1, high=36000, help="hold at each before the reading")
+
+
+@protocol(needs=THERMAL)
+def thermomechanical(parameters: ThermomechanicalParameters) -> Messages:
+    """Measure the static deflection over the temperature of the tip, without voltage.
+
+    The current goes down in steps, up, and back (Rakotondrabe and Ivan 2010, section V-C, Fig. 14).
+    """
+    down = np.linspace(0.0, parameters.coldest, parameters.levels)
+    up = np.linspace(parameters.coldest, parameters.hottest, 2 * parameters.levels)[1:]
+    back = np.linspace(parameters.hottest, 0.0, parameters.levels)[1:]
+    yield Phase("staircase of the current")
+    for current in [*down, *up, *back]:
+        yield Step({"tec": float(current)}, Dwell(parameters.dwell), label="sample")
+
+
+class PiezoLoopsParameters(ProtocolParameters):
+    """What can be set."""
+
+    amplitudes: NumberList = parameter("40, 40, 30, 20, 10", unit="V", help="amplitude of each cycle")
+    frequency: float = parameter(0.1, unit="Hz", low=1e-3, high=10, help="cycles in a second")
+    rate: float = parameter(50.0, unit="Hz", low=1, high=1e5, help="samples in a second")
+
+
+@protocol(needs=("piezo", *SENSORS), controls=DEFLECTION)
+def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
+    """Measure the hysteresis of the piezo by a slow sine, with minor loops of smaller and smaller amplitude.
+
+    Rakotondrabe and Ivan 2010, section V-D, Fig. 15: 40 V, 0.1 Hz.
+    """
+    amplitudes = parameters.amplitudes
+    largest = max(map(abs, amplitudes))
+
+    def voltage(t: float) -> float:
+        cycle = min(int(t * parameters.frequency), len(amplitudes) - 1)
+        return amplitudes[cycle] * math.sin(2.0 * math.pi * parameters.frequency * t)
+
+    yield Phase("loops of the voltage")
+    yield FixedRate(
+        controller=Playback(voltage),
+        rate=parameters.rate,
+        duration=len(amplitudes) / parameters.frequency,
+        inputs=SENSORS,
+        actuators=("piezo",),
+        limits=((-largest, largest),),
+        label="piezo loops",
+    )
+
+
+class PiezoStepParameters(ProtocolParameters):
+    """What can be set."""
+
+    voltage: float = parameter(40.0, unit="V", low=-1000, high=1000, help="height of the step")
+    rest: float = parameter(0.02, unit="s", low=0, high=10, help="time at 0 V before it")
+    duration: float = parameter(0.3, unit="s", low=1e-3, high=100, help="time after it")
+    rate: float = parameter(20e3, unit="Hz", low=10, high=1e6, help="samples in a second")
+
+
+@protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
+def piezo_step(parameters: PiezoStepParameters) -> Messages:
+    """Measure the deflection after a step of the voltage, fast enough for the resonance.
+
+    Rakotondrabe and Ivan 2010, section V-D, Fig. 16: 40 V. Over a network a T7 answers a request or two in a
+    millisecond, so that this rate is for an emulated rig.
+    """
+    yield Phase("step of the voltage")
+    yield FixedRate(
+        controller=Playback(lambda t: parameters.voltage if t >= parameters.rest else 0.0),
+        rate=parameters.rate,
+        duration=parameters.rest + parameters.duration,
+        inputs=(DEFLECTION,),
+        actuators=("piezo",),
+        limits=((min(0.0, parameters.voltage), max(0.0, parameters.voltage)),),
+        label="piezo step",
+    )
+
+
+class ExcitationParameters(ProtocolParameters):
+    """What can be set."""
+
+    current: float = parameter(0.08, unit="A", low=0, high=1, help="amplitude of the current")
+    current_frequency: float = parameter(1e-3, unit="Hz", low=1e-5, high=1, help="frequency of the current")
+    voltage: float = parameter(30.0, unit="V", low=0, high=1000, help="amplitude of the voltage")
+    voltage_frequency: float = parameter(0.05, unit="Hz", low=1e-4, high=10, help="frequency of the voltage")
+    duration: float = parameter(2000.0, unit="s", low=1, high=36000, help="how long")
+    rate: float = parameter(2.0, unit="Hz", low=0.01, high=1000, help="samples in a second")
+
+
+@protocol(needs=("tec", "piezo", *SENSORS), controls=DEFLECTION)
+def hybrid_excitation(parameters: ExcitationParameters) -> Messages:
+    """Drive heat and voltage at once, a sine each, to try a model of the whole on it.
+
+    Rakotondrabe and Ivan 2010, eq. 22, has both parts.
+    """
+    yield Phase("both at once")
+    yield FixedRate(
+        controller=Playback(
+            _sine(parameters.current, parameters.current_frequency),
+            _sine(parameters.voltage, parameters.voltage_frequency),
+        ),
+        rate=parameters.rate,
+        duration=parameters.duration,
+        inputs=SENSORS,
+        actuators=("tec", "piezo"),
+        limits=((-parameters.current, parameters.current), (-parameters.voltage, parameters.voltage)),
+        label="both at once",
+    )
+
+
+def _sine(amplitude: float, frequency: float) -> Callable[[float], float]:
+    return lambda t: amplitude * math.sin(2.0 * math.pi * frequency * t)

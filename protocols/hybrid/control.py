@@ -1,0 +1,127 @@
+"""Control of the thermo-piezoelectric hybrid: the tip follows a reference by heat and voltage together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from bench import registry
+from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
+from bench.model_file import load_hybrid_model
+from bench.number_list import NumberList
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
+from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
+
+ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
+ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
+
+REST = 5.0
+"""Time at the start before the reference begins to move, s."""
+REACH = 199e-6
+"""Farthest position of either sign, m; the displacement sensor sees no farther."""
+
+
+class Parameters(ProtocolParameters):
+    """What can be set."""
+
+    model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
+    controller: ControllerName = parameter("hybrid", unit="", help="which controller")
+    reference: ReferenceName = parameter("moves", unit="", help="what is followed")
+    positions: NumberList = parameter(
+        "60e-6, -50e-6, 90e-6, 85e-6, -120e-6, 0", unit="m", help="of moves: positions, one after another"
+    )
+    low: float = parameter(-50e-6, unit="m", low=-REACH, high=REACH, help="lowest position of the others")
+    high: float = parameter(50e-6, unit="m", low=-REACH, high=REACH, help="highest position of the others")
+    steps: int = parameter(5, unit="1", low=1, high=1000, help="steps of a staircase each way")
+    speed: float = parameter(3e-6, unit="m/s", low=1e-9, high=1e-4, help="greatest speed of the reference")
+    hold: float = parameter(60.0, unit="s", low=0, high=36000, help="time at each position")
+    amplitude: float = parameter(1e-6, unit="m", low=0, high=9e-6, help="amplitude of the sine on a ramp")
+    frequency: float = parameter(1.0, unit="Hz", low=1e-3, high=20, help="frequency of the sine on a ramp")
+    rate: float = parameter(200.0, unit="Hz", low=50, high=1000, help="samples in a second")
+    record_rate: float = parameter(50.0, unit="Hz", low=0.01, high=1000, help="recorded samples in a second")
+    witness: bool = parameter(False, unit="", help="whether a sensor `witness` beside the loop is recorded as well")
+
+
+@protocol(needs=("tec", "piezo", DEFLECTION, BASE, TIP), controls=DEFLECTION)
+def hybrid_control(parameters: Parameters) -> Messages:
+    """Make the tip follow a reference by the thermal and the piezo part together.
+
+    The thermal part takes the range, the piezo part the accuracy. References are smooth moves from position to
+    position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
+    a hold at 0.
+    """
+    model = load_hybrid_model(Path(parameters.model)).model
+    reference, duration = _reference(parameters)
+    controller = registry.load("controllers", f"hybrid.{parameters.controller}")(model, reference, parameters.rate)
+    yield Phase(parameters.controller)
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=duration,
+        inputs=(DEFLECTION, BASE, TIP),
+        actuators=("tec", "piezo"),
+        watched=(WITNESS,) if parameters.witness else (),
+        record_every=max(1, round(parameters.rate / parameters.record_rate)),
+        label=parameters.reference,
+    )
+
+
+class StepParameters(ProtocolParameters):
+    """What can be set."""
+
+    model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
+    step: float = parameter(5e-6, unit="m", low=-9e-6, high=9e-6, help="height of the step")
+    rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
+    duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")
+    rate: float = parameter(20e3, unit="Hz", low=2000, high=1e6, help="samples in a second")
+    witness: bool = parameter(False, unit="", help="whether a sensor `witness` beside the loop is recorded as well")
+
+
+@protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
+def fine_step(parameters: StepParameters) -> Messages:
+    """Make the piezo part alone follow a step, at a rate that sees its resonance.
+
+    The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
+    instruments are called directly.
+    """
+    model = load_hybrid_model(Path(parameters.model)).model
+    controller = registry.load("controllers", "hybrid.fine")(
+        model, lambda t: parameters.step if t >= parameters.rest else 0.0, parameters.rate
+    )
+    yield Phase("fine step")
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=parameters.rest + parameters.duration,
+        inputs=(DEFLECTION,),
+        actuators=("piezo",),
+        watched=(WITNESS,) if parameters.witness else (),
+        label="fine step",
+    )
+
+
+def moves_of(parameters: Parameters) -> SmoothMoves:
+    """Return the moves that a reference consists of, without its sine."""
+    p = parameters
+    if p.reference == "moves":
+        if max(map(abs, p.positions)) > REACH:
+            raise ValueError(f"positions: expected numbers from {-REACH:g} to {REACH:g} m")
+        return SmoothMoves([0.0, *p.positions], p.speed, hold=p.hold)
+    if p.reference == "staircase":
+        return staircase(p.low, p.high, p.steps, p.speed, hold=p.hold)
+    if p.reference == "hold":
+        return SmoothMoves([0.0, 0.0], p.speed, hold=p.hold)
+    return SmoothMoves([0.0, p.low, p.high, p.low], p.speed, hold=p.hold)
+
+
+def _reference(parameters: Parameters) -> tuple[Reference, float]:
+    """Return the reference and its duration, s."""
+    moves = moves_of(parameters)
+    duration = REST + moves.duration
+
+    def delayed(t: float) -> float:
+        return moves(t - REST)
+
+    if parameters.reference == "sine-on-ramp":
+        return AddedSine(delayed, parameters.amplitude, parameters.frequency), duration
+    return delayed, duration

@@ -1,0 +1,1 @@
+"""Operator scripts for artificial muscles, under weights or on a stage."""

@@ -1,0 +1,322 @@
+"""Mid-ranging control of a cantilever with a slow thermal part of long range and a fast piezo part of short range.
+
+The controllers are sampled: called at a fixed rate with all readings, they return all set-points. Units are SI;
+temperatures are in °C and a positive current heats. The thermal part is driven by heat fed forward from the reference
+and fed back from its estimated deflection. The piezo part makes up the difference, through the inverse of its
+hysteresis, and so returns to the middle of its range.
+
+Source: Allison and Isaksson, "Design and performance of mid-ranging controllers", Journal of Process Control 8, 1998.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+import numpy as np
+
+from bench.control.notch_loop import NotchLoop, NotchLoopParameters
+from bench.control.play_inverse import PlayInverse
+from bench.control.references import Reference
+from bench.control.tracking import Trace, check_positive
+from rigs.hybrid.estimates import (
+    Bending,
+    LowPass,
+    ReducedNetwork,
+    ThermalEstimate,
+    ThermalNoise,
+    Thermistor,
+    UnscentedEstimate,
+)
+from rigs.hybrid.model import HybridModel
+
+STROKE = 9e-6
+"""Largest deflection of either sign that the piezo part is asked for, m."""
+_THERMAL_GAIN = 3e4
+"""Heat fed back per missing deflection where there is no piezo part, W/m."""
+
+
+class _Preview:
+    """Thermal part of the reference: smoothed by a window in time, with its derivative, now and ahead.
+
+    Changes faster than the window are left to the piezo part. The window extends into the future of the known
+    reference and adds no delay.
+    """
+
+    def __init__(self, reference: Reference, window: float, lead: float, period: float) -> None:
+        half = max(1, round(0.5 * window / period))
+        self._reference = reference
+        self._period = period
+        x = np.arange(-half, half + 1) / (half + 1.0)
+        weights = 0.5 + 0.5 * np.cos(math.pi * x)
+        self._weights = weights / weights.sum()
+        slopes = np.sin(math.pi * x)
+        # Exact for a ramp.
+        self._slopes = slopes / (slopes @ (x * (half + 1.0) * period))
+        self._width = 2 * half + 1
+        ahead = round(lead / period)
+        self._values = np.array([reference(k * period) for k in range(-half, half + 1 + ahead)])
+        self._next = half + 1 + ahead
+
+    def advance(self, t: float) -> tuple[float, float, float]:
+        """Return the smoothed reference now (m), and ahead (m) with its derivative (m/s)."""
+        values = self._values
+        now = float(self._weights @ values[: self._width])
+        window = values[-self._width :]
+        ahead, rate = float(self._weights @ window), float(self._slopes @ window)
+        values[:-1] = values[1:]
+        values[-1] = self._reference(t + self._next * self._period)
+        return now, ahead, rate
+
+
+@dataclass(frozen=True)
+class MidRangingParameters:
+    """Settings of the mid-ranging controllers.
+
+    Parameters
+    ----------
+    period : float
+        Time between two calls, s.
+    every : int
+        Calls per new current.
+    gain : float
+        Heat fed back per missing deflection of the thermal part, W/m.
+    integral_time : float
+        Time constant of the integral in that feedback, s.
+    lead : float
+        Time by which the heat leads the reference, s: the lag of the bending behind the base.
+    window : float
+        Time over which the reference is smoothed for the thermal part, s.
+    maximum_current : float
+        Greatest current of either sign, A.
+    filter_time : float
+        Time constant of the low-pass that estimates the thermal part in place of a Kalman filter, s.
+    integral : float
+        Gain of the piezo part's integral, 1/s, below half the rate of the calls.
+    stroke : float
+        Greatest deflection of either sign that the piezo part is asked for, m.
+    """
+
+    period: float = 5e-3
+    every: int = 4
+    gain: float = 1.6e4
+    integral_time: float = 40.0
+    lead: float = 1.0
+    window: float = 4.0
+    maximum_current: float = 0.15
+    filter_time: float = 0.15
+    integral: float = 25.0
+    stroke: float = STROKE
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+        if not 2.0 * self.integral * self.period < 1.0:
+            raise ValueError(f"integral: expected less than {0.5 / self.period:g} 1/s, got {self.integral}")
+
+    @classmethod
+    def at_rate(cls, rate: float) -> Self:
+        """Return the settings for a number of calls per second, with a new current every 20 ms or call."""
+        return cls(period=1.0 / rate, every=max(1, round(0.02 * rate)))
+
+    def share(self, period: float) -> float:
+        """Return the share of a new value that a low-pass of `filter_time` takes in after a period (s)."""
+        return -math.expm1(-period / self.filter_time)
+
+
+class _MidRanging:
+    """Thermal and piezo part under one reference; the controllers differ in estimate and use of the piezo part.
+
+    Readings are (deflection, m; temperature of the base, °C; temperature of the tip, °C), set-points (current, A;
+    voltage, V). A missing reading holds both.
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        reference: Reference,
+        parameters: MidRangingParameters,
+        estimate: Callable[[Bending, ReducedNetwork], ThermalEstimate],
+        *,
+        piezo: bool = True,
+        integral: float = 0.0,
+    ) -> None:
+        self._p = parameters
+        self._reference = reference
+        self._celsius = model.reference
+        self._bending, self._network = Bending(model.polynomial), ReducedNetwork(model.network, model.reference)
+        self._estimate = estimate(self._bending, self._network)
+        self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
+        self._step = parameters.period * parameters.every
+        self._preview = _Preview(reference, parameters.window, parameters.lead, self._step)
+        self._integral_gain = integral * parameters.period
+        self._integral = 0.0
+        self._fed_back = 0.0
+        self._start = math.nan
+        self._samples = 0
+        self._current = 0.0
+        self._voltage = 0.0 if inverse is None else inverse.input(0.0)
+        self._wanted = math.nan
+        self._base = self._tip = math.nan
+
+    def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
+        """Take deflection (m) and temperatures of base and tip (°C) at a time (s); return current and voltage.
+
+        Raises
+        ------
+        ValueError
+            If there are not three readings.
+        """
+        if len(measured) != 3:
+            raise ValueError(f"measured: expected deflection and two temperatures, got {len(measured)} readings")
+        deflection, base, tip = measured
+        complete = math.isfinite(deflection + base + tip)
+        if complete:
+            self._base, self._tip = base - self._celsius, tip - self._celsius
+            piezo = 0.0 if self._inverse is None else self._inverse.output
+            if math.isnan(self._start):
+                self._start = t
+                self._estimate.begin(deflection - piezo, self._base, self._tip)
+            self._estimate.sample(deflection - piezo)
+        elif math.isnan(self._start):
+            return self._current, self._voltage
+        now = t - self._start
+        self._wanted = wanted = self._reference(now)
+        if self._samples % self._p.every == 0:
+            self._heat(now, hold=not complete)
+        self._samples += 1
+        if complete and self._inverse is not None:
+            # The voltage aims at the reference at the end of the coming period.
+            thermal = self._estimate.value + self._p.period * self._estimate.rate
+            feedforward = self._reference(now + self._p.period) - thermal
+            total = feedforward + self._integral + self._integral_gain * (wanted - deflection)
+            self._voltage = self._inverse.input(total)
+            if self._integral_gain:
+                # The part clipped by the stroke is taken back: the integral does not wind up.
+                self._integral = self._inverse.output - feedforward
+        return self._current, self._voltage
+
+    def _heat(self, now: float, *, hold: bool) -> None:
+        """Advance the thermal part over the past period; set the current of the coming one, or hold it."""
+        p, network, base = self._p, self._network, self._base
+        network.advance(base, self._current, self._step)
+        self._estimate.correct(base, self._tip, self._current)
+        wanted, ahead, rate = self._preview.advance(now)
+        if hold:
+            return
+        rise = self._bending.rise(ahead)
+        slope = self._bending.slope(rise)
+        heat = network.heat_for(rise, rate / slope, base, self._current)
+        # Heat deflects negatively: the sign is that of the slope.
+        lacking = math.copysign(p.gain, slope) * (wanted - self._estimate.value)
+        further = self._fed_back + lacking * self._step / p.integral_time
+        current = network.current_for(heat + lacking + further, base)
+        self._current = min(max(current, -p.maximum_current), p.maximum_current)
+        # At the limit the integral only moves away from it.
+        if self._current == current or lacking * current < 0.0:
+            self._fed_back = further
+
+    @property
+    def trace(self) -> Trace:
+        """State of the controller; the disturbance is the thermal deflection less that of the model."""
+        disturbance, uncertainty = self._estimate.describe(self._tip)
+        piezo = 0.0 if self._inverse is None else self._inverse.output
+        return Trace(
+            reference=self._wanted,
+            predicted=self._estimate.value + piezo,
+            disturbance=disturbance,
+            uncertainty=uncertainty,
+        )
+
+
+class HybridController(_MidRanging):
+    """Mid-ranging control: the thermal part provides the range, the piezo part the accuracy.
+
+    Parameters
+    ----------
+    model : HybridModel
+        The identified model.
+    reference : callable
+        Wanted deflection, m, at a time in s from the first complete reading; also before 0 and after the end.
+    parameters : MidRangingParameters
+        Settings of the loops.
+    estimator : {"unscented", "low-pass"}
+        Estimate of the thermal part: a Kalman filter of the thermal state, or a low-pass.
+    noise : ThermalNoise
+        Variances of the Kalman filter.
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        reference: Reference,
+        parameters: MidRangingParameters | None = None,
+        *,
+        estimator: Literal["unscented", "low-pass"] = "unscented",
+        noise: ThermalNoise | None = None,
+    ) -> None:
+        p = parameters or MidRangingParameters()
+
+        def estimate(bending: Bending, network: ReducedNetwork) -> ThermalEstimate:
+            if estimator == "unscented":
+                return UnscentedEstimate(bending, network, noise or ThermalNoise(), p.period, p.every)
+            if estimator == "low-pass":
+                return LowPass(bending, p.share(p.period))
+            raise ValueError(f"estimator: expected unscented or low-pass, got {estimator!r}")
+
+        super().__init__(model, reference, p, estimate, integral=p.integral)
+
+
+class OpenLoopHybrid(_MidRanging):
+    """Inverse of the model without the deflection sensor, from the temperature of the tip alone.
+
+    The thermal part follows the inverted polynomial, the piezo part adds what the polynomial at the measured
+    temperature lacks, through the inverse of the hysteresis. Parameters as `HybridController`.
+    """
+
+    def __init__(
+        self, model: HybridModel, reference: Reference, parameters: MidRangingParameters | None = None
+    ) -> None:
+        p = parameters or MidRangingParameters()
+        super().__init__(model, reference, p, lambda bending, _: Thermistor(bending, p.share(p.period * p.every)))
+
+
+class ThermalFeedback(_MidRanging):
+    """Thermal part alone, fed forward and fed back from the deflection; the voltage stays 0.
+
+    Parameters as `HybridController`; the default gain is higher, as no piezo part does the rest.
+    """
+
+    def __init__(
+        self, model: HybridModel, reference: Reference, parameters: MidRangingParameters | None = None
+    ) -> None:
+        p = parameters or MidRangingParameters(gain=_THERMAL_GAIN)
+        super().__init__(model, reference, p, lambda bending, _: LowPass(bending, p.share(p.period)), piezo=False)
+
+
+def make_hybrid(model: HybridModel, reference: Reference, rate: float) -> HybridController:
+    """Return the mid-ranging controller with the Kalman filter, called at a rate (Hz)."""
+    return HybridController(model, reference, MidRangingParameters.at_rate(rate))
+
+
+def make_low_pass(model: HybridModel, reference: Reference, rate: float) -> HybridController:
+    """Return the mid-ranging controller with the low-pass, called at a rate (Hz)."""
+    return HybridController(model, reference, MidRangingParameters.at_rate(rate), estimator="low-pass")
+
+
+def make_open_loop(model: HybridModel, reference: Reference, rate: float) -> OpenLoopHybrid:
+    """Return the inverse of the model, called at a rate (Hz)."""
+    return OpenLoopHybrid(model, reference, MidRangingParameters.at_rate(rate))
+
+
+def make_thermal_feedback(model: HybridModel, reference: Reference, rate: float) -> ThermalFeedback:
+    """Return the feedback to the thermal part alone, called at a rate (Hz)."""
+    return ThermalFeedback(model, reference, replace(MidRangingParameters.at_rate(rate), gain=_THERMAL_GAIN))
+
+
+def make_fine(model: HybridModel, reference: Reference, rate: float = 20e3, *, integral: float = 300.0) -> NotchLoop:
+    """Return the loop of the piezo part alone, at a rate (Hz) that resolves the resonance; integral gain in 1/s."""
+    dynamics = model.dynamics
+    parameters = NotchLoopParameters(rate=rate, integral=integral, stroke=STROKE)
+    return NotchLoop(model.hysteresis, dynamics.frequency, dynamics.damping, reference, parameters)

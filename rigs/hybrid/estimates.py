@@ -1,0 +1,299 @@
+"""Estimates of the thermal deflection: the model in single numbers, and the filters that the controllers choose from.
+
+Units are SI; rises are temperatures above the reference of the model, in K, and a positive current heats.
+
+Sources: Rakotondrabe and Ivan, "Development and dynamic modeling of a new hybrid thermo-piezoelectric
+micro-actuator", IEEE Transactions on Robotics 26(6), 2010 (the model); Julier and Uhlmann, "Unscented filtering and
+nonlinear estimation", Proceedings of the IEEE 92, 2004.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.control.tracking import check_positive
+from bench.hysteresis import Polynomial
+from bench.hysteresis._checks import Floats
+from rigs.hybrid.network import ABSOLUTE_ZERO, ThermalNetwork
+
+# Points at which the polynomial of the thermal deflection is tabulated for its inverse.
+_TABLE = 2001
+
+
+class Bending:
+    """The thermal deflection and its inverse for single values, beyond the fitted range along the end's tangent."""
+
+    def __init__(self, polynomial: Polynomial) -> None:
+        self.low, self.high = polynomial.input_range
+        self._rises = np.linspace(self.low, self.high, _TABLE)
+        self._deflections = polynomial.evaluate(self._rises) - polynomial.evaluate([0.0])[0]
+        falls = np.diff(self._deflections)
+        if not (falls < 0.0).all() and not (falls > 0.0).all():
+            raise ValueError(
+                f"polynomial: expected one that rises or falls all over its range, {self.low:g} to {self.high:g} K"
+            )
+        order = slice(None) if falls[0] > 0.0 else slice(None, None, -1)
+        self._sorted = self._deflections[order].copy(), self._rises[order].copy()
+        # Powers of the rise mapped to [-1, 1].
+        self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        series = np.append(polynomial.bias - polynomial.evaluate([0.0])[0], polynomial.series)
+        powers = np.polynomial.chebyshev.cheb2poly(series)
+        self._powers: list[float] = powers[::-1].tolist()
+        self._slopes: list[float] = (powers[1:] * np.arange(1, powers.size))[::-1].tolist()
+
+    def deflection(self, rise: float) -> float:
+        """Return the deflection (m) at a rise of the tip (K)."""
+        inside = min(max(rise, self.low), self.high)
+        x = (inside - self._middle) / self._half
+        total = 0.0
+        for power in self._powers:
+            total = total * x + power
+        return total if inside == rise else total + self.slope(inside) * (rise - inside)
+
+    def slope(self, rise: float) -> float:
+        """Return the deflection per rise (m/K)."""
+        x = (min(max(rise, self.low), self.high) - self._middle) / self._half
+        total = 0.0
+        for slope in self._slopes:
+            total = total * x + slope
+        return total / self._half
+
+    def rise(self, deflection: float) -> float:
+        """Return the rise of the tip (K) for a deflection (m), at most that at the end of the range."""
+        return float(np.interp(deflection, *self._sorted))
+
+
+class ReducedNetwork:
+    """The thermal network in single numbers, reduced to base and tip, with one node for the block.
+
+    The block is ten times slower than the rest. It is simulated from the current, in open loop, and not estimated.
+    """
+
+    def __init__(self, network: ThermalNetwork, reference: float) -> None:
+        self.kelvin = reference - ABSOLUTE_ZERO
+        self._network = network
+        self.base_capacity, self.tip_capacity = (float(c) for c in network.capacities[2:])
+        self.base_air, self.tip_air = (float(g) for g in network.air_conductances[2:])
+        self.along = 1.0 / network.beam_resistance
+        self.glue, self.cooler = 1.0 / network.glue_resistance, 1.0 / network.tec_resistance
+        self._block_capacity = 2.0 * network.block_capacity
+        self._block_air = float(network.air_conductances[:2].sum())
+        self.block = 0.0
+        """Rise of the block, K."""
+
+    def _back(self, base: float, current: float) -> float:
+        """Return the rise of the face between cooler and glue, K."""
+        n = self._network
+        pumped = n.seebeck * current
+        flow = 0.5 * n.electrical_resistance * current**2 - pumped * self.kelvin
+        return (flow + base * self.cooler + self.block * self.glue) / (self.glue + self.cooler + pumped)
+
+    def advance(self, base: float, current: float, dt: float) -> None:
+        """Advance the block by dt (s), under the rise of the base (K) and the current (A)."""
+        flow = (self._back(base, current) - self.block) * self.glue - self.block * self._block_air
+        self.block += dt * flow / self._block_capacity
+
+    def heat_flow(self, current: float) -> tuple[float, float]:
+        """Return the heat into the base as constant (W) and slope (W/K) of its rise, at a current (A)."""
+        n = self._network
+        pumped = n.seebeck * current
+        constant = pumped * self.kelvin + 0.5 * n.electrical_resistance * current**2
+        slope = pumped - self.cooler
+        total = self.glue + self.cooler + pumped
+        back = 0.5 * n.electrical_resistance * current**2 - pumped * self.kelvin + self.block * self.glue
+        return constant + self.cooler * back / total, slope + self.cooler**2 / total - self.base_air
+
+    def heat_for(self, rise: float, rate: float, base: float, current: float) -> float:
+        """Return the heat from the cooler (W) that moves the tip's rise (K) at a rate (K/s), quasi-statically.
+
+        The base leads the tip by the heat loss of the tip; the heat through the cooler is that at the present rise of
+        the base (K) and current (A).
+        """
+        share = 1.0 + self.tip_air / self.along
+        stored = (self.base_capacity * share + self.tip_capacity) * rate
+        lost = (self.base_air * share + self.tip_air) * rise
+        return stored + lost + (share * rise - self._back(base, current)) * self.cooler
+
+    def current_for(self, heat: float, base: float) -> float:
+        """Return the smaller of the currents (A) that give a heat (W) at the rise of the base (K)."""
+        n = self._network
+        pumped = n.seebeck * (self.kelvin + base)
+        # Beyond the strongest cooling no current gives the heat: the strongest is returned.
+        square = max(pumped * pumped + 2.0 * n.electrical_resistance * heat, 0.0)
+        return 2.0 * heat / (pumped + math.sqrt(square))
+
+
+class ThermalEstimate:
+    """Estimate of the thermal deflection; by itself the first one, held."""
+
+    def __init__(self, bending: Bending) -> None:
+        self._bending = bending
+        self.value = 0.0
+        """Estimate at the last sample, m."""
+        self.rate = 0.0
+        """Its rate of change, m/s; 0 where it is not known."""
+
+    def begin(self, deflection: float, base: float, tip: float) -> None:  # noqa: ARG002
+        """Start from the first readings: thermal deflection (m), rises of base and tip (K)."""
+        self.value = deflection
+
+    def sample(self, deflection: float) -> None:
+        """Use one value of the measured deflection less the piezo part (m), and advance by one fast period."""
+
+    def correct(self, base: float, tip: float, current: float) -> None:
+        """Use the rises of base and tip (K) and the current (A) since the last thermal sample."""
+
+    def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
+        """Return difference to the model, m, and its standard deviation, m, at the measured rise of the tip (K)."""
+        return math.nan, math.nan
+
+
+class LowPass(ThermalEstimate):
+    """First-order low-pass of the measured deflection less the piezo part; share: weight of a new value, 0 to 1."""
+
+    def __init__(self, bending: Bending, share: float) -> None:
+        super().__init__(bending)
+        self._share = share
+
+    def sample(self, deflection: float) -> None:
+        """Follow the deflection."""
+        self.value += self._share * (deflection - self.value)
+
+    def describe(self, rise: float) -> tuple[float, float]:
+        """Return the difference to the polynomial; its uncertainty is not known."""
+        return self.value - self._bending.deflection(rise), math.nan
+
+
+class Thermistor(ThermalEstimate):
+    """The polynomial at the low-passed temperature of the tip, without the deflection; share as in `LowPass`."""
+
+    def __init__(self, bending: Bending, share: float) -> None:
+        super().__init__(bending)
+        self._share = share
+        self._tip = 0.0
+
+    def begin(self, deflection: float, base: float, tip: float) -> None:  # noqa: ARG002
+        """Start from the temperature of the tip."""
+        self._tip = tip
+        self.value = self._bending.deflection(tip)
+
+    def correct(self, base: float, tip: float, current: float) -> None:  # noqa: ARG002
+        """Follow the temperature of the tip."""
+        self._tip += self._share * (tip - self._tip)
+        self.value = self._bending.deflection(self._tip)
+
+
+@dataclass(frozen=True)
+class ThermalNoise:
+    """Standard deviations of the Kalman filter of the thermal part.
+
+    Parameters
+    ----------
+    thermistor : float
+        Noise of one reading of a thermistor, K.
+    deflection : float
+        Noise of one reading of the deflection, m.
+    base, tip : float
+        Random walk of base and tip off the model, K/√s.
+    heat : float
+        Random walk of the disturbing heat flow into the base, W/√s.
+    offset : float
+        Random walk of the deflection off the polynomial, m/√s.
+    """
+
+    thermistor: float = 0.02
+    deflection: float = 10e-9
+    base: float = 1e-3
+    tip: float = 2e-4
+    heat: float = 2e-3
+    offset: float = 3e-9
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+
+
+class UnscentedEstimate(ThermalEstimate):
+    """Unscented Kalman filter of base, tip, a disturbing heat and an offset of the deflection, by filterpy.
+
+    The heat stands for deviations of room, block and network from the model, the offset for the error of the
+    polynomial, creep of the piezo part and drift of the sensor; both are random walks. The filter runs once in a
+    thermal period, with the mean of the deflections since; in between, the estimate advances at the model's rate.
+    """
+
+    def __init__(
+        self, bending: Bending, network: ReducedNetwork, noise: ThermalNoise, period: float, every: int
+    ) -> None:
+        # Half a second of import, needed by this estimate only.
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+        super().__init__(bending)
+        self._network = network
+        self._period = period
+        self._step = period * every
+        self._noise = noise
+        # These settings give the cubature rule: equal positive weights, without cancellation.
+        points = MerweScaledSigmaPoints(
+            4, alpha=1.0, beta=0.0, kappa=0.0, sqrt_method=lambda matrix: np.linalg.cholesky(matrix).T
+        )
+        self._filter = UnscentedKalmanFilter(4, 3, self._step, self._observe, self._move, points)
+        self._filter.Q = np.diag(np.square([noise.base, noise.tip, noise.heat, noise.offset])) * self._step
+        self._filter.R = np.diag(np.square([noise.thermistor, noise.thermistor, noise.deflection]))
+        self._filter.R[2, 2] /= every
+        self._heat = 0.0, 0.0
+        self._sum, self._count = 0.0, 0
+
+    def begin(self, deflection: float, base: float, tip: float) -> None:
+        """Start in equilibrium with the first readings."""
+        n = self._noise
+        self._filter.x = np.array([base, tip, 0.0, deflection - self._bending.deflection(tip)])
+        spread = 2.0 * abs(self._bending.slope(tip)) * n.thermistor
+        self._filter.P = np.diag(np.square([n.thermistor, n.thermistor, 10.0 * n.heat, spread]))
+        self.value = deflection
+
+    def _move(self, state: Floats, dt: float) -> list[float]:
+        base, tip, heat, offset = state.tolist()
+        n = self._network
+        constant, slope = self._heat
+        along = (base - tip) * n.along
+        return [
+            base + dt * (constant + slope * base + heat - along) / n.base_capacity,
+            tip + dt * (along - n.tip_air * tip) / n.tip_capacity,
+            heat,
+            offset,
+        ]
+
+    def _observe(self, state: Floats) -> list[float]:
+        base, tip, _, offset = state.tolist()
+        return [base, tip, self._bending.deflection(tip) + offset]
+
+    def sample(self, deflection: float) -> None:
+        """Advance at the rate of the model, and keep the deflection for the next correction."""
+        self._sum += deflection
+        self._count += 1
+        self.value += self.rate * self._period
+
+    def correct(self, base: float, tip: float, current: float) -> None:
+        """Predict, and update with the mean of the deflections since the last thermal sample."""
+        self._heat = self._network.heat_flow(current)
+        self._filter.predict()
+        if self._count:
+            self._take_in(base, tip)
+        here, there, _, offset = self._filter.x.tolist()
+        n = self._network
+        cooling = ((here - there) * n.along - n.tip_air * there) / n.tip_capacity
+        self.rate = self._bending.slope(there) * cooling
+        self.value = self._bending.deflection(there) + offset
+
+    def _take_in(self, base: float, tip: float) -> None:
+        # The mean of the readings is that of half a period before their last.
+        age = 0.5 * (self._count - 1) * self._period
+        mean = self._sum / self._count + self.rate * age
+        self._sum, self._count = 0.0, 0
+        self._filter.update(np.array([base, tip, mean]))
+
+    def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
+        """Return the offset of the deflection and its standard deviation, m."""
+        return float(self._filter.x[3]), math.sqrt(float(self._filter.P[3, 3]))

@@ -1,0 +1,242 @@
+"""Identification of the thermo-piezoelectric hybrid from the runs that characterize it.
+
+The runs are loops at a fixed rate; their samples are in the telemetry. Units are SI; temperatures are in °C and a
+positive current heats.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.errors import DataError
+from bench.hysteresis import Polynomial, PrandtlIshlinskii
+from bench.identification import Errors, Identification
+from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
+from bench.journal import Record, Table
+from bench.protocol import LATENESS
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
+from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
+from rigs.hybrid.network_identification import NetworkIdentification, identify_network
+
+Floats = npt.NDArray[np.float64]
+
+REFERENCE = 22.0
+"""Reference of the polynomial, °C: the nominal temperature of the room."""
+
+_DRIFT_PASSES = 64
+"""Passes in which operator and parabola are fitted in turn; more change less than the sensor's noise."""
+
+
+@dataclass(frozen=True)
+class HybridIdentification:
+    """The model of a hybrid, part by part from a run each, with the evidence for it.
+
+    Attributes
+    ----------
+    model : HybridModel
+        The whole.
+    network : NetworkIdentification
+        From the steps of the current.
+    order : OrderChoice
+        RMS of the polynomial of each order, and the order chosen.
+    polynomial : Identification
+        From the static curve.
+    piezo : PiezoIdentification
+        From the slow loops of the voltage.
+    dynamics : DynamicsIdentification
+        From the fast step.
+    """
+
+    model: HybridModel
+    network: NetworkIdentification
+    order: OrderChoice
+    polynomial: Identification
+    piezo: PiezoIdentification
+    dynamics: DynamicsIdentification
+
+
+@dataclass(frozen=True)
+class PiezoIdentification:
+    """The operator of the piezo, its errors, and the voltages (V) and deflections (m) that it was fitted to."""
+
+    operator: PrandtlIshlinskii
+    errors: Errors
+    voltages: Floats
+    deflections: Floats
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of one fast loop.
+
+    Attributes
+    ----------
+    table : Table
+        Signals by name; set-points are those sent after the sample was read.
+    period : float
+        Time between two samples, s.
+    """
+
+    table: Table
+    period: float
+
+    def __getitem__(self, signal: str) -> Floats:
+        return self.table[signal]
+
+    @property
+    def times(self) -> Floats:
+        """Time from the first sample, s."""
+        return np.arange(len(self.table), dtype=np.float64) * self.period
+
+
+def read_loops(run: Path) -> dict[str, Samples]:
+    """Return the samples of each fast loop of a run by its label.
+
+    Raises
+    ------
+    DataError
+        If the run was not completed, has no fast loop or two of one label, or left samples out.
+    """
+    with Record(run) as record:
+        if record.status != "completed":
+            raise DataError(f"{run}: the run is {record.status}; a model needs a completed one")
+        if LATENESS.name not in [signal.name for signal in record.signals]:
+            raise DataError(f"{run}: has no fast loop")
+        labels = {step.step: step.label for step in record.step_records()}
+        ticks = record.telemetry()
+    taken = np.isfinite(ticks[LATENESS.name])
+    loops = {}
+    for step in np.unique(ticks["step"][taken]).astype(int).tolist():
+        rows = taken & (ticks["step"] == step)
+        table = Table({name: values[rows] for name, values in ticks.columns.items()})
+        times = table["t"] - table[LATENESS.name]
+        if labels[step] in loops:
+            raise DataError(f"{run}: has two loops {labels[step]!r}; expected one of each label")
+        if len(table) < 2 or np.ptp(steps := np.diff(times)) > 1e-3 * steps.mean():
+            raise DataError(f"{run}: the loop {labels[step]!r} left samples out; a model needs all of them")
+        loops[labels[step]] = Samples(table, float(steps.mean()))
+    if not loops:
+        raise DataError(f"{run}: has no fast loop")
+    return loops
+
+
+def sine_at(samples: Samples, signal: str, frequency: float) -> complex:
+    """Return the complex amplitude of a signal at a frequency (Hz), over the last whole periods but the first.
+
+    The first period is left out: it holds the transient.
+    """
+    period = 1.0 / (frequency * samples.period)
+    # A period need not be a whole number of samples.
+    periods = math.floor((len(samples.table) + 1) / period) - 1
+    if periods < 1:
+        raise DataError(f"a sine of {frequency:g} Hz needs at least two periods; the first is left out")
+    last = slice(len(samples.table) - round(periods * period), None)
+    times, values = samples.times[last], samples[signal][last]
+    # Offset and drift are fitted beside the sine.
+    angle = 2.0 * np.pi * frequency * times
+    columns = np.column_stack([np.cos(angle), np.sin(angle), np.ones_like(times), times - times.mean()])
+    cosine, sine, *_ = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return complex(sine, cosine)
+
+
+def bandwidth_of(frequencies: Floats, gains: Floats) -> float:
+    """Return the frequency (Hz) at which a gain has fallen by 3 dB from the one at the lowest, between two of them.
+
+    Raises
+    ------
+    DataError
+        If it has not fallen so far at the highest.
+    """
+    wanted = gains[0] / np.sqrt(2.0)
+    below = np.flatnonzero(gains <= wanted)
+    if below.size == 0:
+        raise DataError(f"the gain has not fallen by 3 dB up to {frequencies[-1]:g} Hz")
+    k = int(below[0])
+    # Straight between two points of the Bode plot.
+    return float(
+        np.exp(np.interp(-np.log(wanted), -np.log(gains[k - 1 : k + 1]), np.log(frequencies[k - 1 : k + 1])))
+    )
+
+
+def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays: int = 15) -> HybridIdentification:
+    """Return the model of a hybrid from its four runs.
+
+    Parameters
+    ----------
+    steps, static, loops, step : Path
+        Runs of `current-steps`, `thermomechanical`, `piezo-loops` and `piezo-step`.
+    plays : int
+        Number of play operators.
+
+    Raises
+    ------
+    DataError
+        If a run is of another kind or was not completed, or a part cannot be identified.
+    """
+    for run, protocol in (
+        (steps, "current-steps"),
+        (static, "thermomechanical"),
+        (loops, "piezo-loops"),
+        (step, "piezo-step"),
+    ):
+        with Record(run) as record:
+            if record.meta.get("protocol") != protocol:
+                raise DataError(f"{run}: is a run of {record.meta.get('protocol')}; expected one of {protocol}")
+    currents = read_loop(steps)
+    with Record(static) as record:
+        if record.status != "completed":
+            raise DataError(f"{static}: the run is {record.status}; a model needs a completed one")
+        curve = record.steps()
+    fast = read_loop(step)
+    try:
+        network = identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
+        rises = curve[TIP] - REFERENCE
+        order = choose_order(rises, curve[DEFLECTION])
+        polynomial = identify_polynomial(rises, curve[DEFLECTION], order.order)
+        piezo = identify_piezo(read_loop(loops), plays)
+        dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
+        if not isinstance(polynomial.model, Polynomial):
+            raise TypeError("expected a polynomial")
+        model = HybridModel(network.network, polynomial.model, piezo.operator, dynamics.model, REFERENCE)
+    except ValueError as error:
+        raise DataError(f"the hybrid cannot be identified: {error}") from error
+    return HybridIdentification(model, network, order, polynomial, piezo, dynamics)
+
+
+def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
+    """Return the Prandtl-Ishlinskii operator of slow loops.
+
+    Thermal drift is modelled as a parabola in time and subtracted.
+    """
+    # A sample is read before its set-point is sent.
+    applied = np.append(0.0, samples[VOLTAGE][:-1])
+    deflections = samples[DEFLECTION]
+    middle = samples.times - samples.times.mean()
+    columns = np.column_stack([middle, middle**2])
+    drift = np.zeros_like(deflections)
+    for _ in range(_DRIFT_PASSES):
+        found = identify_pi(applied, deflections - drift, plays=plays, maximum=float(np.abs(applied).max()))
+        rest = found.residuals - found.residuals.mean()
+        drift = drift + columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
+    if not isinstance(found.model, PrandtlIshlinskii):
+        raise TypeError("expected a Prandtl-Ishlinskii operator")
+    return PiezoIdentification(found.model, found.errors, applied, deflections - drift)
+
+
+def read_loop(run: Path) -> Samples:
+    """Return the samples of the one fast loop of a run.
+
+    Raises
+    ------
+    DataError
+        As `read_loops`, or if there are several.
+    """
+    loops = read_loops(run)
+    if len(loops) != 1:
+        raise DataError(f"{run}: expected one fast loop, found {len(loops)}")
+    return next(iter(loops.values()))

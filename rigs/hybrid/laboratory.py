@@ -1,0 +1,336 @@
+"""The emulated laboratory of the thermo-piezoelectric hybrid, over its wires or called directly.
+
+A cantilever of piezo-ceramic and copper on a Peltier element. A TEC controller drives the latter as a current
+source; a high-voltage amplifier, set and enabled by a LabJack T7, drives the piezo. An optical sensor sees the
+tip; two thermistors are at the base and the tip.
+
+The classes whose names begin with `Direct` take the place of drivers in a rig file: the emulated instruments
+themselves, without a wire, for loops of many kHz on the virtual clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from bench.clock import Clock
+from bench.devices import Device, DriverSettings, Identity, PositionSensor, TECMode
+from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.rig_file import LaboratorySettings
+from sim_devices import protocol_emulated
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.instruments.t7_roles import (
+    EmulatedHighVoltageSupply,
+    EmulatedPositionSensor,
+    EmulatedTemperatureSensor,
+)
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
+from sim_devices.transducers.displacement import DisplacementSensor
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.transducers.thermistor import Thermistor
+from sim_devices.wire.mecom import MeComServer
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.world import World
+
+DISPLACEMENT_INPUT = 0
+BASE_INPUTS, TIP_INPUTS = (1, 2), (3, 4)
+"""Inputs of the T7: of each thermistor the divider and its excitation."""
+AMPLIFIER_INPUTS = (5, 6, 7)
+"""Voltage monitor, current monitor and status of the amplifier."""
+ENABLE_LINE = 4
+"""Digital line of the amplifier's enable input, FIO4 of the T7; the LJTick-DAC is on FIO0 and FIO1."""
+GAIN = 4.0
+"""Of the amplifier, V/V: the LJTick-DAC's 14 bits over ±10 V then make steps of 4.9 mV, 1.4 nm of deflection."""
+SETTLING_TIME = 20e-6
+"""Time constant of the amplifier with this piezo, s: short beside the 1.4 ms of a period of the resonance."""
+REACH = 199e-6
+"""Displacement of either sign that counts as within range, m; the sensor itself stops at 200 µm."""
+
+_CURRENT_LIMIT_PARAMETER = 2030
+_COLDEST_PARAMETER = 4010
+_COLDEST = -25.0
+"""Below which the TEC controller switches itself off, °C; as delivered it would do so above the coldest used."""
+_OVER_CURRENT, _OBJECT_TOO_HOT = 100, 138
+
+FaultName = Literal[
+    "none",
+    "open-thermistor",
+    "shorted-thermistor",
+    "out-of-range",
+    "tec-over-current",
+    "tec-over-temperature",
+    "amplifier-trips",
+]
+
+_direct: dict[str, Device] = {}
+"""Instruments of the open laboratory with `direct` by name: one such rig at a time in a process."""
+
+
+class HybridLaboratorySettings(LaboratorySettings):
+    """Settings of this laboratory in a rig file."""
+
+    ambient_deviation: float = Field(
+        default=HybridParameters.ambient_sd, ge=0, le=5, description="standard deviation of the room temperature, K"
+    )
+    ambient_step: float = Field(default=0.0, ge=-20, le=20, description="step of the room temperature, K")
+    ambient_step_time: float = Field(default=0.0, ge=0, description="time of that step, s")
+    resonance_offset: float = Field(
+        default=0.0, ge=-0.1, le=0.1, description="deviation of the resonance from the paper's, as a share"
+    )
+    current_limit: float = Field(
+        default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
+    )
+    direct: bool = Field(
+        default=False, description="whether the instruments are called directly, by the Direct classes of this module"
+    )
+    fault: FaultName = Field(
+        default="none",
+        description="fault at `fault_time`: open-thermistor, shorted-thermistor, out-of-range (of the "
+        "displacement sensor), tec-over-current, tec-over-temperature, amplifier-trips (if it is on then)",
+    )
+    fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
+
+
+class HybridLaboratory:
+    """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP).
+
+    With `direct` they are `tec`, `displacement`, `base`, `tip` and `piezo`, without wires.
+
+    Parameters
+    ----------
+    settings : HybridLaboratorySettings
+        From the rig file.
+    clock : Clock
+        The clock of the run.
+    seed : int
+        Seed of the room and of the noise of the sensors.
+    """
+
+    Settings = HybridLaboratorySettings
+
+    def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
+        # One stream a source of noise: reading one instrument must not change the noise of another.
+        plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
+        self._settings = settings
+        self._clock = clock
+        self.plant = HybridCantilever(
+            HybridParameters(ambient_sd=settings.ambient_deviation, resonance_offset=settings.resonance_offset), plant
+        )
+        self.world = World(self.plant, clock)
+        self.tec = DirectTEC("tec", self.world, self.plant.peltier, rng=tec)
+        self.tec.write_parameter(_CURRENT_LIMIT_PARAMETER, settings.current_limit)
+        self.tec.write_parameter(_COLDEST_PARAMETER, _COLDEST)
+        self._beyond = 0.0
+        self.displacement = DisplacementSensor(lambda: self.plant.deflection + self._beyond, rng=sensor)
+        self.base = Thermistor(lambda: self.plant.base_temperature, rng=base)
+        self.tip = Thermistor(lambda: self.plant.tip_temperature, rng=tip)
+        self.amplifier = PiezoAmplifier(self.world, self.plant, gain=GAIN, settling_time=SETTLING_TIME, rng=amplifier)
+        wires: list[Callable[[], float]] = [
+            self.displacement,
+            self.base.divider,
+            self.base.excitation,
+            self.tip.divider,
+            self.tip.excitation,
+            self.amplifier.voltage_monitor,
+            self.amplifier.current_monitor,
+            self.amplifier.status,
+        ]
+        self.t7 = EmulatedT7(self.world, dict(enumerate(wires)), rng=t7)
+        self.t7.add_follower(
+            lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
+        )
+        self._t7_server = ModbusTcpServer(self.t7)
+        self._opened = ExitStack()
+        if settings.ambient_step:
+            self.world.add(_Event(settings.ambient_step_time, self._step_room))
+        if settings.fault != "none":
+            self.world.add(_Event(settings.fault_time, self._go_wrong))
+
+    def open(self) -> Mapping[str, str]:
+        """Switch the instruments on; return the port of each by name.
+
+        Raises
+        ------
+        ValueError
+            If another laboratory of this process has the port of the TEC controller; it keeps it.
+        ConfigurationError
+            If another one with `direct` is open in this process.
+        """
+        with ExitStack() as opened:
+            if self._settings.direct:
+                ports = self._open_directly()
+                opened.callback(_direct.clear)
+            else:
+                self._t7_server.start()
+                opened.callback(self._t7_server.close)
+                ports = {"t7": self._t7_server.address}
+                ports["tec"] = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
+                opened.callback(protocol_emulated.unregister, "tec")
+            self._opened = opened.pop_all()
+        return ports
+
+    def operate(self, task: str, value: float) -> None:  # noqa: ARG002 - nothing is done by hand here
+        """Refuse: nothing is to be done by hand.
+
+        Raises
+        ------
+        ConfigurationError
+            Always.
+        """
+        raise ConfigurationError(f"the hybrid laboratory cannot carry out {task!r}; nothing is done by hand there")
+
+    def close(self) -> None:
+        """Switch the instruments off; those of another laboratory stay as they are."""
+        self._opened.close()
+
+    def _open_directly(self) -> dict[str, str]:
+        if _direct:
+            raise ConfigurationError("another rig with directly called instruments is open in this process")
+        self.tec.select_mode(TECMode.CURRENT)
+        _direct.update(
+            {
+                "tec": self.tec,
+                "displacement": DirectPositionSensor(
+                    "displacement",
+                    self.t7,
+                    channels=(DISPLACEMENT_INPUT,),
+                    volts_per_metre=5e4,
+                    position_limits=(-REACH, REACH),
+                ),
+                "base": DirectTemperatureSensor("base", self.t7, channels=BASE_INPUTS),
+                "tip": DirectTemperatureSensor("tip", self.t7, channels=TIP_INPUTS),
+                "piezo": DirectHighVoltageSupply(
+                    "piezo", self.t7, line=ENABLE_LINE, channels=AMPLIFIER_INPUTS, gain=GAIN
+                ),
+                "witness": DirectWitness("witness", self.world, self.plant),
+            }
+        )
+        return {name: name for name in _direct}
+
+    def _step_room(self) -> None:
+        self.plant.step_ambient(self._settings.ambient_step)
+
+    def _go_wrong(self) -> None:
+        fault = self._settings.fault
+        if fault == "open-thermistor":
+            self.base.open = True
+        elif fault == "shorted-thermistor":
+            self.tip.shorted = True
+        elif fault == "out-of-range":
+            self._beyond = 1e-3
+        elif fault == "tec-over-current":
+            self.tec.trip(_OVER_CURRENT)
+        elif fault == "tec-over-temperature":
+            self.tec.trip(_OBJECT_TOO_HOT)
+        elif fault == "amplifier-trips":
+            self.amplifier.trip()
+
+
+class _Event:
+    """An event that happens once, at its time; a `Timed` part of the world."""
+
+    def __init__(self, instant: float, happen: Callable[[], None]) -> None:
+        self._due = instant
+        self._happen = happen
+
+    def deadline(self) -> float:
+        """Return when it is due, s."""
+        return self._due
+
+    def expire(self) -> None:
+        """Let it happen."""
+        self._due = math.inf
+        self._happen()
+
+
+class DirectSettings(DriverSettings):
+    """Settings of an instrument that is called directly."""
+
+    port: str = Field(description="emulated://NAME of an instrument of a laboratory with `direct`")
+
+
+class Direct(Device):
+    """Base of the instruments that are called directly: the laboratory's own instance, without a wire."""
+
+    Settings: ClassVar[type[DirectSettings]] = DirectSettings
+
+    @classmethod
+    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> Self:  # noqa: ARG003
+        """Return the instrument of the laboratory that is open.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the laboratory has no such instrument, or one of another name.
+        """
+        device = _direct.get(settings.port)
+        if not isinstance(device, cls):
+            known = ", ".join(port for port, each in _direct.items() if isinstance(each, cls))
+            raise DeviceConnectionError(
+                name,
+                f"no such instrument at {settings.port}; "
+                f"there are: {known or 'none: the table [emulation] needs direct = true'}",
+            )
+        # Its signals carry its name, and the rig expects them under its own.
+        if name != device.name:
+            raise DeviceConnectionError(name, f"is called directly and has to be named {device.name}, as it is there")
+        return device
+
+
+class DirectTEC(Direct, EmulatedTEC):
+    """The TEC controller in current mode, without its wire."""
+
+
+class DirectPositionSensor(Direct, EmulatedPositionSensor):
+    """The displacement sensor on the T7, without its wire."""
+
+
+class DirectTemperatureSensor(Direct, EmulatedTemperatureSensor):
+    """A thermistor on the T7, without its wire."""
+
+
+class DirectHighVoltageSupply(Direct, EmulatedHighVoltageSupply):
+    """The amplifier on the T7, without its wire."""
+
+
+class DirectWitness(Direct, PositionSensor):
+    """The deflection itself, without noise: an ideal sensor beside the loop.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    world : World
+        The laboratory's time.
+    plant : HybridCantilever
+        The cantilever.
+    """
+
+    def __init__(self, name: str, world: World, plant: HybridCantilever) -> None:
+        super().__init__(name, world.clock)
+        self._world = world
+        self._plant = plant
+
+    @property
+    def identity(self) -> Identity:
+        """Made up: no such instrument is sold."""
+        return Identity("emulated", "witness", "0", "0")
+
+    def measure(self) -> dict[str, float]:
+        """Return the deflection, m."""
+        with self._world.lock:
+            self._world.advance()
+            return {f"{self.name}_position": self._plant.deflection}
+
+    def safe(self) -> None:
+        """Do nothing: a sensor is safe in any state."""
+
+    def close(self) -> None:
+        """Do nothing: there is no line."""

@@ -1,0 +1,471 @@
+"""The study of the thermo-piezoelectric hybrid: its parts, the model of the whole, and control.
+
+M. Rakotondrabe and I. A. Ivan, *Development and Dynamic Modeling of a New Hybrid Thermopiezoelectric Microactuator*,
+IEEE Transactions on Robotics 26(6), 2010. The paper leaves the controller as future work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.campaign import Campaign, ResultTable, Study, StudyResult
+from bench.identification import measure_errors
+from bench.journal import Record
+from bench.model_file import HybridFile
+from bench.results.figures import Curve, plot_panels, plot_tracking
+from bench.runs import RunResult
+from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE, WITNESS
+from rigs.hybrid.design import Design
+from rigs.hybrid.identification import (
+    REFERENCE,
+    HybridIdentification,
+    Samples,
+    bandwidth_of,
+    identify_hybrid,
+    read_loop,
+    read_loops,
+    sine_at,
+)
+from rigs.hybrid.model import PUBLISHED_DYNAMICS
+
+Floats = npt.NDArray[np.float64]
+
+DIRECT = "hybrid-direct"
+"""Rig of the fast loops: the same laboratory, its instruments called directly."""
+
+FREQUENCIES = (0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008)
+SWEEP_AMPLITUDE = 0.02
+"""Amplitude of the current in the measurement of the bandwidth, A: small, as the gain depends on the current."""
+
+CONTROLLERS = ("hybrid", "hybrid-low-pass", "thermal-feedback", "open-loop")
+REFERENCES = ("staircase", "ramp", "sine-on-ramp")
+SETTLING = 5.0
+"""Time after a move from which a hold counts, s."""
+RESONANCES = (-0.03, 0.0, 0.03)
+"""Deviation of the plant's resonance from the identified one in the fine steps, as a share."""
+ROOM_STEP = 5.0
+"""Step of the room temperature, K."""
+ROOM_STEP_TIME = 30.0
+"""Its time, s."""
+BAND = 0.02
+"""Band within which a step counts as settled, as a share of the step."""
+
+SENSITIVITIES = Design().thermal_sensitivity, Design().piezo_sensitivity
+"""Deflection per rise (m/K) and per voltage (m/V), from geometry."""
+
+
+def _part(name: str, value: str, unit: str, paper: str = "–") -> tuple[str, str, str, str]:
+    return name, paper, value, unit
+
+
+def _actuator(name: str, bandwidth: str, *papers: str) -> tuple[str, ...]:
+    values = bandwidth, f"{{table_3[{name}][resolution_nm]:.1f}} nm", f"{{table_3[{name}][range_um]:.0f}} µm"
+    return (name, *(cell for pair in zip(papers, values, strict=True) for cell in pair))
+
+
+TABLES = (
+    ResultTable(
+        "the parts",
+        ("", "paper", "bench", "unit"),
+        (
+            _part("thermal sensitivity f_s, from geometry", "{geometry[thermal_um_per_K]:.3f}", "µm/K"),
+            _part("piezo sensitivity d_p, from geometry", "{geometry[piezo_um_per_V]:.4f}", "µm/V"),
+            _part("thermal bandwidth", "{thermal[bandwidth_mHz]:.2f}", "mHz", "4"),
+            _part(
+                "swing at -0.1 and 0.1 A (Fig. 13)",
+                "{thermal[swing_um][up]:.0f} and {thermal[swing_um][down]:.0f}",
+                "µm",
+                "> 100",
+            ),
+            _part("network, RMS of the base (Fig. 13)", "{network[base_rms_K]:.3f}", "K"),
+            _part(
+                "polynomial of order {polynomial_order}, RMS (Fig. 14)", "{polynomial_rms_um:.3f}", "µm", "order 4"
+            ),
+            _part("15 plays, RMS (Fig. 15)", "{prandtl_ishlinskii_rms_percent:.2f}", "%"),
+            _part(
+                "D(s), real pole and resonance (Fig. 16)",
+                "{dynamics[poles_Hz][0]:.1f} and {dynamics[poles_Hz][1]:.1f}",
+                "Hz",
+                " and ".join(
+                    f"{pole / (2 * np.pi):.1f}"
+                    for pole in (PUBLISHED_DYNAMICS.real_pole, PUBLISHED_DYNAMICS.frequency)
+                ),
+            ),
+            _part(
+                "D(s), DC gain over the static one", "{dynamics[dc_gain]:.3f}", "1", f"{PUBLISHED_DYNAMICS.gain:.3f}"
+            ),
+            _part("D(s), overshoot", "{dynamics[overshoot_percent]:.1f}", "%", "26.5"),
+            _part("model of the whole by itself (eq. 22), RMS", "{whole[rms_um]:.2f} of {whole[span_um]:.0f}", "µm"),
+        ),
+    ),
+    ResultTable(
+        "Table III: bandwidth (-3 dB), resolution (RMS error of a hold), range",
+        ("actuator", "paper", "bench", "paper", "bench", "paper", "bench"),
+        (
+            _actuator("piezo", "{table_3[piezo][bandwidth_Hz]:.0f} Hz", "> 600 Hz", "< 100 nm", "10 µm"),
+            _actuator("thermal", "{thermal[bandwidth_mHz]:.1f} mHz", "4 mHz", "1 µm", "> 100 µm"),
+            _actuator(
+                "hybrid",
+                "{thermal[bandwidth_mHz]:.1f} mHz and {table_3[hybrid][bandwidth_Hz]:.0f} Hz",
+                "4 mHz and > 600 Hz",
+                "< 100 nm",
+                "> 110 µm",
+            ),
+        ),
+    ),
+    ResultTable(
+        "six moves at 3 µm/s over {control[range_um]:.0f} µm, true errors in nm",
+        ("controller", "hold RMS", "hold max", "move RMS", "move max"),
+        [
+            (
+                name,
+                *(
+                    f"{{controllers[{name}][{part}_{what}_nm]:.1f}}"
+                    for part in ("hold", "move")
+                    for what in ("rms", "max")
+                ),
+            )
+            for name in CONTROLLERS
+        ],
+    ),
+    ResultTable(
+        "hybrid controller, true errors in nm",
+        ("reference", "RMS", "max"),
+        [
+            *((name, *(f"{{references[{name}][{what}_nm]:.1f}}" for what in ("rms", "max"))) for name in REFERENCES),
+            (f"hold, room steps by {ROOM_STEP:g} K", "–", "{room_step_nm:.1f}"),
+        ],
+    ),
+    ResultTable(
+        "fine step of 5 µm at 20 kHz",
+        ("resonance off by", "settling (2 %) / ms", "overshoot / %", "RMS afterwards / nm"),
+        [
+            (
+                f"{offset:+.0%}",
+                *(
+                    f"{{fine_steps[{offset:+.0%}][{what}]:{digits}}}"
+                    for what, digits in (("settling_ms", ".2f"), ("overshoot_percent", ".2f"), ("rms_nm", ".1f"))
+                ),
+            )
+            for offset in RESONANCES
+        ],
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Result of a reference: times (s), reference and true deflection (m), each of shape (N,)."""
+
+    times: Floats
+    reference: Floats
+    deflection: Floats
+
+    @property
+    def errors(self) -> Floats:
+        """Deflection less reference, m."""
+        return self.deflection - self.reference
+
+    @property
+    def moving(self) -> npt.NDArray[np.bool_]:
+        """Where the reference moves."""
+        return np.abs(np.gradient(self.reference, self.times)) > 1e-12
+
+    @property
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Where the reference has rested for `SETTLING`, but for the rest at the beginning."""
+        moving = self.moving
+        last = np.maximum.accumulate(np.where(moving, self.times, -np.inf))
+        return ~moving & np.isfinite(last) & (self.times - last >= SETTLING)
+
+    def measures(self, chosen: npt.NDArray[np.bool_]) -> dict[str, float]:
+        """Return RMS and greatest error (nm) of the chosen samples; nan if there is none."""
+        errors = self.errors[chosen] * 1e9
+        if not errors.size:
+            return {"rms_nm": float("nan"), "max_nm": float("nan")}
+        return {"rms_nm": float(np.sqrt(np.mean(errors**2))), "max_nm": float(np.abs(errors).max())}
+
+    def summary(self) -> dict[str, float]:
+        """Return RMS and greatest error in holds and moves, nm; nan where there is none."""
+        parts = {"hold": self.held, "move": self.moving}
+        return {
+            f"{part}_{key}": value for part, chosen in parts.items() for key, value in self.measures(chosen).items()
+        }
+
+
+class _Runs(NamedTuple):
+    """The runs of the characterization, in their order; the sweep is for the bandwidth."""
+
+    sine: RunResult
+    steps: RunResult
+    static: RunResult
+    loops: RunResult
+    step: RunResult
+    whole: RunResult
+    sweep: RunResult
+
+
+def _carry_out(campaign: Campaign) -> StudyResult:
+    frequencies = ", ".join(map(str, FREQUENCIES))
+    sweep = {"amplitude": str(SWEEP_AMPLITUDE), "frequencies": frequencies, "periods": "3"}
+    runs = _Runs(
+        *(
+            campaign.run(protocol, settings)
+            for protocol, settings in (
+                ("current-sine", {}),
+                ("current-steps", {}),
+                ("thermomechanical", {}),
+                ("piezo-loops", {}),
+                ("piezo-step", {}),
+                ("hybrid-excitation", {}),
+                ("current-sine", sweep),
+            )
+        )
+    )
+    sources = [run.folder for run in (runs.steps, runs.static, runs.loops, runs.step)]
+    found = identify_hybrid(*sources)
+    model = campaign.folder / "hybrid.json"
+    HybridFile(found.model, {"sources": [folder.name for folder in sources]}).save(model)
+
+    # Only the hybrid controller needs long holds.
+    tracked = {
+        name: _track(campaign, model, {"controller": name, "hold": "60" if name == "hybrid" else "15"})
+        for name in CONTROLLERS
+    }
+    slow = {"speed": "0.5e-6", "low": "-10e-6", "high": "10e-6", "hold": "10"}
+    references = {
+        name: _track(campaign, model, {"reference": name, **({"hold": "15"} if name == "staircase" else slow)})
+        for name in REFERENCES
+    }
+    room = _track(
+        campaign,
+        model,
+        {"reference": "hold", "hold": "120"},
+        {"emulation.ambient_step": str(ROOM_STEP), "emulation.ambient_step_time": str(ROOM_STEP_TIME)},
+    )
+    fine = {f"{offset:+.0%}": _fine_step(campaign, model, offset) for offset in RESONANCES}
+
+    values: dict[str, Any] = {
+        "geometry": dict(
+            zip(("thermal_um_per_K", "piezo_um_per_V"), (value * 1e6 for value in SENSITIVITIES), strict=True)
+        ),
+        "thermal": _thermal(runs),
+        "polynomial_rms_um": found.order.rms[found.order.order - 1] * 1e6,
+        "polynomial_order": found.order.order,
+        "polynomial_rms_um_by_order": [value * 1e6 for value in found.order.rms],
+        "prandtl_ishlinskii_rms_percent": found.piezo.errors.rms_percent,
+        "dynamics": _dynamics(found),
+        "network": {
+            "base_rms_K": found.network.base.rms,
+            "tip_rms_K": found.network.tip.rms,
+            "bandwidth_mHz": found.model.bandwidth() * 1e3,
+        },
+        "whole": _validate(found, runs.whole),
+        "control": _control(tracked["hybrid"], fine),
+        "controllers": {name: tracking.summary() for name, tracking in tracked.items()},
+        "references": {name: tracking.measures(tracking.times > SETTLING) for name, tracking in references.items()},
+        "room_step_nm": room.measures(room.times > ROOM_STEP_TIME)["max_nm"],
+        "fine_steps": fine,
+    }
+    values["table_3"] = _table_3(values, found, runs.loops)
+    figures = tuple(_draw(campaign, found, runs, tracked))
+    return StudyResult(values, TABLES, figures)
+
+
+def _track(
+    campaign: Campaign, model: Path, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
+) -> Tracking:
+    run = campaign.run("hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=DIRECT)
+    samples = read_loop(run.folder)
+    return Tracking(samples.times, samples["reference"], samples[WITNESS])
+
+
+def _fine_step(campaign: Campaign, model: Path, offset: float) -> dict[str, float]:
+    """Carry out a fine step; return settling time (ms), overshoot (%) and the RMS error afterwards (nm)."""
+    run = campaign.run(
+        "fine-step",
+        {"model": str(model), "witness": "true"},
+        {"emulation.resonance_offset": str(offset)},
+        rig=DIRECT,
+    )
+    samples = read_loop(run.folder)
+    reference, deflection = samples["reference"], samples[WITNESS]
+    height = float(reference[-1] - reference[0])
+    start = int(np.flatnonzero(reference != reference[0])[0])
+    errors = (deflection - reference[-1])[start:] / height
+    outside = np.flatnonzero(np.abs(errors) > BAND)
+    settled = int(outside[-1]) + 1 if outside.size else 0
+    return {
+        "settling_ms": settled * samples.period * 1e3,
+        "overshoot_percent": max(0.0, float(errors.max()) * 100.0),
+        "rms_nm": float(np.sqrt(np.mean((errors[len(errors) // 2 :] * height) ** 2)) * 1e9),
+    }
+
+
+def _control(tracking: Tracking, fine: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Return the results of the hybrid controller; of the fine steps the worst."""
+    summary = tracking.summary()
+    return {
+        **{key: summary[key] for key in ("hold_rms_nm", "hold_max_nm", "move_rms_nm")},
+        "range_um": float(np.ptp(tracking.reference[tracking.held]) * 1e6),
+        **{
+            f"fine_step_{key}": max(values[key] for values in fine.values())
+            for key in ("settling_ms", "overshoot_percent")
+        },
+    }
+
+
+def _thermal(runs: _Runs) -> dict[str, Any]:
+    deflection = read_loop(runs.steps.folder)[DEFLECTION]
+    by_label = read_loops(runs.sweep.folder)
+    gains = np.array([abs(sine_at(by_label[f"{f:g} Hz"], DEFLECTION, f)) for f in FREQUENCIES])
+    rest = float(deflection[0])
+    return {
+        "bandwidth_mHz": bandwidth_of(np.array(FREQUENCIES), gains) * 1e3,
+        "swing_um": {"up": float(deflection.max() - rest) * 1e6, "down": float(rest - deflection.min()) * 1e6},
+    }
+
+
+def _dynamics(found: HybridIdentification) -> dict[str, Any]:
+    dynamics = found.dynamics.model
+    top = float(found.piezo.voltages.max())
+    # The static operator's response to the same step, from rest.
+    static = float(np.ptp(found.model.hysteresis.evaluate([0.0, top])))
+    return {
+        "poles_Hz": [dynamics.real_pole / (2.0 * np.pi), dynamics.frequency / (2.0 * np.pi)],
+        "dc_gain": dynamics.gain * top / static,
+        "overshoot_percent": dynamics.measure_step().overshoot * 100.0,
+        "gain_um_per_V": dynamics.gain * 1e6,
+    }
+
+
+def _validate(found: HybridIdentification, whole: RunResult) -> dict[str, float]:
+    """Simulate the whole model open-loop on the run with heat and voltage at once; return the errors, µm."""
+    samples = read_loop(whole.folder)
+    response = found.model.simulate(
+        samples[CURRENT], samples[VOLTAGE], samples.period, float(np.mean(samples[BASE][:1]))
+    )
+    errors = measure_errors(samples[DEFLECTION] - samples[DEFLECTION][0], response.deflections)
+    return {"rms_um": errors.rms * 1e6, "max_um": errors.maximum * 1e6, "span_um": errors.span * 1e6}
+
+
+def _table_3(values: Mapping[str, Any], found: HybridIdentification, loops: RunResult) -> dict[str, dict[str, float]]:
+    """Return bandwidth (Hz), resolution (nm, RMS error of a hold) and range (µm) of the three actuators."""
+    fine = found.dynamics.model.bandwidth()
+    reach = float(np.ptp(read_loop(loops.folder)[DEFLECTION])) * 1e6
+    # Up and down at 0.1 A: the paper's temperature variation of 20 °C.
+    heat = sum(values["thermal"]["swing_um"].values())
+    rows = {
+        "piezo": (fine, values["fine_steps"]["+0%"]["rms_nm"], reach),
+        "thermal": (
+            values["thermal"]["bandwidth_mHz"] * 1e-3,
+            values["controllers"]["thermal-feedback"]["hold_rms_nm"],
+            heat,
+        ),
+        "hybrid": (fine, values["control"]["hold_rms_nm"], heat + reach),
+    }
+    keys = ("bandwidth_Hz", "resolution_nm", "range_um")
+    return {name: dict(zip(keys, row, strict=True)) for name, row in rows.items()}
+
+
+class _Panel(NamedTuple):
+    """One figure of curves: its name, the axis labels, and the curves."""
+
+    name: str
+    horizontal: str
+    vertical: str
+    curves: list[Curve]
+
+
+def _panels(found: HybridIdentification, runs: _Runs) -> Iterator[_Panel]:
+    """Yield the paper's figures."""
+    warmth, bending = "temperature of the base / °C", "deflection / µm"
+
+    def compared(samples: Samples, horizontal: Floats, shown: slice = slice(None)) -> list[Curve]:
+        """Return measured and simulated temperature of the base, with the air as identified."""
+        network = found.network.network
+        base = network.simulate(samples[CURRENT], samples.period, found.network.ambient)[:, 2]
+        return [
+            Curve("measured", horizontal[shown], samples[BASE][shown]),
+            Curve("model", horizontal[shown], base[shown]),
+        ]
+
+    around, stepped = read_loop(runs.sine.folder), read_loop(runs.steps.folder)
+    second = slice(len(around.table) // 2, None)
+    yield _Panel("figure-12-static-temperature", "current / A", warmth, compared(around, around[CURRENT], second))
+    yield _Panel("figure-13-temperature-steps", "time / s", warmth, compared(stepped, stepped.times))
+    with Record(runs.static.folder) as record:
+        curve = record.steps()
+    rises = curve[TIP] - REFERENCE
+    ordered = np.sort(rises)
+    by_heat, by_voltage = SENSITIVITIES
+    yield _Panel(
+        "figure-14-thermomechanical",
+        "temperature of the tip less 22 °C / K",
+        bending,
+        [
+            Curve("measured", rises, curve[DEFLECTION] * 1e6),
+            Curve("linear, from geometry", ordered, by_heat * ordered * 1e6),
+            Curve(f"polynomial, order {found.order.order}", ordered, found.model.polynomial.evaluate(ordered) * 1e6),
+        ],
+    )
+    piezo = found.piezo
+    yield _Panel(
+        "figure-15-hysteresis",
+        "voltage / V",
+        bending,
+        [
+            Curve("measured", piezo.voltages, piezo.deflections * 1e6),
+            Curve("Prandtl-Ishlinskii", piezo.voltages, piezo.operator.evaluate(piezo.voltages) * 1e6),
+            Curve("linear, from geometry", piezo.voltages, by_voltage * piezo.voltages * 1e6),
+        ],
+    )
+    fast = read_loop(runs.step.folder)
+    yield _Panel(
+        "figure-16-step",
+        "time / ms",
+        bending,
+        [
+            Curve("measured", fast.times * 1e3, fast[DEFLECTION] * 1e6),
+            Curve("D(s)", fast.times * 1e3, (fast[DEFLECTION] - found.dynamics.residuals) * 1e6),
+        ],
+    )
+
+
+def _draw(
+    campaign: Campaign, found: HybridIdentification, runs: _Runs, tracked: Mapping[str, Tracking]
+) -> Iterator[Path]:
+    """Draw all figures; yield their files."""
+    for panel in _panels(found, runs):
+        yield (path := campaign.figure(panel.name))
+        plot_panels(
+            path, {"": panel.curves}, horizontal_label=panel.horizontal, vertical_label=panel.vertical, columns=1
+        )
+    for name, tracking in tracked.items():
+        # Without the first seconds, in which the controller finds the start.
+        shown = tracking.times > SETTLING
+        yield (path := campaign.figure(f"control-moves-{name}"))
+        plot_tracking(
+            path,
+            tracking.reference[shown] * 1e6,
+            {name: tracking.deflection[shown] * 1e6},
+            horizontal=tracking.times[shown],
+            horizontal_label="time / s",
+            output_label="deflection / µm",
+            error_label="error / µm",
+        )
+
+
+STUDY = Study(
+    rig="hybrid",
+    summary="Thermo-piezoelectric hybrid: parts, model of the whole, and control to nanometres over its range",
+    description="Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric "
+    "microactuator, 2010.",
+    carry_out=_carry_out,
+)

@@ -1,0 +1,309 @@
+"""Emulated laboratories for artificial muscles: one muscle at a time in a test frame, and the instruments around it.
+
+The muscle hangs from a load cell. Its lower end, where the magnet of a position sensor sits, either carries
+weights or is fastened to the drum of a servo; the operator changes between the two. A PWM supply drives the
+muscle, a fan blows at it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from bench.clock import Clock
+from bench.errors import ConfigurationError
+from bench.rig_file import LaboratorySettings
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_drum import EmulatedDrum
+from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
+from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.laboratory import EmulatedLaboratory, Event
+from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
+from sim_devices.plants.sma import SMAParameters, SMAWire
+from sim_devices.transducers.magnet import RatiometricSensor
+from sim_devices.wire.canopen_slcan import CanopenSlcanServer
+from sim_devices.wire.dynamixel2 import Dynamixel2Server
+from sim_devices.wire.modbus_rtu import ModbusRtuServer
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.world import World
+
+LOAD, STAGE = "load", "stage"
+"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, or fasten it to the stage."""
+
+FAN_LINE = 0
+"""Digital line of the T7 that switches the fan: FIO0, on when high."""
+
+_HEARTBEAT_TIME = 0x1017
+"""Object of the supply with the period of its heartbeat, ms; 0 for none."""
+_BROKEN_CELL = -1e3
+"""Reading of a load cell with a broken wire, N."""
+
+FaultName = Literal[
+    "none",
+    "silent-supply",
+    "missing-heartbeat",
+    "servo-overload",
+    "broken-load-cell",
+    "forgotten-load",
+    "heavy-load",
+    "unplugged-sensor",
+]
+
+
+class MusclePlant(Protocol):
+    """What frame and instruments need of a muscle."""
+
+    def advance(self, dt: float) -> None:
+        """Integrate over `dt` seconds."""
+
+    def apply(self, voltage: float) -> None:
+        """Apply a voltage, V."""
+
+    def blow(self, on: bool) -> None:
+        """Switch the fan."""
+
+    def hang(self, load_newton: float) -> None:
+        """Hang a dead load on the end."""
+
+    def clamp(self, length_metre: float) -> None:
+        """Hold the end at a position, m from rest."""
+
+    @property
+    def current(self) -> float:
+        """Current, A."""
+
+    @property
+    def force(self) -> float:
+        """Tension, N."""
+
+    @property
+    def position(self) -> float:
+        """Position of the end, m from rest."""
+
+
+class MuscleLaboratorySettings(LaboratorySettings, ABC):
+    """Keys of the table `[emulation]` that all these laboratories have."""
+
+    battery_voltage: float = Field(default=10.0, gt=0, le=60, description="voltage behind the PWM supply, V")
+    supply_watchdog: float = Field(default=5.0, ge=0, le=65, description="as set in the supply by ^RWD, s")
+    drum_radius: float = Field(default=4.5e-3, gt=0, le=0.1, description="radius of the servo's drum, m")
+    drum_zero_counts: int = Field(
+        default=2200, ge=0, le=4095, description="counts of the servo where the muscle is at rest"
+    )
+    rest_position: float = Field(
+        default=17.5e-3, gt=0, le=35e-3, description="where along its stroke the sensor sees the muscle at rest, m"
+    )
+    force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
+    fault: FaultName = Field(
+        default="none",
+        description="what goes wrong at `fault_time`; forgotten-load (the operator hangs nothing) and heavy-load "
+        "(twice the weight) from then on",
+    )
+    fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
+
+    @abstractmethod
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the muscle of this laboratory."""
+
+
+class Frame:
+    """The muscle with its load or stage: a `sim_devices.world.Plant`.
+
+    Parameters
+    ----------
+    muscle : MusclePlant
+        The specimen; it begins without a load.
+
+    Attributes
+    ----------
+    drum : EmulatedDrum or None
+        The stage's drum, once it is there.
+    t7 : EmulatedT7 or None
+        The instrument that switches the fan, once it is there.
+    """
+
+    def __init__(self, muscle: MusclePlant) -> None:
+        self.muscle = muscle
+        self.drum: EmulatedDrum | None = None
+        self.t7: EmulatedT7 | None = None
+        self._fastened = False
+
+    def hang(self, newton: float) -> None:
+        """Take the end off the stage, if it is there, and hang a load on it."""
+        self._fastened = False
+        self.muscle.hang(newton)
+
+    def fasten(self) -> None:
+        """Take the load off and fasten the end to the stage, so that both stand at the same number of metres."""
+        self._fastened = True
+
+    def advance(self, dt: float) -> None:
+        """Integrate over `dt` seconds, with the end following the stage."""
+        if self.t7 is not None:
+            self.muscle.blow(self.t7.dio_level(FAN_LINE))
+        if self._fastened and self.drum is not None:
+            # A servo on its way is due every 20 ms, so that the world advances in pieces as short as that.
+            self.muscle.clamp(self.drum.position_after(dt))
+        self.muscle.advance(dt)
+
+
+class MuscleLaboratory(EmulatedLaboratory):
+    """A laboratory with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
+
+    Parameters
+    ----------
+    settings : MuscleLaboratorySettings
+        From the rig file.
+    clock : Clock
+        The clock of the run.
+    seed : int
+        Seed of the room and of the noise; the specimen has its own.
+    """
+
+    Settings: ClassVar[type[MuscleLaboratorySettings]]
+
+    def __init__(self, settings: MuscleLaboratorySettings, clock: Clock, seed: int) -> None:
+        if not isinstance(settings, self.Settings):
+            raise TypeError(f"settings: expected {self.Settings.__name__}, got {type(settings).__name__}")
+        # One stream a source of noise: how often one instrument is read must not change the readings of another.
+        plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
+        self._settings = settings
+        self.muscle = settings.make_muscle(plant)
+        self.frame = Frame(self.muscle)
+        self.world = World(self.frame, clock)
+        self._cell_is_broken = False
+        self.supply = EmulatedRoboteq(
+            "supply",
+            self.world,
+            self.muscle,
+            battery_voltage=settings.battery_voltage,
+            watchdog=settings.supply_watchdog,
+            rng=supply,
+        )
+        self.load_cell = EmulatedDAD141(
+            "load_cell",
+            self.world,
+            self._sensed_force,
+            rng=cell,
+            weight_limits=(-5.0, 50.0),
+            noise=settings.force_noise,
+        )
+        self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
+        self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
+        self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
+        self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
+        self.frame.t7 = self.t7
+        if settings.fault != "none":
+            self.world.add(Event(settings.fault_time, self._go_wrong))
+        super().__init__(
+            "muscle laboratory",
+            {
+                "t7": ModbusTcpServer(self.t7),
+                "supply": CanopenSlcanServer(self.supply),
+                "load_cell": ModbusRtuServer(self.load_cell),
+                "stage": Dynamixel2Server([self.servo]),
+            },
+            clock,
+        )
+
+    def operate(self, task: str, value: float) -> None:
+        """Hang a load of `value` N on the muscle, or fasten its end to the stage.
+
+        Raises
+        ------
+        ConfigurationError
+            If it is another task, or the muscle does not bear the load.
+        """
+        if task not in (LOAD, STAGE):
+            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
+        with self.world.lock:
+            self.world.advance()
+            fault = self._settings.fault if self._clock.now() >= self._settings.fault_time else "none"
+            if task == STAGE:
+                self.frame.fasten()
+            elif fault != "forgotten-load":
+                load = 2.0 * value if fault == "heavy-load" else value
+                try:
+                    self.frame.hang(load)
+                except ValueError as error:
+                    raise ConfigurationError(f"a load of {load:g} N cannot be hung on the muscle: {error}") from None
+
+    def _go_wrong(self) -> None:
+        """Make the fault of the settings happen, if it is one of an instant."""
+        fault = self._settings.fault
+        if fault == "silent-supply":
+            self.supply.unplug()
+        elif fault == "missing-heartbeat":
+            self.supply.write_object(_HEARTBEAT_TIME, 0)
+        elif fault == "unplugged-sensor":
+            self.magnet.supply_volts = 0.0
+        elif fault == "servo-overload":
+            self.servo.trip(HardwareError.OVERLOAD)
+        elif fault == "broken-load-cell":
+            self._cell_is_broken = True
+
+    def _sensed_force(self) -> float:
+        return _BROKEN_CELL if self._cell_is_broken else self.muscle.force
+
+
+class _ThermalSettings(MuscleLaboratorySettings):
+    ambient_deviation: float = Field(
+        default=0.3, ge=0, le=5, description="standard deviation of the room temperature, K"
+    )
+
+
+class SMALaboratorySettings(_ThermalSettings):
+    """Keys of the laboratory with the SMA wire."""
+
+    specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="which specimen it is")
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the wire."""
+        return SMAWire(SMAParameters(specimen_seed=self.specimen_seed, ambient_sd=self.ambient_deviation), rng)
+
+
+class SMALaboratory(MuscleLaboratory):
+    """The laboratory with a shape-memory-alloy wire."""
+
+    Settings = SMALaboratorySettings
+
+
+class McKibbenLaboratorySettings(MuscleLaboratorySettings):
+    """Keys of the laboratory with the McKibben muscle."""
+
+    pressure_deviation: float = Field(
+        default=500.0, ge=0, le=1e5, description="standard deviation of the regulated pressure, Pa"
+    )
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the muscle."""
+        return McKibbenMuscle(McKibbenParameters(supply_sd=self.pressure_deviation), rng)
+
+
+class McKibbenLaboratory(MuscleLaboratory):
+    """The laboratory with a McKibben muscle, whose pressure a proportional valve regulates to the voltage.
+
+    The T7's line opens a quick exhaust where the other muscles have a fan.
+    """
+
+    Settings = McKibbenLaboratorySettings
+
+
+class CoiledPolymerLaboratorySettings(_ThermalSettings):
+    """Keys of the laboratory with the super-coiled polymer muscle."""
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the muscle."""
+        return CoiledPolymerMuscle(CoiledPolymerParameters(ambient_sd=self.ambient_deviation), rng)
+
+
+class CoiledPolymerLaboratory(MuscleLaboratory):
+    """The laboratory with a super-coiled polymer muscle."""
+
+    Settings = CoiledPolymerLaboratorySettings

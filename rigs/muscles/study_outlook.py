@@ -1,0 +1,70 @@
+"""The study of the muscles in the outlook of Zhang and Yip 2017: a McKibben and a super-coiled polymer muscle.
+
+Protocols and models are those of the SMA wire, see `rigs.muscles.characterization`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench.campaign import Campaign, Study, StudyResult
+from bench.results.figures import Curve, plot_panels
+from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths
+
+MUSCLES = {
+    "mckibben": ("McKibben muscle", "mckibben"),
+    "coiled_polymer": ("super-coiled polymer muscle", "coiled-polymer"),
+}
+"""Name in tables, and rig, by the key in the JSON."""
+
+TABLES = tuple(
+    errors_table(f"{title}: errors, average / RMS in % of the range", f"{key}[{{}}]")
+    for key, (title, _) in MUSCLES.items()
+)
+
+
+def carry_out(campaign: Campaign) -> StudyResult:
+    """Characterize both muscles and identify the models.
+
+    The values are errors in percent of the range by muscle, and `fv`, `lv`, `lf` and `verification`.
+
+    Raises
+    ------
+    BenchError
+        If a run did not complete; its record is kept.
+    """
+    values, figures = {}, []
+    for key, (_, rig) in MUSCLES.items():
+        part = campaign.part(key, rig)
+        measured = characterize(part)
+        measured.keep_model(part)
+        values[key] = measured.errors_json()
+        figures += _draw(part, measured)
+    return StudyResult(values, TABLES, tuple(figures))
+
+
+STUDY = Study(
+    None,
+    "McKibben and super-coiled polymer muscles: the same protocols and models as for the SMA wire.",
+    "Runs force-voltage, length-voltage, length-force and length-verification on the rigs mckibben and "
+    "coiled-polymer, and identifies the models. The outlook of Zhang and Yip, 2017.",
+    carry_out,
+)
+
+
+def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
+    """Draw the three hysteresis relationships as they were measured."""
+    voltages, forces, _ = measured.resting
+    paths = [campaign.figure("force-voltage")]
+    plot_panels(
+        paths[0],
+        {"ends held": [Curve("", voltages, forces)]},
+        horizontal_label="voltage / V",
+        vertical_label="force / N",
+        columns=1,
+    )
+    for kind in ("length-voltage", "length-force"):
+        paths.append(campaign.figure(kind))
+        chosen = [series for series in measured.series if series.kind == kind]
+        plot_lengths(paths[-1], kind, chosen, {"measured": [s.lengths for s in chosen]}, columns=1)
+    return paths

@@ -1,0 +1,203 @@
+"""The study of the SMA wire: characterization, models, verification, and control of length and force.
+
+Follows Zhang and Yip 2017, see `rigs.muscles.characterization`; the control is beyond the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.identification.two_stage import predict_series
+from bench.results.figures import (
+    Curve,
+    plot_densities,
+    plot_errors,
+    plot_panels,
+    plot_sequence_and_errors,
+    plot_tracking,
+)
+from bench.results.tracking import TargetResults
+from rigs.muscles.characterization import (
+    TITLES,
+    Characterization,
+    characterize,
+    errors_table,
+    json_key,
+    plot_lengths,
+)
+from rigs.muscles.identification import FORCE, LENGTH
+
+CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
+LOAD_CHANGE = 1.96
+"""What is hung on and taken off again in the session with a changing load, N."""
+_SHOWN = ("two-stage", "summed", "linear")
+"""The paper's models, which are drawn."""
+
+
+class Quantity(NamedTuple):
+    """What is controlled: its protocol, name, signal, and the unit in which it is printed, `scale` times SI."""
+
+    protocol: str
+    name: str
+    signal: str
+    unit: str
+    scale: float
+
+
+_LENGTH = Quantity("length-control", "length", LENGTH, "mm", 1e3)
+_FORCE = Quantity("force-control", "force", FORCE, "N", 1.0)
+
+
+class ControlSession(NamedTuple):
+    """A task for each controller: its title, what is controlled, and the parameters of the protocol."""
+
+    title: str
+    controlled: Quantity
+    settings: Mapping[str, str]
+
+
+CONTROL = {
+    "length_4.9N": ControlSession("length under 4.90 N", _LENGTH, {"load": "4.9"}),
+    "length_8.82N": ControlSession("length under 8.82 N", _LENGTH, {"load": "8.82"}),
+    "length_changing_load": ControlSession(
+        f"length, load changes by {LOAD_CHANGE} N", _LENGTH, {"load": "4.9", "change": str(LOAD_CHANGE)}
+    ),
+    "force": ControlSession("force, ends held", _FORCE, {}),
+}
+
+TABLES = (
+    errors_table("errors, average / RMS in % of the range", beside_paper=True),
+    ResultTable(
+        "control, 40 targets of 20 s each, absolute errors",
+        ("", "controller", "max", "RMS", "median"),
+        [
+            (
+                f"{session.title}, {session.controlled.unit}" if controller == CONTROLLERS[0] else "",
+                controller,
+                *(f"{{control[{key}][{json_key(controller)}][{what}]:.3f}}" for what in ("max", "rms", "median")),
+            )
+            for key, session in CONTROL.items()
+            for controller in CONTROLLERS
+        ],
+    ),
+)
+
+
+def carry_out(campaign: Campaign) -> StudyResult:
+    """Run the paper's experiments and the control beyond it, and identify the models.
+
+    The values are errors in percent of the range by `fv`, `lv`, `lf` and `verification`, and those of `control` in
+    `units`.
+
+    Raises
+    ------
+    BenchError
+        If a run did not complete; its record is kept.
+    """
+    measured = characterize(campaign)
+    common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
+    reached = {
+        key: {
+            controller: reached_targets(
+                campaign.run(session.controlled.protocol, {"controller": controller, **session.settings, **common}),
+                session.controlled.signal,
+            )
+            for controller in CONTROLLERS
+        }
+        for key, session in CONTROL.items()
+    }
+    measured.keep_model(campaign)
+    return StudyResult(
+        {
+            **measured.errors_json(),
+            "kkt": {
+                json_key(name): max(certificate.kkt_residual for certificate in found.certificates.values())
+                for name, found in measured.models.items()
+            },
+            "control": {
+                key: {
+                    json_key(controller): _errors(results, CONTROL[key].controlled.scale)
+                    for controller, results in entry.items()
+                }
+                for key, entry in reached.items()
+            },
+            "units": {key: session.controlled.unit for key, session in CONTROL.items()},
+        },
+        TABLES,
+        (*_draw(campaign, measured), *_draw_control(campaign, reached)),
+    )
+
+
+STUDY = Study(
+    "sma",
+    "SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.",
+    "Runs force-voltage, length-voltage, length-force and length-verification, identifies the paper's models, and "
+    "brings length and force to 40 targets with each controller. Zhang and Yip, Three-dimensional hysteresis "
+    "modeling of robotic artificial muscles with application to shape memory alloy actuators, 2017.",
+    carry_out,
+)
+
+
+def _errors(results: TargetResults, scale: float) -> dict[str, float]:
+    summary = results.summary()
+    return {key: summary[key] * scale for key in ("max", "rms", "median")}
+
+
+def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
+    voltages, forces, _ = measured.resting
+    models = {name: found for name, found in measured.models.items() if name in _SHOWN}
+    paths = [campaign.figure("figure-06-force-voltage")]
+    fitted = {TITLES[name]: forces - models[name].residuals["force-voltage"] for name in ("two-stage", "linear")}
+    plot_panels(
+        paths[0],
+        {title: [Curve("", voltages, values)] for title, values in {"measured": forces, **fitted}.items()},
+        horizontal_label="voltage / V",
+        vertical_label="force / N",
+        columns=3,
+    )
+    for name, kind in (("figure-07-length-voltage", "length-voltage"), ("figure-08-length-force", "length-force")):
+        paths.append(campaign.figure(name))
+        chosen = [series for series in measured.series if series.kind == kind]
+        modelled = {
+            TITLES[which]: [predict_series(found.model, s) for s in chosen] for which, found in models.items()
+        }
+        plot_lengths(paths[-1], kind, chosen, {"measured": [s.lengths for s in chosen], **modelled})
+    paths.append(campaign.figure("figure-09-densities"))
+    plot_densities(paths[-1], models["two-stage"].model.densities())
+    for panel, kind in (("a", "length-voltage"), ("b", "length-force")):
+        paths.append(campaign.figure(f"figure-10{panel}-errors-{kind}"))
+        residuals = {TITLES[which]: found.residuals[kind] * 1e3 for which, found in models.items()}
+        plot_errors(paths[-1], residuals, error_label="error / mm")
+    paths.append(campaign.figure("figure-11-verification"))
+    plot_sequence_and_errors(
+        paths[-1],
+        np.concatenate([s.voltages for s in measured.verification]),
+        {
+            TITLES[which]: np.concatenate([s.lengths - predict_series(found.model, s) for s in measured.verification])
+            * 1e3
+            for which, found in models.items()
+        },
+        input_label="voltage / V",
+        error_label="error / mm",
+    )
+    return paths
+
+
+def _draw_control(campaign: Campaign, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:
+    paths = []
+    for key, results in reached.items():
+        paths.append(campaign.figure(f"control-{key.replace('_', '-')}"))
+        _, name, _, unit, scale = CONTROL[key].controlled
+        plot_tracking(
+            paths[-1],
+            results[CONTROLLERS[-1]].targets * scale,
+            {controller: each.outputs * scale for controller, each in results.items()},
+            output_label=f"{name} / {unit}",
+            error_label=f"error / {unit}",
+        )
+    return paths

@@ -1,0 +1,69 @@
+"""The emulated VO2 laboratory: a cantilever on a Peltier plate, its TEC controller, and the PSD on a T7."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from bench.clock import Clock
+from bench.rig_file import LaboratorySettings
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.laboratory import EmulatedLaboratory
+from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
+from sim_devices.transducers.photodetector import NormalisedPSD
+from sim_devices.wire.mecom import MeComServer
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.world import World
+
+
+class VO2LaboratorySettings(LaboratorySettings):
+    """Keys of the table `[emulation]`."""
+
+    specimen_seed: int = Field(default=VO2Parameters.specimen_seed, ge=0, description="which specimen it is")
+    session_offset: float = Field(
+        default=0.0, ge=-5, le=5, description="temperature of the film above the plate's, constant in a session, K"
+    )
+    disturbances: bool = Field(default=True, description="whether the film's temperature wanders and drifts")
+    ambient_temperature: float = Field(default=22.0, ge=0, le=40, description="temperature of the room, °C")
+    psd_noise: float = Field(default=5e-3, ge=0, le=1, description="noise of the PSD in one conversion, V rms")
+    volts_per_metre: float = Field(
+        default=1e5, gt=0, description="sensitivity of laser, beam and PSD together, V per m of tip deflection"
+    )
+
+
+class VO2Laboratory(EmulatedLaboratory):
+    """The laboratory with the instruments `tec` (serial, MeCom) and `psd` (Modbus TCP).
+
+    Parameters
+    ----------
+    settings : VO2LaboratorySettings
+        From the rig file.
+    clock : Clock
+        The clock of the run.
+    seed : int
+        Seed of wander, drift and sensor noise; the specimen itself has its own.
+    """
+
+    Settings = VO2LaboratorySettings
+
+    def __init__(self, settings: VO2LaboratorySettings, clock: Clock, seed: int) -> None:
+        # One stream a source of noise: how often one instrument is read must not change the readings of another.
+        plant_stream, tec_stream, psd_stream, t7_stream = np.random.default_rng(seed).spawn(4)
+        specimen = VO2Parameters(
+            specimen_seed=settings.specimen_seed,
+            session_offset=settings.session_offset,
+            ambient_temperature=settings.ambient_temperature,
+        )
+        if not settings.disturbances:
+            specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
+        self.plant = VO2Cantilever(specimen, plant_stream)
+        self.world = World(self.plant, clock)
+        self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
+        detector = NormalisedPSD(
+            lambda: self.plant.tip_deflection, settings.volts_per_metre, settings.psd_noise, rng=psd_stream
+        )
+        self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
+        super().__init__("VO2 laboratory", {"psd": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)

@@ -1,0 +1,324 @@
+"""The study of the VO2-coated microcantilever: characterization, identification, validation, and tracking.
+
+J. Zhang, E. Merced, N. Sepúlveda, X. Tan, *Modeling and Inverse Compensation of Nonmonotonic Hysteresis in
+VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "Zhang et al. 2013".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.errors import DataError
+from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
+from bench.identification import measure_errors
+from bench.journal import Record, add_model
+from bench.modelling import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
+from bench.results.tracking import FollowingResult, TargetResults, following_result
+from bench.runs import RunResult
+
+Floats = npt.NDArray[np.float64]
+
+INPUT = "tec_temperature"
+OUTPUT = "curvature"
+
+SESSION_OFFSET = 0.2
+"""Between the temperatures of film and plate in the validation session, K; its sign alternates with the seed."""
+
+TRACKING_OFFSET = 0.12
+"""The same in the tracking sessions, K."""
+
+PROPOSED = "preisach-nonmonotonic"
+PERIODS = (60, 200)
+"""Periods of the sine that is followed, s."""
+
+
+class PaperModel(NamedTuple):
+    """One of the paper's three models: its title, its name and options here, and the paper's largest errors, 1/m.
+
+    The errors are those of sections IV-B, Figs. 5, 7, 9 and 10.
+    """
+
+    title: str
+    model: str
+    options: Mapping[str, Any]
+    identification: float
+    validation: float
+
+
+MODELS = {
+    "nonmonotonic": PaperModel("proposed model", PROPOSED, {"levels": 20, "plane": (30.0, 70.0)}, 46.8, 108.1),
+    "signed": PaperModel("signed Preisach", "preisach-signed", {"levels": 20, "plane": (21.0, 84.0)}, 80.3, 108.8),
+    "polynomial": PaperModel("polynomial, degree 12", "polynomial", {"degree": 12}, 483.0, 478.1),
+}
+
+CONTROLLERS = {
+    "open_loop_inverse": ("open-loop inverse", "78", "26.7"),
+    "polynomial": ("polynomial look-up", "734.2", "320.6"),
+    "integral": ("integral, no inverse", "–", "–"),
+    "closed_loop_inverse": ("closed-loop inverse", "–", "–"),
+    "latched": ("latched", "–", "–"),
+}
+"""Title, and the paper's largest and RMS error, 1/m (section V-B). With - for _ the keys are names of controllers."""
+
+FOLLOWERS = ("open_loop_inverse", "integral", "closed_loop_inverse")
+
+PARAMETERS = {
+    "c0": ("1026.7", "1/m"),
+    "k0": ("2.8", "1/(m K)"),
+    "k1": ("4.3", "1/(m K)"),
+    "κ−": ("-20", "1/m"),
+    "κ+": ("1828", "1/m"),
+    "κ min": ("-75", "1/m"),
+    "κ max": ("1836", "1/m"),
+}
+"""The paper's parameters of the proposed model, and their units."""
+
+TABLES = (
+    *(
+        ResultTable(
+            title,
+            ("model", "paper max", "bench max", "bench RMS"),
+            [
+                (
+                    model.title,
+                    f"{getattr(model, kind):g}",
+                    f"{{{kind}[{key}][max]:.1f}}",
+                    f"{{{kind}[{key}][rms]:.1f}}",
+                )
+                for key, model in MODELS.items()
+            ],
+            note,
+        )
+        for kind, title, note in (
+            ("identification", "identification, errors in 1/m (Figs. 5, 7 and 9)", ""),
+            (
+                "validation",
+                "validation, errors in 1/m (Fig. 10; session offset {session_offset:+g} K)",
+                "KKT residuals: " + ", ".join(f"{model.title} {{kkt[{key}]:.0e}}" for key, model in MODELS.items()),
+            ),
+        )
+    ),
+    ResultTable(
+        "the proposed model's parameters",
+        ("", "paper", "bench", "unit"),
+        [(name, paper, f"{{parameters[{name}]:.2f}}", unit) for name, (paper, unit) in PARAMETERS.items()],
+    ),
+    ResultTable(
+        "tracking of 60 targets, errors in 1/m (Fig. 12; session offset {tracking_offset:+g} K)",
+        ("controller", "paper max", "paper RMS", "max", "RMS", "median", "s/target"),
+        [
+            (
+                *texts,
+                *(f"{{tracking[{key}][{what}]:.2f}}" for what in ("max", "rms", "median")),
+                f"{{tracking[{key}][seconds_per_target]:.1f}}",
+            )
+            for key, texts in CONTROLLERS.items()
+        ],
+    ),
+    ResultTable(
+        "following a modulated sine at 2 Hz, errors in 1/m",
+        ("controller", *(f"{what}, {period} s" for period in PERIODS for what in ("max", "RMS"))),
+        [
+            (
+                CONTROLLERS[key][0],
+                *(
+                    f"{{continuous[period_{period}][{key}][{what}]:.1f}}"
+                    for period in PERIODS
+                    for what in ("max", "rms")
+                ),
+            )
+            for key in FOLLOWERS
+        ],
+    ),
+)
+
+
+def carry_out(campaign: Campaign) -> StudyResult:
+    """Run the paper's experiments, identify its models, and track with every controller.
+
+    Raises
+    ------
+    BenchError
+        If a run did not complete; its record is kept.
+    """
+    folder = campaign.folder
+    sign = 1.0 if campaign.seed % 2 == 0 else -1.0
+
+    def session(protocol: str, settings: Mapping[str, str], offset: float) -> RunResult:
+        return campaign.run(protocol, settings, {"emulation.session_offset": str(sign * offset)})
+
+    def model_path(name: str) -> str:
+        return str(folder / f"{name}.json")
+
+    characterization = session("damped-oscillation", {}, 0.0)
+    validation = session("random-validation", {}, SESSION_OFFSET)
+    models: dict[str, IdentifiedFile] = {}
+    for key, (_, name, options, *_) in MODELS.items():
+        models[key] = identify_file(
+            characterization.folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
+        )
+        models[key].file.save(Path(model_path(name)))
+    with Record(validation.folder) as record:
+        steps = record.steps()
+        inputs, outputs = steps[INPUT], steps[OUTPUT]
+    predictions = {key: predict(model.file, inputs) for key, model in models.items()}
+
+    tracking_runs = {
+        key: session(
+            "tracking",
+            {
+                "model": model_path("polynomial" if key == "polynomial" else PROPOSED),
+                "controller": key.replace("_", "-"),
+                "sequence_seed": str(campaign.seed + 1),
+            },
+            TRACKING_OFFSET,
+        )
+        for key in CONTROLLERS
+    }
+    following_runs = {
+        (period, key): session(
+            "following",
+            {"model": model_path(PROPOSED), "controller": key.replace("_", "-"), "period": str(period)},
+            TRACKING_OFFSET,
+        )
+        for period in PERIODS
+        for key in FOLLOWERS
+    }
+    reached = {key: reached_targets(run, OUTPUT) for key, run in tracking_runs.items()}
+    followed = {key: _followed(run) for key, run in following_runs.items()}
+
+    for run in (characterization, validation):
+        with Record(run.folder) as record:
+            finished = float(record.meta["finished"])
+        # The proposed model last: the recording shows the density of the newest.
+        for model in reversed(models.values()):
+            add_model(run.folder, model.file.name, finished, model.file.to_json())
+    for run in (*tracking_runs.values(), *following_runs.values()):
+        add_model(run.folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
+    return StudyResult(
+        {
+            "session_offset": sign * SESSION_OFFSET,
+            "tracking_offset": sign * TRACKING_OFFSET,
+            "identification": {key: errors_json(model.identification.errors) for key, model in models.items()},
+            "validation": {
+                key: errors_json(measure_errors(outputs, predicted)) for key, predicted in predictions.items()
+            },
+            "kkt": {key: model.identification.certificate.kkt_residual for key, model in models.items()},
+            "parameters": _parameters(models["nonmonotonic"].file.operator),
+            "tracking": {key: results.summary() for key, results in reached.items()},
+            "continuous": {
+                f"period_{period}": {key: followed[period, key].summary() for key in FOLLOWERS} for period in PERIODS
+            },
+        },
+        TABLES,
+        (
+            *_draw_models(campaign, models, inputs, outputs, predictions),
+            *_draw_control(campaign, reached, followed),
+        ),
+    )
+
+
+STUDY = Study(
+    "vo2",
+    "VO2 microactuator: characterization, identification, validation and tracking, beside the paper's tables.",
+    "Runs damped-oscillation, identifies the paper's three models, validates them in a session with an offset, and "
+    "tracks 60 targets and a modulated sine with each controller. Zhang et al., Modeling and inverse compensation of "
+    "nonmonotonic hysteresis in VO2-coated microactuators, 2013.",
+    carry_out,
+)
+
+
+def _followed(run: RunResult) -> FollowingResult:
+    with Record(run.folder) as record:
+        result = following_result(record, OUTPUT)
+    if result is None:
+        raise DataError(f"{run.folder}: has no reference")
+    return result
+
+
+def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - checked here
+    if not (isinstance(operator, Preisach) and isinstance(operator.reversible, ThermalExpansion)):
+        raise TypeError("expected the non-monotonic model")
+    low, high = float(operator.levels[0]), float(operator.levels[-1])
+    values = (
+        operator.bias,
+        *operator.reversible.coefficients.tolist(),
+        operator.value(MemoryCurve.from_negative_saturation(low)),
+        operator.value(MemoryCurve.from_positive_saturation(high)),
+        *operator.output_range(),
+    )
+    return dict(zip(PARAMETERS, values, strict=True))
+
+
+def _draw_models(
+    campaign: Campaign,
+    models: Mapping[str, IdentifiedFile],
+    inputs: Floats,
+    outputs: Floats,
+    predictions: Mapping[str, Floats],
+) -> list[Path]:
+    temperature, curvature, error = "temperature / °C", "curvature / (1/m)", "error / (1/m)"
+    proposed = models["nonmonotonic"]
+    residuals = {key: model.identification.residuals for key, model in models.items()}
+    paths = [campaign.figure("figure-05a-loops")]
+    plot_loops(
+        paths[0],
+        proposed.inputs,
+        proposed.outputs,
+        proposed.outputs - residuals["nonmonotonic"],
+        input_label=temperature,
+        output_label=curvature,
+    )
+    for errors_figure, density_figure, key in (
+        ("figure-05b-error-proposed", "figure-06-density-proposed", "nonmonotonic"),
+        ("figure-07-error-signed", "figure-08-density-signed", "signed"),
+        ("figure-09-error-polynomial", None, "polynomial"),
+    ):
+        paths.append(campaign.figure(errors_figure))
+        plot_errors(paths[-1], {MODELS[key].title: residuals[key]}, error_label=error)
+        if density_figure is not None:
+            paths.append(campaign.figure(density_figure))
+            plot_densities(paths[-1], models[key].file.operator.densities())
+    paths.append(campaign.figure("figure-10-validation"))
+    plot_sequence_and_errors(
+        paths[-1],
+        inputs,
+        {MODELS[key].title: outputs - predicted for key, predicted in predictions.items()},
+        input_label=temperature,
+        error_label=error,
+    )
+    return paths
+
+
+def _draw_control(
+    campaign: Campaign, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
+) -> list[Path]:
+    plot = partial(plot_tracking, output_label="curvature / (1/m)", error_label="error / (1/m)")
+    paths = []
+    for name, keys in (
+        ("figure-12-open-loop", ("open_loop_inverse", "polynomial")),
+        ("figure-12-closed-loop", ("closed_loop_inverse", "latched")),
+    ):
+        paths.append(campaign.figure(name))
+        outputs = {CONTROLLERS[key][0]: reached[key].outputs for key in keys}
+        plot(paths[-1], reached[keys[0]].targets, outputs)
+    for period in PERIODS:
+        paths.append(campaign.figure(f"following-period-{period}"))
+        results = {key: followed[period, key] for key in FOLLOWERS}
+        times = results["closed_loop_inverse"].times
+        plot(
+            paths[-1],
+            results["closed_loop_inverse"].reference,
+            {CONTROLLERS[key][0]: np.interp(times, each.times, each.output) for key, each in results.items()},
+            horizontal=times,
+            horizontal_label="time / s",
+        )
+    return paths

@@ -1,0 +1,599 @@
+"""The protocols for the hybrid: what they plan and refuse, what they set, and how they end when something fails."""
+
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bench.cli import main
+from bench.clock import VirtualClock
+from bench.engine import check_before_moving
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import Polynomial, PrandtlIshlinskii
+from bench.journal import Record
+from bench.model_file import HybridFile
+from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
+from bench.rig import Rig
+from bench.rig_file import load_rig
+from bench.runs import Run, carry_out
+from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
+from protocols.hybrid.control import REST, moves_of
+from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
+from rigs.hybrid.design import Design
+from rigs.hybrid.identification import read_loop, read_loops
+from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
+
+WIRED, DIRECT = "hybrid", "hybrid-direct"
+DEVICES = ("tec", "displacement", "base", "tip", "piezo")
+SENSORS = {DEFLECTION, BASE, TIP}
+LIMITS = {"tec": 0.15, "piezo": 40.0}
+MICRO = 1e-6
+
+
+@pytest.fixture
+def bench(capsys):
+    """Run a command in this process; return exit code, standard output and standard error."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stopped:
+            main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+def assignments(option, values):
+    return [part for key, value in values.items() for part in (option, f"{key}={value}")]
+
+
+def made_up_model():
+    """A model of about the numbers of the paper, rather than from measurements."""
+    # The polynomial is one in the rise over half its range.
+    polynomial = Polynomial([-7.363e-6 * 25.0], (-25.0, 25.0), 0.0, "K", "m")
+    weights = np.array([150.0, *np.linspace(30.0, 2.0, 14)]) * 1e-9
+    hysteresis = PrandtlIshlinskii(
+        np.arange(15) * 40.0 / 15, weights, input_range=(-40.0, 40.0), input_unit="V", output_unit="m"
+    )
+    return HybridModel(Design().network(), polynomial, hysteresis, PUBLISHED_DYNAMICS)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Model files that can and cannot be used, by name."""
+    folder = tmp_path_factory.mktemp("models")
+    HybridFile(made_up_model()).save(folder / "hybrid.json")
+    content = json.loads((folder / "hybrid.json").read_text())
+    (folder / "other.json").write_text(json.dumps({**content, "format": "bench-model"}))
+    del content["model"]["dynamics"]
+    (folder / "damaged.json").write_text(json.dumps(content))
+    return {path.stem: path for path in folder.iterdir()} | {"none": folder / "none.json"}
+
+
+def parsed(protocol, settings):
+    definition = find_protocol(protocol)
+    return definition, definition.parse({key: str(value) for key, value in settings.items()})
+
+
+def planned(protocol, **settings):
+    return plan(*parsed(protocol, settings))
+
+
+def dry(protocol, **settings):
+    """All messages of a protocol whose readings are all zero."""
+    definition, parameters = parsed(protocol, settings)
+    messages, found, reading = definition.generator(parameters), [], None
+    while True:
+        try:
+            message = messages.send(reading)
+        except StopIteration:
+            return found
+        found.append(message)
+        reading = None if isinstance(message, Phase) else Reading(len(found), 0.0, True, {})
+
+
+def loops(protocol, **settings):
+    return [message for message in dry(protocol, **settings) if isinstance(message, FixedRate)]
+
+
+def setpoints(loop, actuator=0):
+    """Times and set-points of a loop without feedback."""
+    times = np.arange(round(loop.duration * loop.rate)) / loop.rate
+    return times, np.array([loop.controller.update(t, ())[actuator] for t in times])
+
+
+DEFAULTS = (
+    ("current-sine", 1, 2000.0, SENSORS | {"tec_setpoint"}),
+    ("current-steps", 1, 6000.0, SENSORS | {"tec_setpoint"}),
+    ("thermomechanical", 34, 34 * 240.0, set()),
+    ("piezo-loops", 1, 50.0, SENSORS | {"piezo_setpoint"}),
+    ("piezo-step", 1, 0.32, {DEFLECTION, "piezo_setpoint"}),
+    ("hybrid-excitation", 1, 2000.0, SENSORS | {"tec_setpoint", "piezo_setpoint"}),
+    # Six moves of 640 µm in all.
+    ("hybrid-control", 1, REST + 640.0 / 3.0 + 6 * (10.0 + 60.0), SENSORS | {"tec_setpoint", "piezo_setpoint"}),
+    ("fine-step", 1, 0.25, {DEFLECTION, "piezo_setpoint"}),
+)
+
+EXTREMES = {
+    "current-sine": {"tec": (-0.1, 0.1)},
+    "current-steps": {"tec": (-0.1, 0.1)},
+    "thermomechanical": {"tec": (-0.15, 0.1)},
+    "piezo-loops": {"piezo": (-40.0, 40.0)},
+    "piezo-step": {"piezo": (0.0, 40.0)},
+    "hybrid-excitation": {"tec": (-0.08, 0.08), "piezo": (-30.0, 30.0)},
+}
+
+
+class TestPlan:
+    @pytest.mark.parametrize(("protocol", "steps", "seconds", "watched"), DEFAULTS)
+    def test_as_they_are(self, files, protocol, steps, seconds, watched):
+        settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
+        expected = planned(protocol, **settings)
+        assert expected.steps == steps
+        assert expected.seconds == expected.at_most == pytest.approx(seconds, rel=1e-9)
+        assert expected.watched == watched
+        assert expected.prompts == 0
+        assert expected.extremes == EXTREMES.get(protocol, {})
+
+    @pytest.mark.parametrize("protocol", [entry[0] for entry in DEFAULTS])
+    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    def test_both_rigs_have_what_they_need(self, files, rig, protocol):
+        settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
+        definition, parameters = parsed(protocol, settings)
+        with Rig(load_rig(rig), VirtualClock(), 1) as connected:
+            check_before_moving(connected, definition, plan(definition, parameters))
+            assert definition.controls in ("", DEFLECTION)
+
+    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
+    def test_a_witness_only_where_there_is_one(self, files, protocol):
+        definition, parameters = parsed(protocol, {"model": files["hybrid"], "witness": True})
+        expected = plan(definition, parameters)
+        assert WITNESS in expected.watched
+        with Rig(load_rig(DIRECT), VirtualClock(), 1) as rig:
+            check_before_moving(rig, definition, expected)
+        words = f"needs {WITNESS}, which rig hybrid does not have"
+        with Rig(load_rig(WIRED), VirtualClock(), 1) as rig, pytest.raises(ConfigurationError, match=words):
+            check_before_moving(rig, definition, expected)
+
+    def test_durations_follow_the_settings(self, files):
+        assert planned("current-sine", frequencies="0.01, 0.05", periods=3).seconds == pytest.approx(300.0 + 60.0)
+        assert planned("current-steps", levels="0.1, -0.1", on=100, off=50).seconds == 300.0
+        assert planned("thermomechanical", levels=2, dwell=10).seconds == (2 + 3 + 1) * 10.0
+        assert planned("piezo-loops", amplitudes="10, 5", frequency=1).seconds == 2.0
+        assert planned("piezo-step", rest=0.1, duration=0.4).seconds == pytest.approx(0.5)
+        moves = planned("hybrid-control", model=files["hybrid"], positions="3e-6", speed=1e-6, hold=7).seconds
+        assert moves == pytest.approx(REST + 3.0 + 10.0 + 7.0)
+
+
+class TestSetpoints:
+    @pytest.mark.parametrize(
+        "protocol", ["current-sine", "current-steps", "piezo-loops", "piezo-step", "hybrid-excitation"]
+    )
+    def test_stay_within_what_the_rig_allows(self, protocol):
+        for loop in loops(protocol):
+            for k, actuator in enumerate(loop.actuators):
+                _, values = setpoints(loop, k)
+                assert 0.0 < np.abs(values).max() <= LIMITS[actuator]
+
+    def test_sines_of_the_current(self):
+        found = loops("current-sine", amplitude=0.02, frequencies="0.002, 0.01", periods=3)
+        assert [loop.label for loop in found] == ["0.002 Hz", "0.01 Hz"]
+        for loop, frequency in zip(found, (0.002, 0.01), strict=True):
+            times, values = setpoints(loop)
+            assert times.size == round(3 / frequency * 0.5)
+            np.testing.assert_allclose(values, 0.02 * np.sin(2 * np.pi * frequency * times), atol=1e-15)
+            assert loop.actuators == ("tec",)
+
+    def test_steps_of_the_current(self):
+        (loop,) = loops("current-steps")
+        times, values = setpoints(loop)
+        for k, level in enumerate((-0.1, -0.05, -0.025, 0.1)):
+            assert set(values[(times >= 1500 * k) & (times < 1500 * k + 600)]) == {level}
+            assert set(values[(times >= 1500 * k + 600) & (times < 1500 * (k + 1))]) == {0.0}
+        # Even if the last sample comes late.
+        assert loop.controller.update(loop.duration + 1.0, ()) == (0.1,)
+
+    def test_staircase_of_the_current(self):
+        steps = [message for message in dry("thermomechanical") if isinstance(message, Step)]
+        currents = np.array([step.setpoints["tec"] for step in steps])
+        assert (currents[0], currents.min(), currents.max(), currents[-1]) == (0.0, -0.15, 0.1, 0.0)
+        # Down, up and back, and none twice in a row.
+        assert np.array_equal(np.flatnonzero(np.diff(np.sign(np.diff(currents)))) + 1, [8, 25])
+        assert np.all(np.diff(currents) != 0)
+        assert {step.label for step in steps} == {"sample"}
+        assert {step.settle.seconds for step in steps} == {240.0}
+
+    def test_loops_of_the_voltage(self):
+        (loop,) = loops("piezo-loops")
+        times, values = setpoints(loop)
+        assert loop.actuators == ("piezo",)
+        for k, amplitude in enumerate((40.0, 40.0, 30.0, 20.0, 10.0)):
+            cycle = values[(times >= 10.0 * k - 1e-9) & (times < 10.0 * (k + 1) - 1e-9)]
+            assert cycle.size == 500
+            assert (cycle.min(), cycle.max()) == pytest.approx((-amplitude, amplitude), rel=1e-6)
+            assert abs(cycle[0]) < 1e-9
+        assert np.abs(np.diff(values)).max() < 40.0 * 2 * math.pi * 0.1 / 50.0 * 1.01
+
+    def test_step_of_the_voltage(self):
+        (loop,) = loops("piezo-step", voltage=-15)
+        _, values = setpoints(loop)
+        assert values.tolist() == [0.0] * 400 + [-15.0] * 6000
+        assert loop.inputs == (DEFLECTION,)
+
+    def test_both_at_once(self):
+        (loop,) = loops("hybrid-excitation", current=0.05, voltage=10, duration=100)
+        assert loop.actuators == ("tec", "piezo")
+        times, currents = setpoints(loop, 0)
+        _, voltages = setpoints(loop, 1)
+        np.testing.assert_allclose(currents, 0.05 * np.sin(2 * np.pi * 1e-3 * times), atol=1e-15)
+        np.testing.assert_allclose(voltages, 10.0 * np.sin(2 * np.pi * 0.05 * times), atol=1e-12)
+
+
+class TestReferences:
+    def moves(self, **settings):
+        return moves_of(parsed("hybrid-control", {"model": "m.json", **settings})[1])
+
+    def test_moves_hold_at_each_position(self):
+        moves = self.moves(positions="60e-6, -50e-6, 10e-6", speed=5e-6, hold=20)
+        times = np.linspace(0.0, moves.duration, 20_001)
+        positions = np.array([moves(t) for t in times])
+        assert (moves(0.0), positions[-1]) == (0.0, pytest.approx(10e-6))
+        assert (positions.min(), positions.max()) == (pytest.approx(-50e-6), pytest.approx(60e-6))
+        held = np.array([moves.holding(t) for t in times])
+        assert set(np.round(positions[held] / MICRO, 6)) == {60.0, -50.0, 10.0}
+        assert np.abs(np.diff(positions)).max() <= 5e-6 * np.diff(times).max() * 1.001
+
+    def test_staircase_goes_there_and_back_in_equal_steps(self):
+        moves = self.moves(reference="staircase", low=-40e-6, high=40e-6, steps=4, hold=5)
+        times = np.linspace(0.0, moves.duration, 20_001)
+        held = [round(moves(t) / MICRO, 6) for t in times if moves.holding(t)]
+        visited = [value for value, before in zip(held, [None, *held[:-1]], strict=True) if value != before]
+        assert visited == [-40.0, -20.0, 0.0, 20.0, 40.0, 20.0, 0.0, -20.0, -40.0]
+
+    def test_ramp_goes_to_one_end_to_the_other_and_back(self):
+        moves = self.moves(reference="ramp", low=-10e-6, high=30e-6, hold=3)
+        held = [round(moves(t) / MICRO, 6) for t in np.linspace(0.0, moves.duration, 5001) if moves.holding(t)]
+        assert list(dict.fromkeys(held)) == [-10.0, 30.0]
+        assert (held[0], held[-1]) == (-10.0, -10.0)
+
+    def test_hold_stays_at_rest(self):
+        moves = self.moves(reference="hold", hold=30)
+        assert {moves(t) for t in np.linspace(-5.0, moves.duration + 5.0, 500)} == {0.0}
+        assert moves.duration == 40.0
+
+    def test_a_sine_is_on_top_of_the_ramp(self, files):
+        settings = {"model": files["hybrid"], "low": -10e-6, "high": 10e-6, "hold": 2}
+        (plain,) = loops("hybrid-control", reference="ramp", **settings)
+        (added,) = loops("hybrid-control", reference="sine-on-ramp", amplitude=2e-6, frequency=1.0, **settings)
+        assert added.duration == plain.duration
+        moves = self.moves(reference="sine-on-ramp", low=-10e-6, high=10e-6, hold=2)
+        assert plain.duration == pytest.approx(REST + moves.duration)
+        rest = (0.0, 22.0, 22.0)
+        off = []
+        for k in range(4000):
+            t = k / plain.rate
+            plain.controller.update(t, rest)
+            added.controller.update(t, rest)
+            off.append(added.controller.trace.reference - plain.controller.trace.reference)
+        # It swells within two periods.
+        assert np.max(np.abs(off[:100])) < 1e-6
+        assert np.max(np.abs(off[600:])) == pytest.approx(2e-6, rel=1e-3)
+
+    def test_the_reference_rests_at_first(self, files):
+        (loop,) = loops("hybrid-control", model=files["hybrid"], positions="30e-6")
+        for t in (0.0, 2.0, 4.9):
+            loop.controller.update(t, (0.0, 22.0, 22.0))
+            assert loop.controller.trace.reference == 0.0
+        loop.controller.update(12.0, (0.0, 22.0, 22.0))
+        assert loop.controller.trace.reference > 1e-6
+
+    @pytest.mark.parametrize(
+        ("name", "kind"),
+        [
+            ("hybrid", HybridController),
+            ("hybrid-low-pass", HybridController),
+            ("thermal-feedback", ThermalFeedback),
+            ("open-loop", OpenLoopHybrid),
+        ],
+    )
+    def test_each_controller(self, files, name, kind):
+        (loop,) = loops("hybrid-control", model=files["hybrid"], controller=name)
+        assert isinstance(loop.controller, kind)
+        assert loop.record_every == 4
+        current, voltage = loop.controller.update(0.0, (0.0, 22.0, 22.0))
+        assert abs(current) <= 0.15
+        assert abs(voltage) <= 40.0
+        assert (voltage == 0.0) or name != "thermal-feedback"
+
+    @pytest.mark.parametrize(("rate", "record_rate", "every"), [(200, 200, 1), (200, 1000, 1), (100, 3, 33)])
+    def test_as_many_samples_as_wanted_are_recorded(self, files, rate, record_rate, every):
+        (loop,) = loops("hybrid-control", model=files["hybrid"], rate=rate, record_rate=record_rate)
+        assert loop.record_every == every
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("protocol", "settings", "words"),
+        [
+            (
+                "current-sine",
+                {"frequencies": ""},
+                "= '' is not allowed; allowed: numbers with commas between them Hz",
+            ),
+            (
+                "current-sine",
+                {"frequencies": "0.001, x"},
+                "frequencies = '0.001, x' is not allowed",
+            ),
+            ("current-sine", {"frequencies": "0.06"}, "frequencies: expected more than 0 and at most 0.05 Hz"),
+            ("current-sine", {"frequencies": "0.001, -0.001"}, "frequencies: expected more than 0"),
+            ("current-sine", {"periods": "1"}, "periods = '1' is not allowed; allowed: 2 to 100"),
+            ("current-sine", {"amplitude": "2"}, "amplitude = '2' is not allowed; allowed: 0.001 to 1 A"),
+            ("current-steps", {"levels": "inf"}, "levels = 'inf' is not allowed; allowed: numbers"),
+            ("current-steps", {"on": "0"}, "on = '0' is not allowed; allowed: 1 to 36000 s"),
+            ("thermomechanical", {"coldest": "0.1"}, "coldest = '0.1' is not allowed; allowed: -1 to 0 A"),
+            ("thermomechanical", {"levels": "1"}, "levels = '1' is not allowed"),
+            ("piezo-loops", {"amplitudes": "40; 20"}, "amplitudes = '40; 20' is not allowed; allowed: numbers"),
+            ("piezo-loops", {"frequency": "0"}, "frequency = '0' is not allowed"),
+            ("piezo-step", {"rate": "1"}, "rate = '1' is not allowed; allowed: 10 to 1e+06 Hz"),
+            ("hybrid-excitation", {"voltage": "-1"}, "voltage = '-1' is not allowed; allowed: 0 to 1000 V"),
+            ("hybrid-control", {"controller": "magic"}, "controller = 'magic' is not allowed"),
+            ("hybrid-control", {"reference": "circle"}, "reference = 'circle' is not allowed"),
+            (
+                "hybrid-control",
+                {"positions": "1e-6 2e-6"},
+                "positions = '1e-6 2e-6' is not allowed",
+            ),
+            ("hybrid-control", {"positions": "5e-6, -2e-4"}, "expected numbers from -0.000199 to 0.000199 m"),
+            ("hybrid-control", {"low": "-2e-4"}, "low = '-2e-4' is not allowed; allowed: -0.000199 to 0.000199 m"),
+            ("hybrid-control", {"reference": "staircase", "low": "1e-6", "high": "1e-6"}, "low, high: expected"),
+            ("hybrid-control", {"amplitude": "1e-5"}, "amplitude = '1e-5' is not allowed; allowed: 0 to 9e-06 m"),
+            ("hybrid-control", {"rate": "20"}, "rate = '20' is not allowed; allowed: 50 to 1000 Hz"),
+            ("fine-step", {"step": "1e-5"}, "step = '1e-5' is not allowed; allowed: -9e-06 to 9e-06 m"),
+            ("fine-step", {"rate": "1000"}, "rate = '1000' is not allowed; allowed: 2000 to 1e+06 Hz"),
+        ],
+    )
+    def test_what_is_wrong_is_one_message_before_anything_moves(self, files, protocol, settings, words):
+        if protocol in ("hybrid-control", "fine-step"):
+            settings = {"model": files["hybrid"], **settings}
+        with pytest.raises(ConfigurationError) as caught:
+            planned(protocol, **settings)
+        (line,) = str(caught.value).splitlines()
+        assert line.startswith(f"protocol {protocol}: ")
+        assert words in line
+
+    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [
+            ("none", "cannot be read: No such file"),
+            ("damaged", "damaged"),
+            ("other", "is not a model file: its `format` is not 'bench-hybrid-model'"),
+        ],
+    )
+    def test_a_model_that_cannot_be_used(self, files, protocol, name, words):
+        with pytest.raises(DataError, match=words) as caught:
+            planned(protocol, model=files[name])
+        assert str(files[name]) in str(caught.value)
+
+    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
+    def test_a_model_must_be_given(self, protocol):
+        with pytest.raises(ConfigurationError, match=f"protocol {protocol}: parameter model is missing"):
+            planned(protocol)
+
+    def test_a_staircase_beyond_the_rig_s_limits_is_found_before_anything_moves(self, bench, tmp_path):
+        code, _, err = bench(
+            "run", "thermomechanical", "--rig", WIRED, "--clock", "virtual", "--set", "hottest=0.2", "--out", tmp_path
+        )
+        assert code == 2
+        assert "would set tec to between -0.15 and 0.2 A; rig hybrid allows -0.15 to 0.15 A" in flat(err)
+        assert not list(tmp_path.iterdir())
+
+
+def flat(text):
+    return re.sub(r"\s+", " ", text)
+
+
+def record(folder, protocol, rig, **settings):
+    definition, parameters = parsed(protocol, settings)
+    run = Run(
+        protocol=definition,
+        settings=parameters.model_dump(),
+        rig=rig,
+        folder=folder,
+        seed=1,
+        clock="virtual",
+        recording=False,
+    )
+    result = carry_out(run, Console(file=io.StringIO(), width=200))
+    assert result.outcome.status == "completed", result.outcome.reason
+    assert result.outcome.is_safe
+    return result.folder
+
+
+class TestRuns:
+    def test_a_slow_loop_keeps_the_watchdogs_fed(self, tmp_path):
+        """Ten seconds from sample to sample, where five without a word switch everything off."""
+        run = record(tmp_path, "current-sine", WIRED, rate=0.1, frequencies="0.01")
+        samples = read_loops(run)["0.01 Hz"]
+        assert len(samples.times) == 20
+        assert samples.period == pytest.approx(10.0)
+        with Record(run) as found:
+            # A reading by wire takes some milliseconds.
+            assert np.diff(found.telemetry()["t"]).max() <= 2.01
+
+    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    @pytest.mark.parametrize("controller", ["hybrid", "thermal-feedback", "open-loop"])
+    def test_control(self, files, tmp_path, rig, controller):
+        settings = {"positions": "4e-6", "hold": 8, "controller": controller, "model": files["hybrid"]}
+        if rig == WIRED and controller != "hybrid":
+            settings["hold"] = 1
+        run = record(tmp_path, "hybrid-control", rig, **settings)
+        samples = read_loop(run)
+        assert samples.period == pytest.approx(0.02)
+        assert samples["reference"][0] == 0.0
+        assert samples["reference"][-1] == pytest.approx(4e-6)
+        for actuator, limit in LIMITS.items():
+            assert np.abs(samples[f"{actuator}_setpoint"]).max() <= limit
+        errors = np.abs(samples[DEFLECTION] - samples["reference"])
+        if controller == "hybrid":
+            # With noise of the sensor; the model is made up, and feedback makes up for it.
+            assert errors[samples.times > 12.0].max() < 100e-9
+        if controller == "thermal-feedback":
+            assert not samples["piezo_setpoint"].any()
+
+    @pytest.mark.parametrize("step", [5e-6, -3e-6])
+    def test_a_fine_step_has_every_sample(self, files, tmp_path, step):
+        run = record(tmp_path, "fine-step", DIRECT, model=files["hybrid"], step=step, witness=True)
+        samples = read_loop(run)
+        assert len(samples.times) == 5000
+        assert samples.period == pytest.approx(50e-6, rel=1e-9)
+        assert not samples["lateness"].any()
+        assert samples["reference"].tolist() == [0.0] * 1000 + [step] * 4000
+        assert np.abs(samples[WITNESS][-1000:] - step).max() < 0.02 * abs(step)
+        with Record(run) as found:
+            (text,) = [event.text for event in found.events() if event.kind == "loop"]
+        assert text == "5000 samples at 20000 Hz, 0 left out; late by 0 ms on average, 0 ms at most"
+
+    def test_the_same_loop_in_the_time_of_the_room(self, bench, tmp_path):
+        code, _, err = bench(
+            "run", "piezo-loops", "--rig", WIRED, "--clock", "wall", "--out", tmp_path,
+            "--json", tmp_path / "run.json",
+            *assignments("--set", {"amplitudes": "10", "frequency": 1, "rate": 200}),
+        )  # fmt: skip
+        assert (code, err) == (0, "")
+        result = json.loads((tmp_path / "run.json").read_text())
+        assert result["is_safe"]
+        with Record(Path(result["folder"])) as found:
+            (text,) = [event.text for event in found.events() if event.kind == "loop"]
+            ticks = found.telemetry()
+        taken, left_out = map(int, re.match(r"(\d+) samples at 200 Hz, (\d+) left out", text).groups())
+        assert taken + left_out == 200
+        late = ticks["lateness"][np.isfinite(ticks["lateness"])]
+        assert len(late) == taken > 0
+        assert np.all(late >= 0)
+        assert np.all(np.diff(ticks["t"]) >= 0)
+        assert np.all(np.diff(ticks["t"][np.isfinite(ticks["lateness"])]) > 0)
+
+
+class TestBadInput:
+    """What may go wrong at a specimen: one message, the right exit code, no current and no voltage, and a record."""
+
+    TIME = 12.3
+
+    FAULTS = (
+        ("open-thermistor", ["base: thermistor open", "AIN1", "a wire is broken or not connected"]),
+        ("shorted-thermistor", ["tip: thermistor shorted", "AIN3", "check its wires for a short circuit"]),
+        ("out-of-range", ["displacement: AIN0 reads 10 V", "over its range", "bring what is measured back"]),
+        ("tec-over-current", ["tec: error 100 (over-current", "check the Peltier element and its cables"]),
+        ("tec-over-temperature", ["tec: error 138 (the object temperature is above", "check the load"]),
+        ("amplifier-trips", ["piezo: the amplifier went off by itself", "its own protection has tripped"]),
+    )
+
+    @pytest.fixture
+    def laboratories(self, monkeypatch):
+        """The laboratories that are opened, to look at the plant itself when the run is over."""
+        opened, really_open = [], HybridLaboratory.open
+
+        def remember(laboratory):
+            opened.append(laboratory)
+            return really_open(laboratory)
+
+        monkeypatch.setattr(HybridLaboratory, "open", remember)
+        return opened
+
+    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    @pytest.mark.parametrize(("fault", "words"), FAULTS)
+    def test_ends_the_run_in_the_safe_state(self, bench, laboratories, tmp_path, rig, fault, words):
+        code, _, err = bench(
+            "run", "hybrid-excitation", "--rig", rig, "--clock", "virtual", "--out", tmp_path,
+            "--json", tmp_path / "run.json",
+            *assignments("--set", {"duration": 60, "rate": 20}),
+            *assignments("--override", {"emulation.fault": fault, "emulation.fault_time": self.TIME}),
+        )  # fmt: skip
+        assert code == 4
+        assert err.count("error:") == 1
+        assert "Traceback" not in err
+        device = words[0].partition(":")[0]
+        if rig == WIRED:
+            for word in words:
+                assert word in flat(err)
+        assert f"error: {device}: " in flat(err)
+
+        result = json.loads((tmp_path / "run.json").read_text())
+        devices = (*DEVICES, "witness") if rig == DIRECT else DEVICES
+        assert result["status"] == "failed"
+        assert result["is_safe"]
+        assert result["safe_state"] == dict.fromkeys(devices, "safe")
+
+        # In the plant itself; it takes its commands every 10 ms.
+        (laboratory,) = laboratories
+        laboratory.world.clock.sleep(0.02)
+        laboratory.world.advance()
+        assert laboratory.plant.current == 0.0
+        assert laboratory.plant.piezo_voltage == 0.0
+        assert not laboratory.amplifier.on
+        assert laboratory.t7.tdac_volts(0) == 0.0
+        assert not laboratory.t7.dio_level(ENABLE_LINE, pulled_down=True)
+
+        with Record(Path(result["folder"])) as found:
+            assert found.status == "failed"
+            assert flat(found.meta["reason"]) in flat(err)
+            assert found.meta["safe_state"] == dict.fromkeys(devices, "safe")
+            events, ticks = found.events(), found.telemetry()
+        # Everything before is kept, up to the sample before what happened, or the tick that saw it.
+        taken = np.isfinite(ticks["lateness"])
+        assert self.TIME - 0.06 <= ticks["t"][taken][-1] <= self.TIME + 2.1
+        assert len(ticks["t"][taken]) >= 20 * (self.TIME - 0.1)
+        assert np.abs(ticks["piezo_setpoint"][taken]).max() > 25.0
+        assert ticks["tec_setpoint"][taken][-1] > 5e-3
+        for name in (DEFLECTION, BASE, TIP):
+            assert np.all(np.isfinite(ticks[name]))
+        assert [event.text for event in events if event.kind == "safe-state"] == [f"{name}: safe" for name in devices]
+        (trouble,) = (event for event in events if event.level == "ERROR")
+        assert trouble.kind == "error"
+        assert self.TIME <= trouble.t <= self.TIME + 2.1
+
+    def test_a_fault_that_comes_after_the_end_changes_nothing(self, bench, tmp_path):
+        code, _, err = bench(
+            "run", "piezo-loops", "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            *assignments("--set", {"amplitudes": "10"}),
+            *assignments("--override", {"emulation.fault": "amplifier-trips", "emulation.fault_time": 1e5}),
+        )  # fmt: skip
+        assert (code, err) == (0, "")
+
+    @pytest.mark.parametrize(
+        ("protocol", "settings", "words"),
+        [
+            ("piezo-loops", {"amplitudes": "10, 60"}, "would set piezo to between -60 and 60 V"),
+            ("current-sine", {"amplitude": "0.3"}, "would set tec to between -0.3 and 0.3 A"),
+            ("current-steps", {"levels": "0.1, -0.2"}, "would set tec to between -0.2 and 0.1 A"),
+            ("hybrid-excitation", {"voltage": "45"}, "would set piezo to between -45 and 45 V"),
+            ("piezo-step", {"voltage": "-41"}, "would set piezo to between -41 and 0 V"),
+        ],
+    )
+    def test_a_setpoint_beyond_the_limits_is_found_before_anything_moves(
+        self, bench, tmp_path, protocol, settings, words
+    ):
+        code, _, err = bench(
+            "run", protocol, "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            *assignments("--set", settings),
+        )  # fmt: skip
+        assert code == 2
+        assert err.count("error:") == 1
+        assert words in flat(err)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_room_that_steps_is_no_fault(self, bench, tmp_path):
+        code, _, err = bench(
+            "run", "hybrid-excitation", "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            *assignments("--set", {"duration": 60}),
+            *assignments("--override", {"emulation.ambient_step": 5, "emulation.ambient_step_time": 20}),
+        )  # fmt: skip
+        assert (code, err) == (0, "")

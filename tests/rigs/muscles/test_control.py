@@ -1,0 +1,514 @@
+"""Controllers of the wire's length and force: the thermal lag, the bookkeeping, and how well they do on the plant."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.control.inverse import Reach
+from bench.control.loops import ReachTarget
+from bench.control.two_stage_inverse import TwoStageInverse
+from bench.identification import Series, identify_two_stage, voltage_steps
+from rigs.muscles.control import (
+    FORCE_GAIN,
+    LENGTH_GAIN,
+    ForceTask,
+    InverseControlParameters,
+    LengthTask,
+    MuscleClosedLoop,
+    MuscleOpenLoop,
+    MuscleProportionalIntegral,
+    ProportionalIntegralParameters,
+    ThermalLag,
+)
+from sim_devices.plants.sma import SMAParameters, SMAWire
+
+MILLIMETRE = 1e-3
+LIMITS = (0.0, 3.0)
+LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
+HELD = (0.0, 0.6, 1.2, 1.8, 2.4, 3.0)
+FORCES = np.concatenate([np.linspace(0.0, 10.5, 12), np.linspace(10.5, 0.0, 12)[1:]])
+VOLTAGES = voltage_steps()
+
+
+class Wire:
+    """The plant with its sensors: length 0.01 mm rms, then rounded to 0.04 mm; force 0.02 N rms."""
+
+    def __init__(self, seed, **parameters):
+        self.rng = np.random.default_rng([7, seed])
+        self.plant = SMAWire(SMAParameters(**parameters), self.rng)
+        self.t = 0.0
+
+    def wait(self, seconds):
+        self.plant.advance(seconds)
+        self.t += seconds
+
+    def set(self, voltage, seconds=30.0):
+        self.plant.apply(voltage)
+        self.wait(seconds)
+
+    def load(self, newton, seconds=30.0):
+        self.plant.hang(newton)
+        self.wait(seconds)
+
+    def reset(self):
+        self.plant.hang(0.3)
+        self.set(3.0, 60.0)
+        self.set(0.0, 60.0)
+
+    def fix(self):
+        """Fix the ends of the wire where it has the pretension, as it was conditioned."""
+        self.load(0.3)
+        self.plant.clamp(self.plant.position)
+
+    def length(self):
+        step = 0.04 * MILLIMETRE
+        return step * round((self.plant.position + 0.01 * MILLIMETRE * self.rng.standard_normal()) / step)
+
+    def force(self):
+        return self.plant.force + 0.02 * self.rng.standard_normal()
+
+
+class Bench:
+    """A wire at one task: the length under a load, or the force between fixed ends if there is none."""
+
+    def __init__(self, seed, load=None):
+        self.wire = Wire(100 + seed, ambient_sd=0.3)
+        self.is_length = load is not None
+        if self.is_length:
+            self.wire.reset()
+            self.wire.load(load)
+        else:
+            self.wire.fix()
+
+    @property
+    def truth(self):
+        return self.wire.plant.position if self.is_length else self.wire.plant.force
+
+    def output(self):
+        return self.wire.length() if self.is_length else self.wire.force()
+
+    def read(self):
+        others = (self.wire.force(),) if self.is_length else ()
+        return self.wire.t, self.wire.plant.voltage, self.output(), *others
+
+    def reach(self, controller, target, duration=20.0, load=None):
+        """Return the errors after 10 s and at the end, the latter by the mean of ten readings.
+
+        A load, if given, is hung on after 10 s.
+        """
+        loop, start, halfway = ReachTarget(controller, target), self.wire.t, math.nan
+        command = loop.begin(*self.read())
+        while not command.done:
+            assert LIMITS[0] <= command.setpoint <= LIMITS[1]
+            self.wire.set(command.setpoint, command.wait)
+            if math.isnan(halfway) and self.wire.t - start >= 10.0 - 1e-6:
+                halfway = target - self.truth
+                if load is not None:
+                    self.wire.plant.hang(load)
+            command = loop.update(*self.read())
+        assert self.wire.t - start == pytest.approx(duration)
+        outputs = []
+        for _ in range(10):
+            outputs.append(self.output())
+            self.wire.wait(0.1)
+        return halfway, target - np.mean(outputs)
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    """Identify the plant once: force over voltage between fixed ends, lengths under loads and at voltages."""
+    wire = Wire(1)
+    wire.fix()
+    forces = []
+    for voltage in VOLTAGES:
+        wire.set(voltage)
+        forces.append(wire.force())
+    series = []
+    for load in LOADS:
+        wire.reset()
+        wire.plant.hang(load)
+        lengths = []
+        for voltage in VOLTAGES:
+            wire.set(voltage)
+            lengths.append(wire.length())
+        series.append(Series.under_load(load, VOLTAGES, lengths))
+    for voltage in HELD:
+        wire.reset()
+        wire.load(0.0)
+        wire.set(voltage)
+        lengths = []
+        for force in FORCES:
+            wire.load(force)
+            lengths.append(wire.length())
+        series.append(Series.at_voltage(voltage, FORCES, lengths))
+    return TwoStageInverse(identify_two_stage(VOLTAGES, forces, series, units=("V", "N", "m")).model)
+
+
+def output_range(load=None):
+    """Return the outputs of the cold and the hot wire, the lower first."""
+    bench = Bench(0, load)
+    ends = [bench.truth]
+    bench.wire.set(3.0, 60.0)
+    return sorted([*ends, bench.truth])
+
+
+def task(inverse, load):
+    return ForceTask(inverse) if load is None else LengthTask(inverse)
+
+
+def controllers(inverse, load):
+    gain = FORCE_GAIN if load is None else LENGTH_GAIN
+    return {
+        "open-loop-inverse": lambda: MuscleOpenLoop(task(inverse, load)),
+        "proportional-integral": lambda: MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(gain)),
+        "closed-loop-inverse": lambda: MuscleClosedLoop(task(inverse, load)),
+    }
+
+
+def rms(errors):
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+# The thermal lag.
+
+
+@given(
+    st.floats(0.0, 9.0),
+    st.floats(0.5, 20.0),
+    st.floats(0.0, 3.0),
+    st.floats(0.0, 60.0),
+    st.floats(0.0, 1.0),
+)
+def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage, duration, part):
+    lag = ThermalLag(time_constant, level)
+    first = part * duration
+    parts = lag.advance(first, voltage).advance(duration - first, voltage)
+    whole = lag.advance(duration, voltage)
+    assert parts.level == pytest.approx(whole.level, rel=1e-12, abs=1e-12)
+    assert whole.time_constant == time_constant
+    # The solution of dw/dt = (V² - w) / tau.
+    expected = voltage**2 + (level - voltage**2) * math.exp(-duration / time_constant)
+    assert whole.voltage == pytest.approx(math.sqrt(expected), abs=1e-9)
+
+
+def test_lag_settles_and_holds():
+    lag = ThermalLag(5.0, 4.0)
+    assert lag.advance(1000.0, 2.0).level == 4.0
+    assert lag.advance(0.0, 3.0) == lag
+    assert ThermalLag().advance(5.0, 3.0).level == pytest.approx(9.0 * (1.0 - math.exp(-1.0)))
+    assert ThermalLag().advance(1e4, 1.5).voltage == pytest.approx(1.5)
+
+
+@given(st.floats(0.0, 9.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
+def test_lead_meets_its_target_unless_clipped(level, time_constant, target, horizon):
+    lag = ThermalLag(time_constant, level)
+    voltage, clipped = lag.lead(target, horizon, LIMITS)
+    arrived = lag.advance(horizon, voltage).voltage
+    if clipped:
+        assert voltage in LIMITS
+        # It falls short of the target, on the side where it comes from.
+        assert (arrived - target) * (lag.voltage - target) >= -1e-12
+    else:
+        assert arrived**2 == pytest.approx(target**2, abs=1e-9)
+        assert LIMITS[0] <= voltage <= LIMITS[1]
+
+
+def test_lead_of_a_cold_and_of_a_hot_wire():
+    share = 1.0 - math.exp(-0.4)
+    assert ThermalLag().lead(1.0, 2.0, LIMITS) == (pytest.approx(1.0 / math.sqrt(share)), False)
+    assert ThermalLag().lead(2.5, 2.0, LIMITS) == (3.0, True)
+    assert ThermalLag(5.0, 9.0).lead(1.0, 2.0, LIMITS) == (0.0, True)
+    assert ThermalLag(5.0, 9.0).lead(1.0, 2.0, (0.5, 3.0)) == (0.5, True)
+    assert ThermalLag(5.0, 4.0).lead(2.0, 2.0, LIMITS) == (2.0, False)
+
+
+# On the plant.
+
+ROUNDS = [4.9, 8.82, None]
+SEEDS = (0, 1, 2)
+
+
+@pytest.fixture(scope="module")
+def rounds(inverse):
+    """The errors of each controller, 40 targets in three sessions: rows of those after 10 s and at the end."""
+    results = {}
+    for load in ROUNDS:
+        low, high = output_range(load)
+        for name, make in controllers(inverse, load).items():
+            errors = []
+            for seed in SEEDS:
+                bench, controller = Bench(seed, load), make()
+                targets = low + (high - low) * np.random.default_rng([seed, 5]).uniform(0.05, 0.95, 40)
+                errors += [bench.reach(controller, target) for target in targets.tolist()]
+            results[load, name] = np.array(errors)
+    return results
+
+
+@pytest.mark.parametrize("load", [4.9, 8.82])
+def test_length_under_a_load(rounds, load):
+    errors = rounds[load, "closed-loop-inverse"] / MILLIMETRE
+    after_ten, final = rms(errors)
+    assert final <= 0.02
+    assert after_ten <= 0.07
+    assert np.abs(errors[:, 1]).max() <= 0.1
+    assert np.median(np.abs(errors[:, 1])) <= 0.015
+
+
+def test_force_between_fixed_ends(rounds):
+    errors = rounds[None, "closed-loop-inverse"]
+    after_ten, final = rms(errors)
+    assert final <= 0.04
+    assert after_ten <= 0.15
+    assert np.abs(errors[:, 1]).max() <= 0.15
+
+
+@pytest.mark.parametrize("load", ROUNDS)
+def test_feedback_beats_open_loop_and_the_model_beats_feedback_alone(rounds, load):
+    names = ("closed-loop-inverse", "proportional-integral", "open-loop-inverse")
+    closed, proportional_integral, opened = (rms(rounds[load, name]) for name in names)
+    assert (closed < proportional_integral).all()
+    assert (proportional_integral < opened).all()
+    # After 10 s by far: that is what driving ahead of the lag is for.
+    assert closed[0] < 0.5 * proportional_integral[0]
+
+
+def test_length_while_the_load_changes(inverse):
+    loads = (5.88, 7.84, 6.37, 4.9)
+    ranges = [output_range(load) for load in loads]
+    low, high = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    errors = []
+    for seed in SEEDS:
+        bench = Bench(seed, loads[-1])
+        controller = MuscleClosedLoop(LengthTask(inverse), parameters=InverseControlParameters(duration=30.0))
+        targets = low + (high - low) * np.random.default_rng([seed, 6]).uniform(0.05, 0.95, 12)
+        for n, target in enumerate(targets.tolist()):
+            # The force is all that tells the controller.
+            _, final = bench.reach(controller, target, 30.0, loads[n % 4])
+            errors.append(final)
+            assert controller.reach is Reach.MET
+    assert rms(errors) <= 0.02 * MILLIMETRE
+
+
+@pytest.mark.parametrize("name", ["closed-loop-inverse", "proportional-integral"])
+@pytest.mark.parametrize(("load", "side"), [(4.9, 0), (4.9, 1), (None, 0), (None, 1)])
+def test_out_of_reach_for_long_and_then_not(inverse, name, load, side):
+    low, high = output_range(load)
+    span = high - low
+    bench, controller = Bench(3, load), controllers(inverse, load)[name]()
+    # The cold end of the force is 0.3 N: below it there is less to ask for.
+    beyond = (low - 0.5 * span, high + 0.5 * span)[side]
+    for _ in range(5):
+        bench.reach(controller, beyond)
+        assert controller.reach is (Reach.TOO_LOW, Reach.TOO_HIGH)[side]
+    limit = bench.wire.plant.voltage
+    assert limit == (LIMITS[1] if (load is None) == (side == 1) else LIMITS[0])
+    inside = low + 0.5 * span
+    # It leaves the limit with the first command.
+    command = controller.aim(inside, *bench.read())
+    assert abs(command.setpoint - limit) > 0.3
+    bench.reach(controller, inside)
+    _, final = bench.reach(controller, inside)
+    assert abs(final) <= 0.05 * span
+    assert controller.reach is Reach.MET
+    # As good as one that was never out of reach.
+    _, final = bench.reach(controller, inside + 0.1 * span)
+    assert abs(final) <= 0.02 * span
+
+
+def test_narrower_limits_are_kept_and_flagged(inverse):
+    bench = Bench(4, 4.9)
+    low, high = output_range(4.9)
+    for make in (MuscleClosedLoop, MuscleOpenLoop):
+        controller = make(LengthTask(inverse), limits=(0.5, 2.0))
+        assert controller.limits == (0.5, 2.0)
+        command = controller.aim(low + 0.05 * (high - low), *bench.read())
+        assert command.setpoint == 2.0
+        assert controller.reach is Reach.TOO_LOW
+    controller = MuscleOpenLoop(ForceTask(inverse), limits=(0.0, 2.0))
+    assert controller.aim(10.5, 0.0, 0.0, 0.3).setpoint == 2.0
+    assert controller.reach is Reach.TOO_HIGH
+
+
+# What the controllers know.
+
+
+def test_memory_follows_what_the_supply_put_out_and_the_force_first(inverse):
+    model, rng = inverse.model, np.random.default_rng(8)
+    controller = MuscleClosedLoop(LengthTask(inverse))
+    state, lag = model.initial_state(), ThermalLag()
+    times = np.cumsum(rng.uniform(0.5, 2.0, 30)).tolist()
+    for n, t in enumerate(times):
+        voltage, force = rng.uniform(0.0, 3.0), rng.uniform(1.0, 9.0)
+        if n > 0:
+            lag = lag.advance(t - times[n - 1], voltage)
+        # The supply does not do what the controller asked for.
+        ask = controller.update if n % 10 else lambda *reading: controller.aim(2e-4, *reading)
+        ask(t, voltage, rng.uniform(-1e-3, 2e-3), force)
+        state, _ = model.step(state, lag.voltage, force)
+        assert controller.state == state
+
+
+def test_the_argument_stays_between_fixed_ends(inverse):
+    model = inverse.model
+    state = model.advance([1.5, 1.0], [3.0, 4.0])
+    controller = MuscleOpenLoop(ForceTask(inverse), state)
+    command = controller.aim(5.0, 0.0, 1.0, 4.0)
+    expected = inverse.voltage_for_force(state, 5.0)
+    assert command.setpoint == expected.voltage
+    for n in range(1, 20):
+        held = controller.update(float(n), command.setpoint, 9.9)
+        assert (held.setpoint, held.done) == (command.setpoint, False)
+    lag = ThermalLag(5.0, 1.0)
+    for _ in range(19):
+        lag = lag.advance(1.0, command.setpoint)
+    assert controller.state == model.move(state, lag.voltage, state.argument)[0]
+    assert controller.trace.reference == 5.0
+    assert controller.trace.predicted == controller.state.force
+    assert math.isnan(controller.trace.disturbance)
+
+
+def test_trace_of_the_closed_loop(inverse):
+    controller = MuscleClosedLoop(LengthTask(inverse))
+    controller.aim(1e-3, 0.0, 0.0, 2e-3, 4.9)
+    model = inverse.model.step(inverse.model.initial_state(), 0.0, 4.9)[1]
+    trace = controller.trace
+    assert trace.reference == 1e-3
+    # The first reading fixes the disturbance.
+    assert trace.disturbance == pytest.approx(2e-3 - model, abs=1e-9)
+    assert trace.predicted == pytest.approx(2e-3, abs=1e-9)
+    assert 0.0 < trace.uncertainty < 0.02 * MILLIMETRE
+    loop = ReachTarget(controller, 1e-3)
+    assert loop.trace == trace
+
+
+def test_an_exact_model_is_led_to_the_target(inverse):
+    model = inverse.model
+    # Slopes of any size are believed: the model is the wire.
+    controller = MuscleClosedLoop(ForceTask(inverse, slopes=(1e-3, 1e3)))
+    state, lag, t, voltage = model.initial_state(), ThermalLag(), 0.0, 0.0
+    for target in (4.0, 6.0, 5.0, 8.0, 7.0):
+        command = controller.aim(target, t, voltage, state.force)
+        while not command.done:
+            voltage = command.setpoint
+            lag, t = lag.advance(command.wait, voltage), t + command.wait
+            state, _ = model.move(state, lag.voltage, state.argument)
+            command = controller.update(t, voltage, state.force)
+        assert state.force == pytest.approx(target, abs=2e-3)
+        assert controller.reach is Reach.MET
+
+
+def test_missing_readings(inverse):
+    nan = math.nan
+    controller = MuscleClosedLoop(LengthTask(inverse))
+    command = controller.aim(1e-3, 0.0, 0.0, 2e-3, 4.9)
+    before = controller.trace.disturbance, controller.trace.uncertainty
+    after = controller.update(1.0, nan, nan, nan)
+    # The supply is taken to have done what it was told, the load to be the same; the wire is not left to overheat.
+    lag = ThermalLag().advance(1.0, command.setpoint)
+    assert controller.state.voltage == lag.voltage
+    assert controller.state.force == 4.9
+    assert (controller.trace.disturbance, controller.trace.uncertainty) == before
+    assert math.isfinite(after.setpoint)
+    # Nonsense is missing too.
+    controller.update(2.0, 1e6, 5.0, 1e9)
+    assert controller.state.force == 4.9
+    assert controller.state.voltage == lag.advance(1.0, after.setpoint).voltage
+    assert (controller.trace.disturbance, controller.trace.uncertainty) == before
+    plain = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(1.0))
+    assert plain.aim(5.0, 0.0, 1.5, nan).setpoint == 1.5
+    # The integral begins with the first reading: no proportional part comes of it.
+    assert plain.update(1.0, nan, 3.0).setpoint == pytest.approx(math.sqrt(1.5**2 + 2.0 / 4.0))
+    assert plain.update(2.0, nan, nan).setpoint == pytest.approx(math.sqrt(1.5**2 + 2.0 / 4.0))
+
+
+def test_proportional_integral_steps():
+    controller = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(0.5, 5.0))
+    first = controller.aim(4.0, 0.0, 1.0, 3.0)
+    assert first.setpoint == pytest.approx(math.sqrt(1.0 + 0.5 * 1.0 / 5.0))
+    second = controller.update(1.0, first.setpoint, 3.5)
+    assert second.setpoint == pytest.approx(math.sqrt(first.setpoint**2 + 0.5 * (-0.5 + 0.5 / 5.0)))
+    assert controller.reach is Reach.MET
+    assert controller.trace.reference == 4.0
+    # A new target acts at once.
+    third = controller.aim(5.0, 2.0, second.setpoint, 3.5)
+    assert third.setpoint == pytest.approx(math.sqrt(second.setpoint**2 + 0.5 * (1.0 + 1.5 / 5.0)))
+    assert controller.aim(1e3, 3.0, third.setpoint, 3.5).setpoint == 3.0
+    assert controller.reach is Reach.TOO_HIGH
+    assert controller.aim(-1e3, 4.0, 3.0, 3.5).setpoint == 0.0
+    assert controller.reach is Reach.TOO_LOW
+
+
+@pytest.mark.parametrize("name", ["closed-loop-inverse", "proportional-integral", "open-loop-inverse"])
+def test_lasts_its_time_and_then_holds(inverse, name):
+    controller = controllers(inverse, 4.9)[name]()
+    loop, t = ReachTarget(controller, 1e-3), 7.0
+    command, commands = loop.begin(t, 0.0, 2e-3, 4.9), 1
+    while not command.done:
+        # Late by 0.3 s each time: the next period is the shorter.
+        t += command.wait + 0.3
+        held = command.setpoint
+        command, commands = loop.update(t, held, 2e-3, 4.9), commands + 1
+    assert commands == 21
+    assert t == pytest.approx(27.3)
+    for _ in range(3):
+        t += command.wait
+        command = loop.update(t, held, 1e-3, 4.9)
+        assert (command.setpoint, command.done) == (held, True)
+
+
+# Wrong input.
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ThermalLag(0.0), "time_constant: expected a positive"),
+        (lambda: ThermalLag(5.0, -1.0), "level: expected a finite"),
+        (lambda: ThermalLag(5.0, math.nan), "level: expected a finite"),
+        (lambda: ThermalLag().advance(-1.0, 1.0), "duration: expected a finite number"),
+        (lambda: ThermalLag().advance(1.0, math.nan), "voltage: expected a finite"),
+        (lambda: ThermalLag().lead(-1.0, 2.0, LIMITS), "target: expected a finite number of V"),
+        (lambda: ThermalLag().lead(1.0, 0.0, LIMITS), "horizon: expected a positive"),
+        (lambda: ThermalLag().lead(1.0, 2.0, (3.0, 0.0)), "limits: expected two finite"),
+        (lambda: ThermalLag().lead(1.0, 2.0, (-1.0, 3.0)), "limits: expected two finite"),
+        (lambda: InverseControlParameters(horizon=0.0), "horizon: expected a positive"),
+        (lambda: InverseControlParameters(duration=math.inf), "duration: expected a positive"),
+        (lambda: ProportionalIntegralParameters(0.0), "gain: expected a number other than 0"),
+        (lambda: ProportionalIntegralParameters(1.0, 0.0), "integral_time: expected a positive"),
+        (lambda: MuscleProportionalIntegral((-1.0, 3.0), ProportionalIntegralParameters(1.0)), "limits: expected"),
+    ],
+)
+def test_wrong_input_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda i: LengthTask(i, walk_variance=0.0), "walk_variance: expected a positive"),
+        (lambda i: LengthTask(i, slopes=(1e-3, 2e-3)), "slopes: expected negative"),
+        (lambda i: ForceTask(i, reading_variance=math.nan), "reading_variance: expected a positive"),
+        (lambda i: ForceTask(i, slopes=(-1.0, 2.0)), "slopes: expected positive"),
+        (lambda i: ForceTask(i, slopes=(2.0, 1.0)), "slopes: expected"),
+        (lambda i: MuscleOpenLoop(LengthTask(i), limits=(4.0, 5.0)), "limits: expected an overlap"),
+        (lambda i: MuscleClosedLoop(ForceTask(i)).aim(math.nan, 0.0, 0.0, 0.3), "target: expected a finite"),
+        (lambda i: MuscleClosedLoop(ForceTask(i)).aim(5.0, 0.0, 0.0, 0.3, 1.0), "force task: expected no further"),
+        (lambda i: MuscleClosedLoop(LengthTask(i)).aim(0.0, 0.0, 0.0, 0.0), "length task: expected the force"),
+    ],
+)
+def test_wrong_input_of_a_controller_is_named(inverse, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(inverse)
+
+
+def test_time_does_not_go_back_and_targets_come_first(inverse):
+    controller = MuscleClosedLoop(ForceTask(inverse))
+    with pytest.raises(RuntimeError, match="expected a target first"):
+        controller.update(0.0, 0.0, 0.3)
+    controller.aim(5.0, 10.0, 0.0, 0.3)
+    with pytest.raises(ValueError, match="duration: expected a finite number"):
+        controller.update(9.0, 0.0, 0.3)
