@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bench.cli import main
 from bench.clock import VirtualClock
 from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
@@ -33,19 +32,6 @@ DEVICES = ("tec", "displacement", "base", "tip", "piezo")
 SENSORS = {DEFLECTION, BASE, TIP}
 LIMITS = {"tec": 0.15, "piezo": 40.0}
 MICRO = 1e-6
-
-
-@pytest.fixture
-def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 def assignments(option, values):
