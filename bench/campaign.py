@@ -6,7 +6,7 @@ A package registers a `Study` as an entry point of the group `bench.studies`; `b
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -104,11 +104,6 @@ class Campaign:
             self._whole.runs.append(result)
         return result
 
-    @property
-    def laboratory_seconds(self) -> float:
-        """Laboratory time of all runs, s."""
-        return sum(run.outcome.laboratory_seconds for run in self.runs)
-
 
 @dataclass(frozen=True)
 class ResultTable:
@@ -133,8 +128,12 @@ class ResultTable:
 
     def print(self, values: Mapping[str, Any], console: Console) -> None:
         """Print it, with the first column aligned left and all others right."""
-        rows = ([cell.format_map(values) for cell in row] for row in self.rows)
-        console.print(make_table(self.title.format_map(values), self.columns, rows))
+        table = Table(title=self.title.format_map(values), title_justify="left")
+        for i, column in enumerate(self.columns):
+            table.add_column(column, justify="left" if i == 0 else "right")
+        for row in self.rows:
+            table.add_row(*(cell.format_map(values) for cell in row))
+        console.print(table)
         if self.note:
             console.print(self.note.format_map(values), highlight=False)
 
@@ -223,7 +222,7 @@ def reproduce(
     values = {
         "seed": seed,
         **found.values,
-        "laboratory_seconds": campaign.laboratory_seconds,
+        "laboratory_seconds": sum(run.outcome.laboratory_seconds for run in campaign.runs),
         "wall_seconds": stopwatch.seconds(),
         "folder": str(campaign.folder),
         "figures": [str(path) for path in found.figures],
@@ -231,7 +230,7 @@ def reproduce(
     }
     for table in found.tables:
         table.print(values, console)
-    print_end(values, console)
+    _print_end(values, console)
     return values
 
 
@@ -250,18 +249,7 @@ def reached_targets(run: RunResult, signal: str) -> TargetResults:
     return results
 
 
-def make_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with its first column aligned left and all others right."""
-    table = Table(title=title, title_justify="left")
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def print_end(values: Mapping[str, Any], console: Console) -> None:
-    """Print how long a study took and where its files are, from `laboratory_seconds`, `folder` and the like."""
+def _print_end(values: Mapping[str, Any], console: Console) -> None:
     laboratory, wall = values["laboratory_seconds"], values["wall_seconds"]
     console.print(
         f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",

@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -35,7 +35,7 @@ from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 LOAD, STAGE = "load", "stage"
-"""What an operator does in these laboratories: hang a load of so many N on the muscle, or fasten it to the stage."""
+"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, or fasten it to the stage."""
 
 FAN_LINE = 0
 """Digital line of the T7 that switches the fan: FIO0, on when high."""
@@ -43,7 +43,7 @@ FAN_LINE = 0
 _HEARTBEAT_TIME = 0x1017
 """Object of the supply with the period of its heartbeat, ms; 0 for none."""
 _BROKEN_CELL = -1e3
-"""What a load cell with a broken wire shows, N."""
+"""Reading of a load cell with a broken wire, N."""
 
 FaultName = Literal[
     "none",
@@ -57,8 +57,8 @@ FaultName = Literal[
 ]
 
 
-class Muscle(Protocol):
-    """What the frame and its instruments ask of a muscle."""
+class MusclePlant(Protocol):
+    """What frame and instruments need of a muscle."""
 
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds."""
@@ -88,8 +88,8 @@ class Muscle(Protocol):
         """Position of the end, m from rest."""
 
 
-class MuscleLaboratorySettings(LaboratorySettings):
-    """What a rig file may say of these laboratories."""
+class MuscleLaboratorySettings(LaboratorySettings, ABC):
+    """Keys of the table `[emulation]` that all these laboratories have."""
 
     battery_voltage: float = Field(default=10.0, gt=0, le=60, description="voltage behind the PWM supply, V")
     supply_watchdog: float = Field(default=5.0, ge=0, le=65, description="as set in the supply by ^RWD, s")
@@ -108,14 +108,18 @@ class MuscleLaboratorySettings(LaboratorySettings):
     )
     fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
 
+    @abstractmethod
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the muscle of this laboratory."""
+
 
 class Frame:
-    """The muscle with what its lower end is fastened to: a `sim_devices.world.Plant`.
+    """The muscle with its load or stage: a `sim_devices.world.Plant`.
 
     Parameters
     ----------
-    muscle : Muscle
-        What is tested; it begins without a load.
+    muscle : MusclePlant
+        The specimen; it begins without a load.
 
     Attributes
     ----------
@@ -125,7 +129,7 @@ class Frame:
         The instrument that switches the fan, once it is there.
     """
 
-    def __init__(self, muscle: Muscle) -> None:
+    def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
         self.t7: EmulatedT7 | None = None
@@ -150,7 +154,7 @@ class Frame:
         self.muscle.advance(dt)
 
 
-class MuscleLaboratory(ABC):
+class MuscleLaboratory:
     """A `bench.rig.Laboratory` with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
     Parameters
@@ -163,14 +167,16 @@ class MuscleLaboratory(ABC):
         Seed of the room and of the noise; the specimen has its own.
     """
 
-    Settings: type[MuscleLaboratorySettings] = MuscleLaboratorySettings
+    Settings: ClassVar[type[MuscleLaboratorySettings]]
 
     def __init__(self, settings: MuscleLaboratorySettings, clock: Clock, seed: int) -> None:
-        # One stream a source of noise: how often one instrument is asked must not change what another says.
+        if not isinstance(settings, self.Settings):
+            raise TypeError(f"settings: expected {self.Settings.__name__}, got {type(settings).__name__}")
+        # One stream a source of noise: how often one instrument is read must not change the readings of another.
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
         self._clock = clock
-        self.muscle = self.make_muscle(settings, plant)
+        self.muscle = settings.make_muscle(plant)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
         self._cell_is_broken = False
@@ -199,10 +205,6 @@ class MuscleLaboratory(ABC):
         self._opened = ExitStack()
         if settings.fault != "none":
             self.world.add(_Fault(self, settings.fault_time))
-
-    @abstractmethod
-    def make_muscle(self, settings: MuscleLaboratorySettings, rng: np.random.Generator) -> Muscle:
-        """Return the muscle of this laboratory."""
 
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name.
@@ -254,7 +256,7 @@ class MuscleLaboratory(ABC):
         self._opened.close()
 
     def go_wrong(self) -> None:
-        """Have the fault of the settings happen, if it is one that happens at an instant."""
+        """Make the fault of the settings happen, if it is one of an instant."""
         fault = self._settings.fault
         if fault == "silent-supply":
             self.supply.unplug()
@@ -272,7 +274,7 @@ class MuscleLaboratory(ABC):
 
 
 class _Fault:
-    """Something that goes wrong at its time; a `Timed` part of the world."""
+    """A fault at its time; a `Timed` part of the world."""
 
     def __init__(self, laboratory: MuscleLaboratory, instant: float) -> None:
         self._laboratory = laboratory
@@ -283,18 +285,25 @@ class _Fault:
         return self._due
 
     def expire(self) -> None:
-        """Let it happen, once."""
+        """Make it happen, once."""
         self._due = math.inf
         self._laboratory.go_wrong()
 
 
-class SMALaboratorySettings(MuscleLaboratorySettings):
-    """What a rig file may say of the laboratory with the SMA wire."""
-
+class _ThermalSettings(MuscleLaboratorySettings):
     ambient_deviation: float = Field(
         default=0.3, ge=0, le=5, description="standard deviation of the room temperature, K"
     )
+
+
+class SMALaboratorySettings(_ThermalSettings):
+    """Keys of the laboratory with the SMA wire."""
+
     specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="which specimen it is")
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the wire."""
+        return SMAWire(SMAParameters(specimen_seed=self.specimen_seed, ambient_sd=self.ambient_deviation), rng)
 
 
 class SMALaboratory(MuscleLaboratory):
@@ -302,21 +311,17 @@ class SMALaboratory(MuscleLaboratory):
 
     Settings = SMALaboratorySettings
 
-    def make_muscle(self, settings: MuscleLaboratorySettings, rng: np.random.Generator) -> Muscle:
-        """Return the wire."""
-        if not isinstance(settings, SMALaboratorySettings):
-            raise TypeError(f"settings: expected SMALaboratorySettings, got {type(settings).__name__}")
-        return SMAWire(
-            SMAParameters(specimen_seed=settings.specimen_seed, ambient_sd=settings.ambient_deviation), rng
-        )
-
 
 class McKibbenLaboratorySettings(MuscleLaboratorySettings):
-    """What a rig file may say of the laboratory with the McKibben muscle."""
+    """Keys of the laboratory with the McKibben muscle."""
 
     pressure_deviation: float = Field(
         default=500.0, ge=0, le=1e5, description="standard deviation of the regulated pressure, Pa"
     )
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+        """Return the muscle."""
+        return McKibbenMuscle(McKibbenParameters(supply_sd=self.pressure_deviation), rng)
 
 
 class McKibbenLaboratory(MuscleLaboratory):
@@ -327,28 +332,16 @@ class McKibbenLaboratory(MuscleLaboratory):
 
     Settings = McKibbenLaboratorySettings
 
-    def make_muscle(self, settings: MuscleLaboratorySettings, rng: np.random.Generator) -> Muscle:
+
+class CoiledPolymerLaboratorySettings(_ThermalSettings):
+    """Keys of the laboratory with the super-coiled polymer muscle."""
+
+    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the muscle."""
-        if not isinstance(settings, McKibbenLaboratorySettings):
-            raise TypeError(f"settings: expected McKibbenLaboratorySettings, got {type(settings).__name__}")
-        return McKibbenMuscle(McKibbenParameters(supply_sd=settings.pressure_deviation), rng)
-
-
-class CoiledPolymerLaboratorySettings(MuscleLaboratorySettings):
-    """What a rig file may say of the laboratory with the super-coiled polymer muscle."""
-
-    ambient_deviation: float = Field(
-        default=0.3, ge=0, le=5, description="standard deviation of the room temperature, K"
-    )
+        return CoiledPolymerMuscle(CoiledPolymerParameters(ambient_sd=self.ambient_deviation), rng)
 
 
 class CoiledPolymerLaboratory(MuscleLaboratory):
     """The laboratory with a super-coiled polymer muscle."""
 
     Settings = CoiledPolymerLaboratorySettings
-
-    def make_muscle(self, settings: MuscleLaboratorySettings, rng: np.random.Generator) -> Muscle:
-        """Return the muscle."""
-        if not isinstance(settings, CoiledPolymerLaboratorySettings):
-            raise TypeError(f"settings: expected CoiledPolymerLaboratorySettings, got {type(settings).__name__}")
-        return CoiledPolymerMuscle(CoiledPolymerParameters(ambient_sd=settings.ambient_deviation), rng)

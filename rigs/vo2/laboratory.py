@@ -21,7 +21,7 @@ from sim_devices.world import World
 
 
 class VO2LaboratorySettings(LaboratorySettings):
-    """What a rig file may say of this laboratory."""
+    """Keys of the table `[emulation]`."""
 
     specimen_seed: int = Field(default=VO2Parameters.specimen_seed, ge=0, description="which specimen it is")
     session_offset: float = Field(
@@ -51,7 +51,7 @@ class VO2Laboratory:
     Settings = VO2LaboratorySettings
 
     def __init__(self, settings: VO2LaboratorySettings, clock: Clock, seed: int) -> None:
-        # One stream a source of noise: how often one instrument is asked must not change what another says.
+        # One stream a source of noise: how often one instrument is read must not change the readings of another.
         plant_stream, tec_stream, psd_stream, t7_stream = np.random.default_rng(seed).spawn(4)
         specimen = VO2Parameters(
             specimen_seed=settings.specimen_seed,
@@ -80,8 +80,8 @@ class VO2Laboratory:
             raise
         return {"tec": port, "psd": self._t7_server.address}
 
-    def operate(self, task: str, value: float) -> None:  # noqa: ARG002 - nothing is done by hand here
-        """Refuse: nothing is to be done by hand.
+    def operate(self, task: str, value: float) -> None:  # noqa: ARG002
+        """Refuse any task.
 
         Raises
         ------
