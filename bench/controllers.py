@@ -8,7 +8,6 @@ from typing import Literal
 
 from bench.control.baselines import IntegralControl, LookUp
 from bench.control.following import ClosedLoopFollower, IntegralFollower, OpenLoopFollower
-from bench.control.inverse import Inverse
 from bench.control.latched import Latched
 from bench.control.muscle import (
     ForceTask,
@@ -29,7 +28,8 @@ from bench.control.tracking import (
 from bench.control.two_stage_inverse import TwoStageInverse
 from bench.errors import DataError
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, TwoStage, TwoStageState
-from bench.model_file import ModelFile, load_coupled_model, load_model
+from bench.hysteresis.inverse import Inverse
+from bench.results.model_file import ModelFile, load_coupled_model, load_model
 
 Policy = Literal["nearest", "paper"]
 TargetControllerName = Literal["open-loop-inverse", "polynomial", "integral", "closed-loop-inverse", "latched"]

@@ -63,8 +63,8 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve, Operator, Preisach, Summed, TwoStage
 from bench.journal import Event, Record, StepRecord
-from bench.model_file import FORMAT, is_coupled_model, parse_coupled_model, parse_model
 from bench.protocol import TRACES
+from bench.results.model_file import FORMAT, is_coupled_model, parse_coupled_model, parse_model
 from bench.runs import run_card
 
 QUEUED_TICKS = 20_000

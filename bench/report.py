@@ -17,9 +17,9 @@ from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, 
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.identification import measure_errors
 from bench.journal import Record, Table
-from bench.measurements import header_with_unit, write_csv
-from bench.model_file import ModelFile, is_coupled_model, load_model, parse_model
-from bench.modelling import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.data import header_with_unit, write_csv
+from bench.results.model_file import ModelFile, is_coupled_model, load_model, parse_model
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.runs import RECORDING_NAME, run_card
 from bench.tracking_results import results_json
 

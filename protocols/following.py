@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.control.inverse import Inverse
 from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
 from bench.controllers import FollowerName, load_model_for, make_follower, saturated_below
 from bench.hysteresis import MemoryCurve, Preisach
-from bench.measurements import read_columns
+from bench.hysteresis.inverse import Inverse
 from bench.protocol import (
     Control,
     Messages,
@@ -23,6 +22,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
+from bench.results.data import read_columns
 from bench.tracking_results import FOLLOW
 
 

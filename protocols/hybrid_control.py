@@ -19,8 +19,8 @@ from bench.control.hybrid import (
 )
 from bench.control.loops import SampledController
 from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS
-from bench.model_file import load_hybrid_model
 from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from bench.results.model_file import load_hybrid_model
 from protocols.muscle import parse_numbers
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]

@@ -16,7 +16,6 @@ from bench.controllers import (
     saturated_below,
 )
 from bench.hysteresis import MemoryCurve
-from bench.measurements import read_columns
 from bench.protocol import (
     Control,
     Dwell,
@@ -29,6 +28,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
+from bench.results.data import read_columns
 from bench.tracking_results import REACH, READING
 
 

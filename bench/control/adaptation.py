@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.hysteresis.inverse import Inverse
 
 
 @dataclass(frozen=True, eq=False)

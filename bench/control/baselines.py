@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.control.inverse import Reach
 from bench.control.tracking import Reading, Script, Scripted, Trace, check_positive
 from bench.hysteresis import Polynomial
+from bench.hysteresis.inverse import Reach
 
 
 class LookUp(Scripted):

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse, Reach
 from bench.control.tracking import Actuator, Trace, check_positive
 from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.hysteresis.inverse import Inverse, Reach
 
 
 @dataclass(frozen=True)

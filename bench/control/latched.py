@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse
 from bench.control.tracking import (
     Arrival,
     Correcting,
@@ -18,6 +17,7 @@ from bench.control.tracking import (
     check_positive,
 )
 from bench.hysteresis import MemoryCurve, Preisach
+from bench.hysteresis.inverse import Inverse
 
 Direction = Literal[-1, 1]
 

@@ -24,11 +24,11 @@ from typing import Protocol
 
 from bench.control.baselines import saturation
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Reach
 from bench.control.loops import SHORTEST_WAIT
 from bench.control.tracking import Actuator, Command, Trace, check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
 from bench.hysteresis import TwoStageState, _checks
+from bench.hysteresis.inverse import Reach
 
 
 @dataclass(frozen=True, slots=True)

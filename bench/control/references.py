@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.inverse import Inverse
 
 
 def tracking_targets(rng: np.random.Generator, low: float, high: float, count: int = 60) -> Floats:

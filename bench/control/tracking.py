@@ -30,8 +30,8 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse, Inversion, Reach
 from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.hysteresis.inverse import Inverse, Inversion, Reach
 
 # Part of the output at stake within which a clipped answer still counts as met.
 _CLOSE = 1e-9

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bench.control.inverse import Inverse, Reach
 from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, _checks
+from bench.hysteresis.inverse import Inverse, Reach
 from bench.hysteresis.prandtl_ishlinskii import PlayState
 from bench.hysteresis.two_stage import Stage, TwoStage, TwoStageState
 

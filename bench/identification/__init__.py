@@ -1,6 +1,8 @@
 """Identification of hysteresis operators: excitation, constrained least squares, error measures."""
 
 from bench.hysteresis.regressor import Regressor
+from bench.identification.by_name import MODELS, Identification, Initial, ModelSpec, identify
+from bench.identification.cross_validation import CrossValidation, Trial, cross_validate
 from bench.identification.design import (
     Assessment,
     assess,
@@ -9,7 +11,6 @@ from bench.identification.design import (
     laboratory_time,
 )
 from bench.identification.excitation import damped_oscillation, ramps, random_validation
-from bench.identification.identify import MODELS, Identification, Initial, ModelSpec, identify
 from bench.identification.inspection import Coverage, check_data, measure_coverage
 from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
 from bench.identification.measures import Comparison, Errors, compare, measure_errors
@@ -23,7 +24,6 @@ from bench.identification.two_stage import (
     predict_series,
     voltage_steps,
 )
-from bench.identification.validation import CrossValidation, Trial, cross_validate
 
 __all__ = [
     "MODELS",

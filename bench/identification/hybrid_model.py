@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
+from bench.identification.by_name import Identification, Initial, identify
 from bench.identification.dynamics import ThirdOrder
-from bench.identification.identify import Identification, Initial, identify
 from bench.identification.thermal_network import NODES, ThermalNetwork
 
 # How far beyond the range that a part was fitted on it may be used, as part of that range.

@@ -38,9 +38,9 @@ from bench.identification import measure_errors
 from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.identification.thermal_network import Design
 from bench.journal import Record
-from bench.model_file import HybridFile
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.model_file import HybridFile
 from bench.runs import RunResult
 
 Floats = npt.NDArray[np.float64]

@@ -30,7 +30,6 @@ from bench.hysteresis import Preisach, TwoStage
 from bench.identification import Errors
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series, predict_series
 from bench.journal import Record, add_model
-from bench.model_file import CoupledFile
 from bench.muscle_runs import (
     FORCE,
     LENGTH,
@@ -45,6 +44,7 @@ from bench.muscle_runs import (
 )
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.model_file import CoupledFile
 from bench.runs import RunResult
 from bench.tracking_results import TargetResults, target_results
 

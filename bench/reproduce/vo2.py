@@ -21,9 +21,9 @@ from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_a
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.modelling import IdentifiedFile, errors_json, identify_file, predict
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.runs import RunResult
 from bench.tracking_results import FollowingResult, TargetResults, following_result, target_results
 

@@ -31,8 +31,8 @@ from bench.hysteresis import (
     uniform_levels,
 )
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
-from bench.model_file import CoupledFile, ModelFile
 from bench.protocol import TRACES
+from bench.results.model_file import CoupledFile, ModelFile
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),

@@ -21,8 +21,8 @@ from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.identification.hybrid_model import HybridModel
 from bench.identification.thermal_network import Design
 from bench.journal import Record
-from bench.model_file import HybridFile
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
+from bench.results.model_file import HybridFile
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid_control import REST, moves_of

@@ -23,7 +23,7 @@ from bench.hysteresis import (
 from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.identification.hybrid_model import HybridModel
 from bench.identification.thermal_network import Design
-from bench.model_file import (
+from bench.results.model_file import (
     COUPLED_FORMAT,
     FORMAT,
     HYBRID_FORMAT,

@@ -11,9 +11,9 @@ from bench.cli import main
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
-from bench.model_file import CoupledFile, ModelFile
 from bench.muscle_runs import FORCE, LENGTH, SAMPLE
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
+from bench.results.model_file import CoupledFile, ModelFile
 from bench.rig import load_rig
 from bench.tracking_results import target_results
 from protocols.force_voltage import scaled_steps

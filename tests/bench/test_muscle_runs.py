@@ -11,7 +11,6 @@ from bench.errors import DataError
 from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
 from bench.identification.two_stage import measure_series, predict_series
 from bench.journal import FILE_NAME, Record
-from bench.model_file import load_coupled_model
 from bench.muscle_runs import (
     FORCE,
     LENGTH,
@@ -26,6 +25,7 @@ from bench.muscle_runs import (
     read_series,
 )
 from bench.protocol import find_protocol
+from bench.results.model_file import load_coupled_model
 from bench.runs import Run, carry_out
 from protocols.force_voltage import scaled_steps
 

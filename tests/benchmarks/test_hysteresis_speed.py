@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 from bench.control.adaptation import Adapter
-from bench.control.inverse import Inverse
 from bench.hysteresis import PrandtlIshlinskii, Preisach, ThermalExpansion, uniform_levels
+from bench.hysteresis.inverse import Inverse
 from bench.identification import damped_oscillation
 
 pytestmark = pytest.mark.benchmark

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.control.adaptation import Adapter
-from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, Preisach, QuadraticTerm, uniform_levels
+from bench.hysteresis.inverse import Inverse
 
 
 def plant(order=20, seed=0, term=None, bias=0.3):

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.control.inverse import Reach
 from bench.control.muscle import (
     ForceTask,
     LengthTask,
@@ -20,6 +19,7 @@ from bench.control.muscle import (
     ThermalLag,
 )
 from bench.control.two_stage_inverse import TwoStageInverse
+from bench.hysteresis.inverse import Reach
 from bench.identification import Series, identify_two_stage, voltage_steps
 from sim_devices.plants.sma import SMAParameters, SMAWire
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.control.inverse import Inverse
 from bench.control.references import fastest_slope, modulated_sine, tracking_targets
 from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
+from bench.hysteresis.inverse import Inverse
 
 
 class TestTargets:

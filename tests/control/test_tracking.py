@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
-from bench.control.inverse import Inverse, Reach
 from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
 from bench.control.references import modulated_sine, tracking_targets
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
+from bench.hysteresis.inverse import Inverse, Reach
 
 LOW, HIGH = 21.0, 84.0
 NARROW = (45.0, 66.0)

@@ -8,7 +8,7 @@ import pytest
 
 from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.identification import check_data, cross_validate, fit, identify, measure_coverage, ramps
-from bench.identification.identify import prepare
+from bench.identification.by_name import prepare
 
 
 def plane(order=4):

@@ -9,8 +9,8 @@ import pytest
 from bench.cli import main
 from bench.hybrid_runs import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from bench.journal import Record
-from bench.model_file import load_hybrid_model
 from bench.reproduce.hybrid import CONTROLLERS, RESONANCES, Tracking
+from bench.results.model_file import load_hybrid_model
 
 RUNS = {
     "current-sine": 2,

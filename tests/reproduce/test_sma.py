@@ -9,8 +9,8 @@ from bench.cli import main
 from bench.identification import measure_errors
 from bench.identification.two_stage import measure_series
 from bench.journal import Record
-from bench.model_file import load_coupled_model
 from bench.muscle_runs import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
+from bench.results.model_file import load_coupled_model
 from bench.tracking_results import target_results
 
 CONTROLLERS = ("open_loop_inverse", "proportional_integral", "closed_loop_inverse")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.control.inverse import Inverse, Reach
 from bench.hysteresis import MemoryCurve, PolynomialTerm, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
+from bench.hysteresis.inverse import Inverse, Reach
 
 LOW, HIGH = 21.0, 84.0
 

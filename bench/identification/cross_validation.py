@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.identification.identify import Initial, prepare
+from bench.identification.by_name import Initial, prepare
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ class Inverse:
         ValueError
             If the target is not finite.
         """
-        from bench.control import _kernels
+        from bench.hysteresis import _inverse_kernels as _kernels
 
         if not math.isfinite(target):
             raise ValueError(f"target: expected a finite number, got {target}")
@@ -219,7 +219,7 @@ class Inverse:
         ValueError
             If `targets` is empty, not one-dimensional or not finite.
         """
-        from bench.control import _kernels
+        from bench.hysteresis import _inverse_kernels as _kernels
 
         wanted = _checks.samples("targets", targets)
         before = self.operator.initial_state() if state is None else state

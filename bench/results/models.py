@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.control.baselines import LookUp
-from bench.control.inverse import Inverse, Reach
 from bench.controllers import Policy
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import (
@@ -24,6 +23,7 @@ from bench.hysteresis import (
     ThermalExpansion,
     uniform_levels,
 )
+from bench.hysteresis.inverse import Inverse, Reach
 from bench.identification import (
     MODELS,
     Assessment,
@@ -41,8 +41,8 @@ from bench.identification import (
     identify,
     measure_coverage,
 )
-from bench.measurements import FEWEST_ROWS, check_excitation, read_columns
-from bench.model_file import ModelFile, load_model
+from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
 
