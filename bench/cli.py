@@ -82,11 +82,11 @@ def list_(
     A protocol is shown with its parameters, a rig with its file: `bench list vo2-hardware > desk.toml`
     gives you a copy to fill in.
     """
-    from bench.identification import MODELS
+    from bench.hysteresis import identifiable_models
     from bench.protocol import packaged_protocols
     from bench.rig import load_rig, packaged_rigs
 
-    models = {model: spec.summary for model, spec in MODELS.items()}
+    models = {model: spec.summary for model, spec in identifiable_models().items()}
     protocols = packaged_protocols()
     rigs = {rig: load_rig(rig) for rig in packaged_rigs()}
     if name is None:
@@ -108,11 +108,11 @@ def list_(
     elif name in protocols:
         print_protocol(protocols[name])
         write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in protocols[name].help()]})
-    elif name in MODELS:
+    elif name in models:
         console.print(models[name])
         write_json(json_file, {"name": name, "summary": models[name]})
     else:
-        known = ", ".join([*rigs, *protocols, *MODELS])
+        known = ", ".join([*rigs, *protocols, *models])
         raise ConfigurationError(f"there is no rig, protocol or model {name!r}; there are: {known}")
 
 
@@ -370,7 +370,7 @@ def identify_hybrid_(
     voltage, third-order dynamics from the fast step.
     """
     from bench.hybrid_runs import identify_hybrid
-    from bench.results.model_file import HybridFile
+    from bench.results.model_file import ModelFile
 
     found = identify_hybrid(steps, static, loops, step, plays=plays)
     dynamics = found.dynamics
@@ -393,7 +393,8 @@ def identify_hybrid_(
     ]
     print_rows("hybrid", rows)
     if out is not None:
-        HybridFile(found.model, {"sources": [run.name for run in (steps, static, loops, step)]}).save(out)
+        sources = [run.name for run in (steps, static, loops, step)]
+        ModelFile("hybrid", found.model, provenance={"sources": sources}).save(out)
         console.print(f"model: {out}", highlight=False, soft_wrap=True)
     write_json(
         json_file,

@@ -20,7 +20,7 @@ from bench.control.hybrid import (
 from bench.control.loops import SampledController
 from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS
 from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
-from bench.results.model_file import load_hybrid_model
+from bench.results.model_file import load_model
 from protocols.muscle import parse_numbers
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
@@ -61,7 +61,7 @@ def hybrid_control(parameters: Parameters) -> Messages:
     position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
     a hold at 0.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
+    model = load_model(Path(parameters.model), "hybrid").model
     reference, duration = _reference(parameters)
     controller: SampledController
     numbers = MidRangingParameters(period=1.0 / parameters.rate, every=max(1, round(0.02 * parameters.rate)))
@@ -105,7 +105,7 @@ def fine_step(parameters: StepParameters) -> Messages:
     The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
     instruments are called directly.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
+    model = load_model(Path(parameters.model), "hybrid").model
     controller = FineController(
         model,
         lambda t: parameters.step if t >= parameters.rest else 0.0,

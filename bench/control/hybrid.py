@@ -205,7 +205,7 @@ class HysteresisInverse:
             raise ValueError("hysteresis: expected an operator of plays alone, got one with dead zones")
         if not stroke > 0.0:
             raise ValueError(f"stroke: expected a positive number of m, got {stroke}")
-        inverse = operator.inverse()
+        inverse = operator.inverse_operator()
         self._offset = inverse.bias
         self._thresholds: list[float] = inverse.thresholds.tolist()
         self._weights: list[float] = inverse.weights.tolist()

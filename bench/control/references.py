@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import MemoryCurve, _checks
+from bench.hysteresis import Inverse, _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.inverse import Inverse
+
+S = TypeVar("S")
 
 
 def tracking_targets(rng: np.random.Generator, low: float, high: float, count: int = 60) -> Floats:
@@ -112,9 +114,7 @@ class Slope:
         return self.rate <= limit
 
 
-def fastest_slope(
-    inverse: Inverse, times: ArrayLike, reference: ArrayLike, state: MemoryCurve | None = None
-) -> Slope:
+def fastest_slope(inverse: Inverse[S], times: ArrayLike, reference: ArrayLike, state: S | None = None) -> Slope:
     """Return the input rate that a moving reference asks for, by inverting it.
 
     A step from the present output to the start of the reference does not count, nor do the two samples about
@@ -129,8 +129,8 @@ def fastest_slope(
         Increasing times, s, N >= 3.
     reference : array_like, shape (N,)
         Reference at these times, output units.
-    state : MemoryCurve or None
-        Memory before the reference; default negative saturation.
+    state : object or None
+        Memory before the reference; default that of the model.
 
     Raises
     ------

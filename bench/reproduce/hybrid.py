@@ -40,7 +40,7 @@ from bench.identification.thermal_network import Design
 from bench.journal import Record
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
-from bench.results.model_file import HybridFile
+from bench.results.model_file import ModelFile
 from bench.runs import RunResult
 
 Floats = npt.NDArray[np.float64]
@@ -145,7 +145,8 @@ def reproduce_hybrid(*, rig: str, seed: int, out: Path, live: bool, console: Con
     )
     found = identify_hybrid(steps.folder, static.folder, loops.folder, step.folder)
     model = campaign.folder / "hybrid.json"
-    HybridFile(found.model, {"sources": [run.folder.name for run in (steps, static, loops, step)]}).save(model)
+    sources = [run.folder.name for run in (steps, static, loops, step)]
+    ModelFile("hybrid", found.model, provenance={"sources": sources}).save(model)
 
     # Only the hybrid one has to show that it holds for long.
     tracked = {

@@ -44,7 +44,7 @@ from bench.muscle_runs import (
 )
 from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
-from bench.results.model_file import CoupledFile
+from bench.results.model_file import ModelFile
 from bench.runs import RunResult
 from bench.tracking_results import TargetResults, target_results
 
@@ -147,7 +147,7 @@ class Characterization:
 
     def keep_model(self, campaign: Campaign) -> None:
         """Put the two-stage model into the record of every run of a campaign, for the view of its densities."""
-        content = CoupledFile("two-stage", self.models["two-stage"].model).to_json()
+        content = ModelFile("two-stage", self.models["two-stage"].model).to_json()
         for run in campaign.runs:
             add_model(run.folder, "two-stage", 0.0, content)
 

@@ -68,7 +68,14 @@ class PaperModel:
 PROPOSED = "preisach-nonmonotonic"
 
 MODELS = (
-    PaperModel("nonmonotonic", "proposed model", PROPOSED, {"levels": 20, "plane": (30.0, 70.0)}, 46.8, 108.1),
+    PaperModel(
+        "nonmonotonic",
+        "proposed model",
+        PROPOSED,
+        {"levels": 20, "plane": (30.0, 70.0), "reference": 20.0},
+        46.8,
+        108.1,
+    ),
     PaperModel("signed", "signed Preisach", "preisach-signed", {"levels": 20, "plane": (21.0, 84.0)}, 80.3, 108.8),
     PaperModel("polynomial", "polynomial, degree 12", "polynomial", {"degree": 12}, 483.0, 478.1),
 )

@@ -1,54 +1,41 @@
 """Model files: an identified model as versioned JSON, with its units and where it comes from.
 
-The file of an operator, version 1, is an object with these keys:
+A file of version 2 is an object with these keys:
 
 `format`, `version`
-    `bench-model` and 1.
+    `bench-model` and 2.
 `name`
-    Under which name it was identified, such as `preisach-nonmonotonic`.
-`operator`
-    The operator: its `type`, levels, densities or coefficients, ranges and units, as the operator itself
-    writes them.
+    Under which name the model was identified, such as `preisach-nonmonotonic`.
+`kind`
+    The class of the model: the `kind` of a class that an entry of `bench.models` names.
+`model`
+    The model as it writes itself: its `type` (the kind), coefficients, ranges and units.
 `memory`
-    The operator's state at the end of the data that it was identified from: the memory curve of a Preisach
-    operator, the list of play states of a Prandtl-Ishlinskii one; null for one without memory.
+    The state of an operator at the end of the data from which it was identified; null for a model without memory
+    or of several inputs.
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
 
-The file of a model among voltage, force and length has the format `bench-coupled-model`, that of the whole of a
-thermo-piezoelectric actuator `bench-hybrid-model`; both have `model` in place of `operator` and `memory`.
+Version 1 had three formats, which are still read: `bench-model`, with `operator` in place of `kind` and `model`, and
+`bench-coupled-model` and `bench-hybrid-model`, without `kind` and `memory`.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bench.errors import DataError
-from bench.hysteresis import (
-    Linear,
-    MemoryCurve,
-    Operator,
-    PrandtlIshlinskii,
-    Summed,
-    TwoStage,
-    coupled_from_json,
-    operator_from_json,
-)
-from bench.identification.hybrid_model import HybridModel
+from bench.hysteresis import Operator, model_class, model_from_json
 
 FORMAT = "bench-model"
-COUPLED_FORMAT = "bench-coupled-model"
-HYBRID_FORMAT = "bench-hybrid-model"
-VERSION = 1
-
-
-Memory = MemoryCurve | tuple[float, ...]
+VERSION = 2
+_FORMER_FORMATS = {FORMAT: "operator", "bench-coupled-model": "model", "bench-hybrid-model": "model"}
+"""The formats of version 1, and the key of the model in each."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +45,32 @@ class ModelFile:
     Attributes
     ----------
     name : str
-        Under which name the operator was identified.
-    operator : Operator
-        The model itself.
-    memory : MemoryCurve, tuple of float, or None
-        Its state at the end of the data that it was identified from: a memory curve, the states of the plays, or
-        None for a model without memory.
+        Under which name the model was identified.
+    model : object
+        The model itself, of a registered class.
+    memory : object
+        State of an operator at the end of the data from which it was identified; None for other models.
     provenance : mapping
         Where it comes from.
     """
 
     name: str
-    operator: Operator[Any]
-    memory: Memory | None
+    model: Any
+    memory: Any = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def operator(self) -> Operator[Any]:
+        """The model, if it is one of one input and one output.
+
+        Raises
+        ------
+        DataError
+            If it is another.
+        """
+        if not isinstance(self.model, Operator):
+            raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one of one input")
+        return self.model
 
     def to_json(self) -> dict[str, Any]:
         """Return the file's content."""
@@ -79,8 +78,9 @@ class ModelFile:
             "format": FORMAT,
             "version": VERSION,
             "name": self.name,
-            "operator": self.operator.to_json(),
-            "memory": self.memory.to_json() if isinstance(self.memory, MemoryCurve) else self.memory,
+            "kind": self.model.kind,
+            "model": self.model.to_json(),
+            "memory": None if self.memory is None else self.operator.state_to_json(self.memory),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -90,197 +90,92 @@ class ModelFile:
         Raises
         ------
         DataError
-            If it cannot be written.
+            If it cannot be written, or could not be loaded again because the class of the model is not registered.
         """
-        _write(path, self.to_json())
+        content = self.to_json()
+        text = json.dumps(content, indent=1, ensure_ascii=False)
+        reference = f"{type(self.model).__module__}:{type(self.model).__qualname__}"
+        try:
+            registered = model_class(self.model.kind)
+        except ValueError:
+            registered = None
+        if registered is not type(self.model):
+            raise DataError(
+                f"model file {path} is not written, as it could not be loaded again: {reference} is not the class "
+                f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
+            )
+        again = parse_model(json.loads(text), str(path)).to_json()
+        if any(again[key] != content[key] for key in ("kind", "model", "memory")):
+            raise DataError(
+                f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
+            )
+        try:
+            path.write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise DataError(f"model file {path} cannot be written: {error}") from None
 
 
-@dataclass(frozen=True)
-class CoupledFile:
-    """The content of the file of a model among voltage, force and length.
+def load_model(path: Path, kind: str | None = None) -> ModelFile:
+    """Read a model file.
 
-    Attributes
+    Parameters
     ----------
-    name : str
-        Under which name it was identified.
-    model : TwoStage, Summed or Linear
-        The model itself.
-    provenance : mapping
-        Where it comes from.
-    """
-
-    name: str
-    model: TwoStage | Summed | Linear
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the file's content."""
-        return _content(COUPLED_FORMAT, self.name, self.model.to_json(), self.provenance)
-
-    def save(self, path: Path) -> None:
-        """Write the file.
-
-        Raises
-        ------
-        DataError
-            If it cannot be written.
-        """
-        _write(path, self.to_json())
-
-
-@dataclass(frozen=True)
-class HybridFile:
-    """The content of the file of a model of a thermo-piezoelectric actuator.
-
-    Attributes
-    ----------
-    model : HybridModel
-        The model.
-    provenance : mapping
-        Where it comes from.
-    """
-
-    model: HybridModel
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the file's content."""
-        return _content(HYBRID_FORMAT, "hybrid", self.model.to_json(), self.provenance)
-
-    def save(self, path: Path) -> None:
-        """Write the file.
-
-        Raises
-        ------
-        DataError
-            If it cannot be written.
-        """
-        _write(path, self.to_json())
-
-
-def load_model(path: Path) -> ModelFile:
-    """Read the file of an operator.
+    path : Path
+        The file.
+    kind : str or None
+        The only kind of model that is accepted; None accepts every registered kind.
 
     Raises
     ------
     DataError
-        If there is none, it is damaged, or its version is unknown.
+        If there is none, it is damaged, its version or kind is unknown, or it is of another kind.
     """
-    return parse_model(_read(path), str(path))
-
-
-def load_coupled_model(path: Path) -> CoupledFile:
-    """Read the file of a model among voltage, force and length; see `load_model`."""
-    return parse_coupled_model(_read(path), str(path))
-
-
-def parse_coupled_model(content: object, source: str) -> CoupledFile:
-    """Make such a model of the content of its file; see `parse_model`."""
-    document = _checked(content, source, COUPLED_FORMAT)
     try:
-        return CoupledFile(
-            name=str(document["name"]),
-            model=coupled_from_json(document["model"]),
-            provenance=dict(document["provenance"]),
-        )
-    except KeyError as error:
-        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
-    except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise DataError(f"model file {source} is damaged: {error}") from None
-
-
-def load_hybrid_model(path: Path) -> HybridFile:
-    """Read the file of a model of a thermo-piezoelectric actuator; see `load_model`."""
-    source = str(path)
-    document = _checked(_read(path), source, HYBRID_FORMAT)
-    try:
-        return HybridFile(HybridModel.from_json(document["model"]), dict(document["provenance"]))
-    except KeyError as error:
-        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
-    except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise DataError(f"model file {source} is damaged: {error}") from None
-
-
-def is_coupled_model(content: object) -> bool:
-    """Return whether the content of a model file is that of a model among voltage, force and length."""
-    return isinstance(content, dict) and content.get("format") == COUPLED_FORMAT
-
-
-def _content(format_: str, name: str, model: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "format": format_,
-        "version": VERSION,
-        "name": name,
-        "model": model,
-        "provenance": {"bench": importlib.metadata.version("actuator-bench"), **provenance},
-    }
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    try:
-        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"model file {path} cannot be written: {error}") from None
-
-
-def _read(path: Path) -> object:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
     # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
     except (ValueError, RecursionError) as error:
         raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
+    file = parse_model(content, str(path))
+    if kind not in (None, file.model.kind):
+        raise DataError(f"model file {path}: expected a model of the kind {kind!r}, got {file.model.kind!r}")
+    return file
 
 
-def _checked(content: object, source: str, expected: str) -> dict[str, Any]:
-    if not isinstance(content, dict) or content.get("format") != expected:
-        raise DataError(f"{source} is not a model file: its `format` is not {expected!r}")
-    if content.get("version") != VERSION:
-        raise DataError(
-            f"model file {source} has version {content.get('version')!r}; this bench reads version {VERSION}"
-        )
-    return content
+def is_model(content: object) -> bool:
+    """Return whether something is the content of a model file of any version."""
+    return isinstance(content, dict) and content.get("format") in list(_FORMER_FORMATS)
 
 
 def parse_model(content: object, source: str) -> ModelFile:
-    """Make a model of the content of the file of an operator.
+    """Make a model of the content of its file.
 
     Raises
     ------
     DataError
-        If it is not one, is damaged, or its version is unknown; names `source`.
+        If it is not one, is damaged, or its version or kind is unknown; names `source`.
     """
-    document = _checked(content, source, FORMAT)
+    if not isinstance(content, dict) or not is_model(content):
+        raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")
+    version, format_ = content.get("version"), content["format"]
+    former = version == 1
+    if not former and (version != VERSION or format_ != FORMAT):
+        raise DataError(f"model file {source} has version {version!r}; this bench reads versions 1 and {VERSION}")
     try:
-        memory = document["memory"]
-        operator = operator_from_json(document["operator"])
-        for key in ("input_unit", "output_unit"):
-            if not isinstance(getattr(operator, key), str):
-                raise TypeError(f"operator: expected a text for {key}, got {getattr(operator, key)!r}")
-        return ModelFile(
-            name=str(document["name"]),
-            operator=operator,
-            memory=_parse_memory(memory, operator),
-            provenance=dict(document["provenance"]),
-        )
+        model = model_from_json(content[_FORMER_FORMATS[format_] if former else "model"])
+        if not former and content["kind"] != model.kind:
+            raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
+        memory = content["memory"] if format_ == FORMAT else None
+        if isinstance(model, Operator):
+            for key in ("input_unit", "output_unit"):
+                if not isinstance(getattr(model, key), str):
+                    raise TypeError(f"operator: expected a text for {key}, got {getattr(model, key)!r}")
+            memory = None if memory is None else model.state_from_json(memory)
+        elif memory is not None:
+            raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory!r}")
+        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]))
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
-    except (ValueError, TypeError, OverflowError) as error:
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None
-
-
-def _parse_memory(memory: object, operator: Operator[Any]) -> Memory | None:
-    if memory is None:
-        return None
-    if isinstance(operator, PrandtlIshlinskii):
-        if not isinstance(memory, list) or not all(
-            isinstance(value, int | float) and math.isfinite(value) for value in memory
-        ):
-            raise ValueError(f"memory: expected a list of finite numbers, got {memory!r}")
-        if len(memory) != operator.thresholds.size:
-            raise ValueError(f"memory: expected {operator.thresholds.size} play states, got {len(memory)}")
-        return tuple(float(value) for value in memory)
-    if not isinstance(memory, dict):
-        raise TypeError(f"memory: expected an object, got {memory!r}")
-    return MemoryCurve.from_json(memory)

@@ -22,7 +22,7 @@ from bench.identification.hybrid_model import HybridModel
 from bench.identification.thermal_network import Design
 from bench.journal import Record
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
-from bench.results.model_file import HybridFile
+from bench.results.model_file import ModelFile
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid_control import REST, moves_of
@@ -67,7 +67,7 @@ def made_up_model():
 def files(tmp_path_factory):
     """Model files that can and cannot be used, by name."""
     folder = tmp_path_factory.mktemp("models")
-    HybridFile(made_up_model()).save(folder / "hybrid.json")
+    ModelFile("hybrid", made_up_model()).save(folder / "hybrid.json")
     content = json.loads((folder / "hybrid.json").read_text())
     (folder / "other.json").write_text(json.dumps({**content, "format": "bench-model"}))
     del content["model"]["dynamics"]
@@ -361,7 +361,7 @@ class TestRefused:
         [
             ("none", "cannot be read: No such file"),
             ("damaged", "damaged"),
-            ("other", "is not a model file: its `format` is not 'bench-hybrid-model'"),
+            ("other", "expected a model of the kind 'hybrid', got"),
         ],
     )
     def test_a_model_that_cannot_be_used(self, files, protocol, name, words):

@@ -10,7 +10,7 @@ from bench.cli import main
 from bench.hybrid_runs import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from bench.journal import Record
 from bench.reproduce.hybrid import CONTROLLERS, RESONANCES, Tracking
-from bench.results.model_file import load_hybrid_model
+from bench.results.model_file import load_model
 
 RUNS = {
     "current-sine": 2,
@@ -162,7 +162,7 @@ def the_tables_say_what_the_runs_say(campaign):
 
 def the_saved_model_simulates(campaign):
     folder = Path(campaign["folder"])
-    file = load_hybrid_model(folder / "hybrid.json")
+    file = load_model(folder / "hybrid.json")
     assert [source.rpartition("-2")[0] for source in file.provenance["sources"]] == [
         "hybrid-current-steps", "hybrid-thermomechanical", "hybrid-piezo-loops", "hybrid-piezo-step",
     ]  # fmt: skip
