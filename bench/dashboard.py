@@ -61,10 +61,10 @@ from rerun.experimental import ViewerClient
 from bench.clock import WallClock
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve, Operator, Preisach, Summed, TwoStage
+from bench.hysteresis import MemoryCurve
 from bench.journal import Event, Record, StepRecord
-from bench.model_file import FORMAT, is_coupled_model, parse_coupled_model, parse_model
 from bench.protocol import TRACES
+from bench.results.model_file import is_model, parse_model
 from bench.runs import run_card
 
 QUEUED_TICKS = 20_000
@@ -1194,24 +1194,10 @@ def _entries(record: Record) -> list[_Entry]:
 def _densities(record: Record) -> Iterator[_Model]:
     """Yield the densities of the models that have one, the newest last."""
     for name, content in record.models().items():
-        for stage, operator in _stages(content, f"{record.path}: model {name}").items():
-            if isinstance(operator, Preisach):
-                units = operator.input_unit, operator.output_unit
-                yield _Model(name, operator.density_matrix(), operator.levels, stage, *units)
-
-
-def _stages(content: object, source: str) -> dict[str, Operator[Any]]:
-    """Return the operators of a model's document by their names in a coupled model; none of an unknown document."""
-    if is_coupled_model(content):
-        model = parse_coupled_model(content, source).model
-        if isinstance(model, TwoStage):
-            return {"H1": model.first, "H2": model.second}
-        if isinstance(model, Summed):
-            return {"H3": model.by_force, "H4": model.by_voltage}
-        return {"H5": model.operator}
-    if isinstance(content, dict) and content.get("format") == FORMAT:
-        return {"": parse_model(content, source).operator}
-    return {}
+        if is_model(content):
+            for density in parse_model(content, f"{record.path}: model {name}").model.densities():
+                units = density.input_unit, density.output_unit
+                yield _Model(name, density.values, density.levels, density.title, *units)
 
 
 def _times(t: npt.ArrayLike, step: npt.ArrayLike) -> list[rr.TimeColumn]:

@@ -35,7 +35,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.control.loops import Loop, SampledController
+from bench.control.loops import ControlTask, SampledController
 from bench.devices import Signal
 from bench.errors import BenchError, ConfigurationError
 
@@ -121,7 +121,7 @@ class Control:
 
     Attributes
     ----------
-    loop : Loop
+    loop : ControlTask
         The controller at work; it sees numbers only.
     actuator : str
         Device that takes the set-points.
@@ -139,7 +139,7 @@ class Control:
         Further signals that the controller wants to see.
     """
 
-    loop: Loop
+    loop: ControlTask
     actuator: str
     input: str
     output: str

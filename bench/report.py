@@ -14,12 +14,12 @@ from rich.table import Table as Columns
 
 from bench.errors import ConfigurationError, DataError
 from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
-from bench.hysteresis import MemoryCurve, Preisach
+from bench.hysteresis import MemoryCurve, Operator, Preisach
 from bench.identification import measure_errors
 from bench.journal import Record, Table
-from bench.measurements import header_with_unit, write_csv
-from bench.model_file import ModelFile, is_coupled_model, load_model, parse_model
-from bench.modelling import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.data import header_with_unit, write_csv
+from bench.results.model_file import ModelFile, load_model, parse_model
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.runs import RECORDING_NAME, run_card
 from bench.tracking_results import results_json
 
@@ -277,12 +277,9 @@ def _print_control(results: Mapping[str, Mapping[str, float]], unit: str, consol
 
 
 def _models_of(record: Record) -> list[ModelFile]:
-    return [
-        parse_model(content, f"{record.path}: model {name}")
-        for name, content in record.models().items()
-        # A model among voltage, force and length has two inputs: its errors are those of several runs together.
-        if not is_coupled_model(content)
-    ]
+    files = [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
+    # A model of several inputs is not compared: its errors are those of several runs together.
+    return [file for file in files if isinstance(file.model, Operator)]
 
 
 def _headers(record: Record, table: Table) -> list[str]:

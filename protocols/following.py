@@ -6,12 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.control.inverse import Inverse
 from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
-from bench.controllers import FollowerName, load_model_for, make_follower, saturated_below
-from bench.hysteresis import MemoryCurve, Preisach
-from bench.measurements import read_columns
+from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller, saturated_below
 from bench.protocol import (
     Control,
     Messages,
@@ -23,6 +20,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
+from bench.results.data import read_columns
 from bench.tracking_results import FOLLOW
 
 
@@ -30,7 +28,9 @@ class Parameters(ProtocolParameters):
     """What can be set."""
 
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
-    controller: FollowerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: str = parameter(
+        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('follow'))}"
+    )
     reference: str = parameter("", unit="", help="CSV file with columns `time` and `reference`; a sine if not given")
     low: float = parameter(200.0, unit="1/m", low=-1e5, high=1e5, help="lowest value of the sine")
     high: float = parameter(1500.0, unit="1/m", low=-1e5, high=1e5, help="highest value of the sine")
@@ -51,13 +51,13 @@ def following(parameters: Parameters) -> Messages:
     of the specimen is unknown at the start, so it is reset first, by negative saturation at `reset`.
     """
     model = load_model_for(parameters.model, input_unit="°C", output_unit="1/m")
-    if not saturated_below(model, parameters.reset):
+    if not saturated_below(model.operator, parameters.reset):
         raise ValueError(
             f"reset = {parameters.reset:g} °C does not saturate the model's Preisach plane; choose it lower"
         )
     times, values = _reference(parameters)
-    if isinstance(model.operator, Preisach):
-        slope = fastest_slope(Inverse(model.operator), times, values)
+    if not model.operator.memoryless:
+        slope = fastest_slope(model.operator.inverse(), times, values)
         if not slope.within(parameters.fastest):
             raise ValueError(
                 f"the reference asks for {slope.rate:.2f} K/s at {slope.time:g} s, and the plate follows "
@@ -75,8 +75,10 @@ def following(parameters: Parameters) -> Messages:
         UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=8.0),
         label="reset",
     )
-    state = MemoryCurve.from_negative_saturation(reading["tec_temperature"])
-    follower = make_follower(parameters.controller, model, limits=limits, state=state)
+    state = model.operator.saturated_state(-1, reading["tec_temperature"])
+    follower = make_controller(
+        "follow", parameters.controller, ControllerSetup(model=model, limits=limits, state=state)
+    )
     yield Phase(f"approach, {parameters.controller}")
     # The way to the first value is no part of the reference.
     yield Control(

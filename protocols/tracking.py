@@ -9,14 +9,13 @@ import numpy as np
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
 from bench.controllers import (
-    Policy,
-    TargetControllerName,
+    ControllerSetup,
+    controller_names,
     load_model_for,
-    make_target_controller,
+    make_controller,
     saturated_below,
 )
-from bench.hysteresis import MemoryCurve
-from bench.measurements import read_columns
+from bench.hysteresis import Policy
 from bench.protocol import (
     Control,
     Dwell,
@@ -29,6 +28,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
+from bench.results.data import read_columns
 from bench.tracking_results import REACH, READING
 
 
@@ -36,7 +36,9 @@ class Parameters(ProtocolParameters):
     """What can be set."""
 
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
-    controller: TargetControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: str = parameter(
+        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('target'))}"
+    )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
     targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")
     low: float = parameter(-63.0, unit="1/m", low=-1e5, high=1e5, help="lowest of the generated targets")
@@ -59,7 +61,7 @@ def tracking(parameters: Parameters) -> Messages:
     negative saturation at `reset`.
     """
     model = load_model_for(parameters.model, input_unit="°C", output_unit="1/m")
-    if not saturated_below(model, parameters.reset):
+    if not saturated_below(model.operator, parameters.reset):
         raise ValueError(
             f"reset = {parameters.reset:g} °C does not saturate the model's Preisach plane; choose it lower"
         )
@@ -79,10 +81,9 @@ def tracking(parameters: Parameters) -> Messages:
         UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=8.0),
         label="reset",
     )
-    state = MemoryCurve.from_negative_saturation(reading["tec_temperature"])
-    controller = make_target_controller(
-        parameters.controller, model, limits=limits, policy=parameters.policy, state=state
-    )
+    state = model.operator.saturated_state(-1, reading["tec_temperature"])
+    setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state)
+    controller = make_controller("target", parameters.controller, setup)
     yield Phase(parameters.controller)
     errors: list[float] = []
     seconds: list[float] = []

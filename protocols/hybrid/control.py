@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
-from bench import registry
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
-from bench.model_file import load_hybrid_model
+from bench.controllers import ControllerSetup, make_controller
 from bench.number_list import NumberList
 from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from bench.results.model_file import load_model
 from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
@@ -50,9 +51,8 @@ def hybrid_control(parameters: Parameters) -> Messages:
     position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
     a hold at 0.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
     reference, duration = _reference(parameters)
-    controller = registry.load("controllers", f"hybrid.{parameters.controller}")(model, reference, parameters.rate)
+    controller = make_controller("hybrid", parameters.controller, _setup(parameters, reference))
     yield Phase(parameters.controller)
     yield FastLoop(
         controller,
@@ -84,10 +84,8 @@ def fine_step(parameters: StepParameters) -> Messages:
     The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
     instruments are called directly.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
-    controller = registry.load("controllers", "hybrid.fine")(
-        model, lambda t: parameters.step if t >= parameters.rest else 0.0, parameters.rate
-    )
+    setup = _setup(parameters, lambda t: parameters.step if t >= parameters.rest else 0.0)
+    controller = make_controller("hybrid-fine", "notch", setup)
     yield Phase("fine step")
     yield FastLoop(
         controller,
@@ -97,6 +95,14 @@ def fine_step(parameters: StepParameters) -> Messages:
         ("piezo",),
         watched=(WITNESS,) if parameters.witness else (),
         label="fine step",
+    )
+
+
+def _setup(parameters: Parameters | StepParameters, reference: Reference) -> ControllerSetup:
+    return ControllerSetup(
+        model=load_model(Path(parameters.model), "hybrid"),
+        limits=(-math.inf, math.inf),
+        options={"reference": reference, "rate": parameters.rate},
     )
 
 

@@ -7,17 +7,17 @@ micro-actuator", IEEE Transactions on Robotics 26(6), 2010, eqs. 18 to 22; here 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Polynomial, PrandtlIshlinskii, _checks
+from bench.hysteresis import Model, ModelSpec, Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.documents import Parts
+from bench.identification.by_name import Identification, Initial, identify
 from bench.identification.dynamics import ThirdOrder
-from bench.identification.identify import Identification, Initial, identify
 from rigs.hybrid.network import NODES, ThermalNetwork
 
 # Allowed use of a part beyond the range that it was fitted on, as a share of that range.
@@ -58,7 +58,7 @@ class HybridResponse:
 
 
 @dataclass(frozen=True, eq=False)
-class HybridModel:
+class HybridModel(Model):
     """From current and voltage to the deflection of the tip (Rakotondrabe and Ivan 2010, eq. 22, corrected).
 
     deflection = p(T_L - T_r) - p(0) + D(s)/D(0) (P(U) - its bias)
@@ -89,6 +89,13 @@ class HybridModel:
         If the range of the polynomial does not contain 0 K, or the reference is not a number.
     """
 
+    kind: ClassVar[str] = "hybrid"
+    parts: ClassVar[Parts] = {
+        "network": ThermalNetwork.from_json,
+        "polynomial": Polynomial.from_json,
+        "hysteresis": PrandtlIshlinskii.from_json,
+        "dynamics": ThirdOrder.from_json,
+    }
     network: ThermalNetwork
     polynomial: Polynomial
     hysteresis: PrandtlIshlinskii
@@ -150,35 +157,6 @@ class HybridModel:
         The polynomial is a factor for small changes: it is the bandwidth of the tip's temperature.
         """
         return self.network.bandwidth("tip", current, ambient)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        return {
-            "type": "hybrid",
-            "network": self.network.to_json(),
-            "polynomial": self.polynomial.to_json(),
-            "hysteresis": self.hysteresis.to_json(),
-            "dynamics": self.dynamics.to_json(),
-            "reference": self.reference,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> HybridModel:
-        """Return the model that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        kind = "hybrid model"
-        return cls(
-            ThermalNetwork.from_json(_checks.json_field(document, "network", kind)),
-            Polynomial.from_json(_checks.json_field(document, "polynomial", kind)),
-            PrandtlIshlinskii.from_json(_checks.json_field(document, "hysteresis", kind)),
-            ThirdOrder.from_json(_checks.json_field(document, "dynamics", kind)),
-            _checks.json_field(document, "reference", kind),
-        )
 
 
 @dataclass(frozen=True)
@@ -334,3 +312,6 @@ def _check_range(name: str, values: Floats, span: tuple[float, float], unit: str
             f"{name}: expected {low:g} to {high:g} {unit}, the range of the {part}, "
             f"got {least:g} to {greatest:g} {unit}"
         )
+
+
+HYBRID = ModelSpec("thermo-piezoelectric cantilever: network, polynomial, plays and dynamics", HybridModel)

@@ -18,7 +18,7 @@ from bench.campaign import Campaign, ResultTable, Study, StudyResult
 from bench.figures import Curve, plot_panels, plot_tracking
 from bench.identification import measure_errors
 from bench.journal import Record
-from bench.model_file import HybridFile
+from bench.results.model_file import ModelFile
 from bench.runs import RunResult
 from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE, WITNESS
 from rigs.hybrid.design import Design
@@ -231,7 +231,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     sources = [run.folder for run in (runs.steps, runs.static, runs.loops, runs.step)]
     found = identify_hybrid(*sources)
     model = campaign.folder / "hybrid.json"
-    HybridFile(found.model, {"sources": [folder.name for folder in sources]}).save(model)
+    ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
 
     # Only the hybrid controller needs long holds.
     tracked = {

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.journal import FILE_NAME, Journal, StepRecord
-from bench.measurements import Columns, check_excitation, read_columns, split_unit, write_csv
+from bench.results.data import Columns, check_excitation, read_columns, split_unit, write_csv
 
 
 @pytest.fixture

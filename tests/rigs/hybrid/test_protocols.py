@@ -15,8 +15,8 @@ from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
-from bench.model_file import HybridFile
 from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
+from bench.results.model_file import ModelFile
 from bench.rig import Rig, load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
@@ -53,9 +53,9 @@ def made_up_model():
 def files(tmp_path_factory):
     """Model files that can and cannot be used, by name."""
     folder = tmp_path_factory.mktemp("models")
-    HybridFile(made_up_model()).save(folder / "hybrid.json")
+    ModelFile("hybrid", made_up_model()).save(folder / "hybrid.json")
     content = json.loads((folder / "hybrid.json").read_text())
-    (folder / "other.json").write_text(json.dumps({**content, "format": "bench-model"}))
+    ModelFile("polynomial", made_up_model().polynomial).save(folder / "other.json")
     del content["model"]["dynamics"]
     (folder / "damaged.json").write_text(json.dumps(content))
     return {path.stem: path for path in folder.iterdir()} | {"none": folder / "none.json"}
@@ -359,7 +359,7 @@ class TestRefused:
         [
             ("none", "cannot be read: No such file"),
             ("damaged", "damaged"),
-            ("other", "is not a model file: its `format` is not 'bench-hybrid-model'"),
+            ("other", "expected a model of the kind 'hybrid', got 'polynomial'"),
         ],
     )
     def test_a_model_that_cannot_be_used(self, files, protocol, name, words):

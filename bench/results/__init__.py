@@ -1,0 +1,1 @@
+"""Data, models, figures and reports made from the records of runs."""
