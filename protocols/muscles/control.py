@@ -170,12 +170,12 @@ def _reach(
 ) -> Part[float]:
     """Go to a target and read; return the error (m or N)."""
     yield Control(
-        ReachTarget(controller, target),
-        "supply",
-        "supply_voltage",
-        signal,
-        (0.0, parameters.highest),
-        parameters.duration + _GRACE,
+        task=ReachTarget(controller, target),
+        actuator="supply",
+        drive="supply_voltage",
+        response=signal,
+        limits=(0.0, parameters.highest),
+        timeout=parameters.duration + _GRACE,
         label=REACH,
         others=others,
     )

@@ -8,10 +8,10 @@ from bench.engine import Engine
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
-from bench.protocol import FastLoop, ProtocolParameters, protocol
-from bench.rig import Rig, load_rig
+from bench.protocol import FixedRate, ProtocolParameters, protocol
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import trace_signals
-from protocols.hybrid import DEFLECTION
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
@@ -20,6 +20,7 @@ pytestmark = pytest.mark.benchmark
 
 RATE, COUNT = 20e3, 20_000
 STEP = 5e-6
+DEFLECTION = "displacement_position"
 
 
 class Nothing(ProtocolParameters):
@@ -43,11 +44,18 @@ def through_the_engine(folder, record_every):
     @protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
     def fine(parameters: Nothing):
         """Follow a step."""
-        yield FastLoop(make_controller(), RATE, COUNT / RATE, (DEFLECTION,), ("piezo",), record_every=record_every)
+        yield FixedRate(
+            controller=make_controller(),
+            rate=RATE,
+            duration=COUNT / RATE,
+            inputs=(DEFLECTION,),
+            actuators=("piezo",),
+            record_every=record_every,
+        )
 
     folder.mkdir()
     with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
-        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig)), {})
+        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig, {})), {})
         watch = Stopwatch()
         outcome = Engine(rig, journal, (), Interrupts()).run(fine, Nothing())
         seconds = watch.seconds()

@@ -20,7 +20,8 @@ from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, ThermalNoise, UnscentedEstimate
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import identify_network
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9
 PERIOD, FAST = 5e-3, 5e-5

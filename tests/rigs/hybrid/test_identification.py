@@ -13,8 +13,12 @@ from bench.hysteresis import PrandtlIshlinskii
 from bench.journal import FILE_NAME, Record, Table
 from bench.protocol import find_protocol
 from bench.runs import Run, carry_out
-from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.identification import (
+    BASE,
+    CURRENT,
+    DEFLECTION,
+    TIP,
+    VOLTAGE,
     Samples,
     bandwidth_of,
     identify_hybrid,
@@ -40,7 +44,7 @@ PARTS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
 def record_run(folder, protocol, rig="hybrid", overrides=None, **settings):
     definition = find_protocol(protocol)
     run = Run(
-        protocol=definition, parameters=definition.parse({**SHORT[protocol], **settings}), rig=rig, folder=folder,
+        protocol=definition, settings={**SHORT[protocol], **settings}, rig=rig, folder=folder,
         overrides=overrides or {}, seed=1, clock="virtual", recording=False,
     )  # fmt: skip
     return carry_out(run, Console(file=io.StringIO(), width=200))

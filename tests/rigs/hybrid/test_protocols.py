@@ -4,6 +4,7 @@ import io
 import json
 import math
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
-from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
+from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
-from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 from protocols.hybrid.control import REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
 from rigs.hybrid.design import Design
@@ -28,6 +29,8 @@ from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 WIRED, DIRECT = "hybrid", "hybrid-direct"
+DEFLECTION, BASE, TIP = "displacement_position", "base_temperature", "tip_temperature"
+WITNESS = "witness_position"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
 SENSORS = {DEFLECTION, BASE, TIP}
 LIMITS = {"tec": 0.15, "piezo": 40.0}
@@ -66,14 +69,20 @@ def parsed(protocol, settings):
     return definition, definition.parse({key: str(value) for key, value in settings.items()})
 
 
-def planned(protocol, **settings):
-    return plan(*parsed(protocol, settings))
+@cache
+def slots_of(protocol, rig=WIRED):
+    with Rig(load_rig(rig), VirtualClock(), 1) as connected:
+        return connected.slots(find_protocol(protocol))
+
+
+def planned(protocol, rig=WIRED, **settings):
+    return plan(*parsed(protocol, settings), slots_of(protocol, rig))
 
 
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
     definition, parameters = parsed(protocol, settings)
-    messages, found, reading = definition.generator(parameters), [], None
+    messages, found, reading = definition.start(parameters, slots_of(protocol)), [], None
     while True:
         try:
             message = messages.send(reading)
@@ -84,7 +93,7 @@ def dry(protocol, **settings):
 
 
 def loops(protocol, **settings):
-    return [message for message in dry(protocol, **settings) if isinstance(message, FastLoop)]
+    return [message for message in dry(protocol, **settings) if isinstance(message, FixedRate)]
 
 
 def setpoints(loop, actuator=0):
@@ -132,19 +141,19 @@ class TestPlan:
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         definition, parameters = parsed(protocol, settings)
         with Rig(load_rig(rig), VirtualClock(), 1) as connected:
-            check_before_moving(connected, definition, plan(definition, parameters))
-            assert definition.controls in ("", DEFLECTION)
+            slots = connected.slots(definition)
+            check_before_moving(connected, definition, plan(definition, parameters, slots))
+            assert definition.controlled(slots) in ("", DEFLECTION)
 
     @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
     def test_a_witness_only_where_there_is_one(self, files, protocol):
-        definition, parameters = parsed(protocol, {"model": files["hybrid"], "witness": True})
-        expected = plan(definition, parameters)
+        settings = {"model": files["hybrid"], "witness": True}
+        expected = planned(protocol, DIRECT, **settings)
         assert WITNESS in expected.watched
         with Rig(load_rig(DIRECT), VirtualClock(), 1) as rig:
-            check_before_moving(rig, definition, expected)
-        words = f"needs {WITNESS}, which rig hybrid does not have"
-        with Rig(load_rig(WIRED), VirtualClock(), 1) as rig, pytest.raises(ConfigurationError, match=words):
-            check_before_moving(rig, definition, expected)
+            check_before_moving(rig, find_protocol(protocol), expected)
+        with pytest.raises(ConfigurationError, match=r"witness: the rig binds no \[roles\.witness\]"):
+            planned(protocol, WIRED, **settings)
 
     def test_durations_follow_the_settings(self, files):
         assert planned("current-sine", frequencies="0.01, 0.05", periods=3).seconds == pytest.approx(300.0 + 60.0)
@@ -386,9 +395,14 @@ def flat(text):
 
 
 def record(folder, protocol, rig, **settings):
-    definition, parameters = parsed(protocol, settings)
     run = Run(
-        protocol=definition, parameters=parameters, rig=rig, folder=folder, seed=1, clock="virtual", recording=False
+        protocol=find_protocol(protocol),
+        settings={key: str(value) for key, value in settings.items()},
+        rig=rig,
+        folder=folder,
+        seed=1,
+        clock="virtual",
+        recording=False,
     )
     result = carry_out(run, Console(file=io.StringIO(), width=200))
     assert result.outcome.status == "completed", result.outcome.reason

@@ -9,8 +9,7 @@ import pytest
 from bench.cli import main
 from bench.journal import Record
 from bench.results.model_file import load_model
-from protocols.hybrid import CURRENT, DEFLECTION, VOLTAGE, WITNESS
-from rigs.hybrid.identification import read_loop
+from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
 
 RUNS = {

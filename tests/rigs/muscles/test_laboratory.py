@@ -8,7 +8,8 @@ import serial
 
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceError
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from rigs.muscles.laboratory import (
     FAN_LINE,
     LOAD,
@@ -21,7 +22,7 @@ from rigs.muscles.laboratory import (
     SMALaboratory,
     SMALaboratorySettings,
 )
-from sim_devices.instruments.dynamixel import VELOCITY_UNIT
+from sim_devices.instruments.dynamixel_table import VELOCITY_UNIT
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 PROFILE_VELOCITY = 112
