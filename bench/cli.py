@@ -262,6 +262,12 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="KEY=VALUE", help="Another option of the model, a number; may come several times."
+        ),
+    ] = None,
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
@@ -272,8 +278,8 @@ def identify_(
     """Identify a hysteresis model from measurements, and say how good it is.
 
     Columns are named as in the header; a unit in brackets at the end, as in `force [N]`, may be left out and
-    goes into the model. Of a run, the readings are taken: `bench identify RUN --input tec_temperature
-    --output curvature --model preisach-nonmonotonic --out model.json`.
+    goes into the model. Of a run, the readings are taken: `bench identify RUN --input voltage
+    --output displacement --model preisach --out model.json`.
     """
     from bench.results.models import certificate_lines, identify_file
 
@@ -289,6 +295,7 @@ def identify_(
         smoothing=smoothing,
         skip=skip,
         initial=initial,
+        **parse_numbers("--option", options or ()),
         cross_validated=cross_validate,
     )
     if found.trials is not None:
@@ -702,6 +709,17 @@ def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"{option}: {key} is given twice")
         pairs[key] = value
     return pairs
+
+
+def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
+    """Split texts of the form `key=number`; errors as `parse_assignments`, or if a value is not a number."""
+    numbers: dict[str, int | float] = {}
+    for key, text in parse_assignments(option, texts).items():
+        try:
+            numbers[key] = int(text) if text.lstrip("-").isdigit() else float(text)
+        except ValueError:
+            raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
+    return numbers
 
 
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold

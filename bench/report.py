@@ -14,7 +14,7 @@ from rich.table import Table as Columns
 
 from bench.errors import ConfigurationError, DataError
 from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
-from bench.hysteresis import MemoryCurve, Operator, Preisach
+from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table
 from bench.results.data import header_with_unit, write_csv
@@ -159,12 +159,12 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     )
     plot_errors(errors, {name: found.identification.residuals}, error_label=f"error{unit}")
     paths = [loops, errors]
-    if isinstance(operator, Preisach):
+    if found.coverage is not None:
         paths.append(folder / f"{name}-density.png")
-        plot_density(paths[-1], operator)
-        if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
+        plot_density(paths[-1], found.file.model)
+        if isinstance(found.file.memory, MemoryCurve):
             paths.append(folder / f"{name}-coverage.png")
-            plot_coverage(paths[-1], operator, found.coverage.swept, found.file.memory)
+            plot_coverage(paths[-1], found.file.model, found.coverage.swept, found.file.memory)
     return paths
 
 

@@ -26,7 +26,6 @@ from bench.figures import (
     plot_sequence_and_errors,
     plot_tracking,
 )
-from bench.hysteresis import Preisach, TwoStage
 from bench.identification import Errors
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series, predict_series
 from bench.journal import Record, add_model
@@ -354,12 +353,6 @@ def _draw(measured: Characterization, folder: Path) -> list[Path]:
             vertical_label="length / mm",
         )
     two_stage = measured.models["two-stage"].model
-    if not (
-        isinstance(two_stage, TwoStage)
-        and isinstance(two_stage.first, Preisach)
-        and isinstance(two_stage.second, Preisach)
-    ):
-        raise TypeError("expected a two-stage model of Preisach operators")
     plot_densities(path("figure-09-densities"), {"H1": two_stage.first, "H2": two_stage.second})
     for name, kind in (
         ("figure-10a-errors-length-voltage", "length-voltage"),

@@ -18,7 +18,7 @@ from rich.console import Console
 from bench.clock import Stopwatch
 from bench.errors import DataError
 from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
-from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
+from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
 from bench.report import export_run
@@ -256,9 +256,7 @@ def _identify(entry: PaperModel, run: Path, folder: Path) -> IdentifiedFile:
     return found
 
 
-def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - checked here
-    if not (isinstance(operator, Preisach) and isinstance(operator.reversible, ThermalExpansion)):
-        raise TypeError("expected the non-monotonic model")
+def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - the non-monotonic model
     low, high = float(operator.levels[0]), float(operator.levels[-1])
     smallest, largest = operator.output_range()
     cold, hot = operator.reversible.coefficients.tolist()
@@ -311,9 +309,7 @@ def _draw(
     ):
         plot_errors(paths[name], {titles[key]: residuals[key]}, error_label=error)
     for name, key in (("figure-06-density-proposed", "nonmonotonic"), ("figure-08-density-signed", "signed")):
-        operator = models[key].file.operator
-        if isinstance(operator, Preisach):
-            plot_density(paths[name], operator)
+        plot_density(paths[name], models[key].file.model)
     plot_sequence_and_errors(
         paths["figure-10-validation"],
         inputs,

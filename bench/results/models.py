@@ -17,8 +17,8 @@ from bench.hysteresis import (
     Operator,
     Policy,
     Preisach,
-    QuadraticTerm,
     Reach,
+    ThermalExpansion,
     find_model,
     identifiable_models,
     uniform_levels,
@@ -68,7 +68,7 @@ class IdentifiedFile:
     """
 
     file: ModelFile
-    identification: Identification
+    identification: Identification[Any]
     warnings: tuple[str, ...]
     inputs: Floats
     outputs: Floats
@@ -398,11 +398,11 @@ def assess_designs(
     low, high = operating
     try:
         grid = uniform_levels(*plane, levels)
-        # The quadratic term stands for any reversible part of two coefficients.
+        # The term stands for any reversible part of two coefficients.
         operator = Preisach(
             grid,
             np.zeros(levels * (levels + 1) // 2),
-            reversible=QuadraticTerm(quadratic=0.0, origin=0.5 * (plane[0] + plane[1])),
+            reversible=ThermalExpansion(low=plane[0], high=plane[1]),
             input_range=operating,
         )
         span = high - low
