@@ -361,7 +361,7 @@ class TestRefused:
         [
             ("none", "cannot be read: No such file"),
             ("damaged", "damaged"),
-            ("other", "expected a model of the kind 'hybrid', got"),
+            ("other", "is not a model file: its `format` is not 'bench-model'"),
         ],
     )
     def test_a_model_that_cannot_be_used(self, files, protocol, name, words):
