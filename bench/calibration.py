@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from bench.derived import Derived, DerivedSignal
 from bench.devices import Signal
 from bench.errors import DeviceError
 
@@ -78,15 +79,9 @@ def deflection_to_curvature(deflection: npt.ArrayLike, length: float, residual_c
     return np.asarray(angles / length - residual_curvature)
 
 
-class CantileverCurvature(BaseModel):
+class CantileverCurvature(DerivedSignal):
     """Curvature of a cantilever from the deflection of its tip."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    source_unit: ClassVar[str] = "m"
-    """Unit that the source has to have."""
-
-    kind: Literal["cantilever-curvature"]
     source: str = Field(description="signal of the tip deflection, m")
     length: float = Field(gt=0, le=1, description="length of the beam, m")
     residual_curvature: float = Field(default=0.0, ge=-1e5, le=1e5, description="curvature of the beam at rest, 1/m")
@@ -101,31 +96,28 @@ class CantileverCurvature(BaseModel):
             )
         return self
 
-    def signal(self, name: str) -> Signal:
-        """Return the signal that this gives."""
-        return Signal(name, "1/m", "curvature", 2)
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The deflection."""
+        return (self.source,)
 
-    def compute(self, name: str, values: Mapping[str, float]) -> float:
-        """Return the curvature in 1/m from the measured values.
+    def bind(self, name: str, units: Mapping[str, str]) -> Derived:
+        """Return the curvature, 1/m; it has no value where no bending of the beam reaches the deflection."""
+        if units[self.source] != "m":
+            raise ValueError(f"source = {self.source!r}: is in {units[self.source]}; expected a deflection in m")
 
-        Raises
-        ------
-        DeviceError
-            If no bending of the beam reaches the deflection.
-        """
-        deflection = values[self.source]
-        curvature = float(deflection_to_curvature(deflection, self.length, self.residual_curvature))
-        if not np.isfinite(curvature) and np.isfinite(deflection):
-            raise DeviceError(
-                name,
-                f"a beam of {self.length * 1e6:g} µm cannot bend by {deflection * 1e6:.1f} µm; "
-                "check the spot on the detector and the calibration",
-            )
-        return curvature
+        def compute(values: Mapping[str, float]) -> float:
+            deflection = values[self.source]
+            curvature = float(deflection_to_curvature(deflection, self.length, self.residual_curvature))
+            if not np.isfinite(curvature) and np.isfinite(deflection):
+                raise DeviceError(
+                    name,
+                    f"a beam of {self.length * 1e6:g} µm cannot bend by {deflection * 1e6:.1f} µm; "
+                    "check the spot on the detector and the calibration",
+                )
+            return curvature
 
-
-DerivedSignal = CantileverCurvature
-"""Every kind of derived signal that a rig file may ask for, chosen by its `kind`."""
+        return Derived(Signal(name, "1/m", "curvature", 2), self.sources, compute)
 
 
 # Scalars by `math`: one reading at a time is what a run asks for, and numpy's calls cost it fifty times as much.

@@ -84,10 +84,10 @@ def list_(
     """
     from bench.hysteresis import identifiable_models
     from bench.protocol import packaged_protocols
-    from bench.rig import load_rig, packaged_rigs
+    from bench.rig_file import load_rig, packaged_rigs
 
     models = {model: spec.summary for model, spec in identifiable_models().items()}
-    protocols = packaged_protocols()
+    protocols = packaged_protocols().protocols
     rigs = {rig: load_rig(rig) for rig in packaged_rigs()}
     if name is None:
         _print_table("rigs", {rig: file.rig.title for rig, file in rigs.items()})
@@ -172,7 +172,7 @@ def run(
     if rig is None:
         raise ConfigurationError("--rig is missing: `bench list` shows the packaged rigs")
     definition = find_protocol(protocol)
-    parameters = definition.parse(parse_assignments("--set", settings or []))
+    given = parse_assignments("--set", settings or [])
 
     from bench.runs import Run, carry_out
     from bench.safety import SAFE
@@ -180,7 +180,7 @@ def run(
     result = carry_out(
         Run(
             protocol=definition,
-            parameters=parameters,
+            settings=given,
             rig=rig,
             overrides=parse_assignments("--override", overrides or []),
             seed=seed,

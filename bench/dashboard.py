@@ -624,7 +624,9 @@ class _Writer:
         for entry in entries:
             if isinstance(entry, StepRecord):
                 steps.append(entry)
-                changes += self._enter("run", entry.started, entry.step, _RUNNING if entry.settled else _NOT_SETTLED)
+                changes += self._enter(
+                    "run", entry.started, entry.step, _NOT_SETTLED if entry.settled.failed else _RUNNING
+                )
                 self._step = entry.step + 1
                 self._t = entry.finished
             elif isinstance(entry, Event):

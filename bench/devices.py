@@ -160,6 +160,11 @@ class Status:
         return status
 
     @property
+    def device(self) -> str:
+        """Name of the device."""
+        return self._device
+
+    @property
     def done(self) -> bool:
         """Whether the change has ended, well or not."""
         return self._done

@@ -1,8 +1,8 @@
 """Carries a protocol out on a rig.
 
-For each step: check the set-points, send them, tick through the hold (telemetry, interlocks, faults), take
-the reading, write the journal, and only then tell whoever watches. However the run ends, every device is
-brought into its safe state, each by itself, and the journal says how that went.
+For each step: checks the set-points, sends them, ticks through the hold (telemetry, interlocks, faults), takes the
+reading, writes the journal, and then notifies the observers. However the run ends, every device is brought into its
+safe state, each independently; the outcome is recorded.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from bench.control.estimators import DriftEstimator, agility_for, preload
 from bench.control.tracking import Command, Trace
-from bench.devices import Actuator
+from bench.devices import Actuator, Status
 from bench.errors import (
     AbortError,
     BenchError,
@@ -28,24 +28,23 @@ from bench.errors import (
 )
 from bench.interrupts import Interrupts
 from bench.journal import Event, Journal, StepRecord
-from bench.protocol import (
+from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
+from bench.protocol.plan import EXPECTED, Plan
+from bench.protocol.vocabulary import (
     LATENESS,
     TRACES,
     Control,
-    Dwell,
-    FastLoop,
+    FixedRate,
+    Message,
     Note,
     Phase,
-    Plan,
     Prompt,
-    ProtocolDefinition,
-    ProtocolParameters,
     Reading,
     Step,
-    UntilSteady,
 )
 from bench.rig import Rig
 from bench.safety import SAFE, InterlockWatch, make_safe
+from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
 _NOT_AT_WORK = dict.fromkeys((*TRACE_NAMES, LATENESS.name), math.nan)
@@ -58,7 +57,7 @@ PROMPT = "prompt"
 
 
 class Observer(Protocol):
-    """Watches a run: the dashboard, the progress display. No method may block; one that raises is told no more."""
+    """Watches a run: the dashboard, the progress display. No method may block; an observer that raises is dropped."""
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """See one tick of a hold; `values` in the order of the rig's signals."""
@@ -111,14 +110,13 @@ class Engine:
     rig : Rig
         Connected devices.
     journal : Journal
-        Written before anybody else is told.
+        Written before any observer is notified.
     observers : iterable of Observer
-        Told after the journal.
+        Notified after the journal.
     interrupts : Interrupts
         What the operator and the system ask for.
     ask : callable, optional
-        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt is an
-        abort, as nobody is there to answer.
+        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
     """
 
     def __init__(
@@ -141,6 +139,12 @@ class Engine:
         self._watch = InterlockWatch(rig.file.interlocks, {signal.name: signal.unit for signal in rig.signals})
         self._phase = ""
         self._steps = 0
+        self._work: dict[type[Message], Callable[[Any], Reading]] = {
+            Step: self._step,
+            Control: self._control,
+            FixedRate: self._fixed_rate,
+            Prompt: self._prompt,
+        }
 
     def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
         """Carry a protocol out, from its first step to the safe state.
@@ -148,7 +152,7 @@ class Engine:
         Returns
         -------
         Outcome
-            How it ended; nothing that happens on the way is raised.
+            How it ended; exceptions end up in its `error`.
         """
         start = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
@@ -166,7 +170,7 @@ class Engine:
 
     def _carry_out(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> None:
         self._watch.check(self._clock.now(), self._rig.glance())
-        messages = definition.generator(parameters)
+        messages = definition.start(parameters, self._rig.slots(definition))
         reading: Reading | None = None
         try:
             while True:
@@ -177,28 +181,16 @@ class Engine:
                     return
                 self._raise_if_aborted()
                 reading = None
-                if isinstance(message, Step):
-                    self._pause_if_asked()
-                    reading = self._step(message)
-                elif isinstance(message, Control):
-                    self._pause_if_asked()
-                    reading = self._control(message)
-                elif isinstance(message, FastLoop):
-                    self._pause_if_asked()
-                    reading = self._fast_loop(message)
-                elif isinstance(message, Prompt):
-                    self._pause_if_asked()
-                    reading = self._prompt(message)
-                elif isinstance(message, Phase):
+                if isinstance(message, Phase):
                     self._phase = message.name
                     self._event("INFO", "phase", message.name)
                 elif isinstance(message, Note):
                     self._event("INFO", "note", message.text)
+                elif type(message) in self._work:
+                    self._pause_if_asked()
+                    reading = self._work[type(message)](message)
                 else:
-                    raise ConfigurationError(
-                        f"protocol {definition.name} yielded {message!r}; "
-                        "expected a Step, a Control, a FastLoop, a Prompt, a Phase or a Note"
-                    )
+                    raise ConfigurationError(f"protocol {definition.name} yielded {message!r}; {EXPECTED}")
         finally:
             # What a protocol does or raises while it is closed must not hide why the run ends.
             with suppress(Exception):
@@ -208,14 +200,29 @@ class Engine:
         if isinstance(step.settle, UntilSteady):
             self._check_signals(step.settle.signal)
         started = self._clock.now()
-        self._send(step.setpoints)
-        self._settle(step.settle, started)
+        statuses = self._send(step.setpoints)
+        return self._settle_and_read(step.settle, statuses, started, started, step.label, step.setpoints)
+
+    def _settle_and_read(
+        self,
+        settle: Settle,
+        statuses: Sequence[Status],
+        since: float,
+        started: float,
+        label: str,
+        setpoints: Mapping[str, float],
+    ) -> Reading:
+        """Settle from `since` on, take the reading and record it, also that of a rule that was not met."""
+        settled, failure = self._settle(settle, statuses, since)
         values = self._values(self._rig.measure)
         self._watch.check(self._clock.now(), values)
-        return self._finish_step(started, step.label, step.setpoints, values)
+        reading = self._finish_step(started, label, setpoints, values, settled)
+        if failure is not None:
+            raise failure
+        return reading
 
     def _control(self, message: Control) -> Reading:
-        wanted = (message.input, message.output, *message.others)
+        wanted = (message.drive, message.response, *message.others)
         self._check_signals(*wanted)
         actuator = self._actuator(message.actuator)
         started = self._clock.now()
@@ -227,14 +234,15 @@ class Engine:
                 asked = self._clock.now()
                 values = self._values(lambda: self._rig.sample(wanted))
                 now = self._clock.now()
-                ask = message.loop.begin if command is None else message.loop.update
+                ask = message.task.begin if command is None else message.task.update
                 command = ask(now, *(values[name] for name in wanted))
-                trace = message.loop.trace
+                trace = message.task.trace
                 self._trace = _traced(trace)
                 values |= self._trace
                 self._record_tick(now, values)
                 if command.done:
-                    return self._finish_step(started, message.label, {message.actuator: command.setpoint}, values)
+                    setpoints = {message.actuator: command.setpoint}
+                    return self._finish_step(started, message.label, setpoints, values, Settled.CONTROLLED)
                 if not low <= command.setpoint <= high:
                     raise LimitError(
                         message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"
@@ -242,19 +250,19 @@ class Engine:
                 if command.setpoint != actuator.setpoint:
                     self._send({message.actuator: command.setpoint})
                 if not command.wait > 0:
-                    raise ConfigurationError(f"the controller of {message.output} asked to wait {command.wait} s")
-                # From reading to reading: what a reading takes is part of the wait, not beside it.
+                    raise ConfigurationError(f"the controller of {message.response} asked to wait {command.wait} s")
+                # From reading to reading: the wait includes the time of the reading.
                 end = asked + command.wait
                 if end > latest:
                     raise SettleTimeoutError(
-                        f"{message.output} did not reach its reference {trace.reference:g} "
+                        f"{message.response} did not reach its reference {trace.reference:g} "
                         f"within {message.timeout:g} s"
                     )
                 self._hold_until(end, asked)
         finally:
             self._trace = _NOT_AT_WORK
 
-    def _fast_loop(self, message: FastLoop) -> Reading:
+    def _fixed_rate(self, message: FixedRate) -> Reading:
         self._check_signals(*message.inputs, *message.watched)
         actuators = [self._actuator(name) for name in message.actuators]
         setpoints = [f"{name}_setpoint" for name in message.actuators]
@@ -322,7 +330,8 @@ class Engine:
         )
         values = self._values(self._rig.measure)
         self._watch.check(self._clock.now(), values)
-        return self._finish_step(started, message.label, dict(zip(message.actuators, commands, strict=True)), values)
+        sent = dict(zip(message.actuators, commands, strict=True))
+        return self._finish_step(started, message.label, sent, values, Settled.CONTROLLED)
 
     def _prompt(self, message: Prompt) -> Reading:
         self._event("INFO", "prompt", message.text)
@@ -333,11 +342,8 @@ class Engine:
             raise AbortError(f"nobody is there to do it: {message.text}")
         elif self._await_answer(self._ask, f"{message.text}; then") != RESUME:
             raise AbortError("ended by the operator at a prompt")
-        self._settle(message.settle, self._clock.now())
-        values = self._values(self._rig.measure)
-        self._watch.check(self._clock.now(), values)
         # Kept in any case: it shows what was wrong.
-        reading = self._finish_step(started, PROMPT, {}, values)
+        reading = self._settle_and_read(message.settle, (), self._clock.now(), started, PROMPT, {})
         value = reading[message.signal]
         if not message.low <= value <= message.high:
             unit = next(signal.unit for signal in self._rig.signals if signal.name == message.signal)
@@ -349,7 +355,12 @@ class Engine:
         return reading
 
     def _finish_step(
-        self, started: float, label: str, setpoints: Mapping[str, float], values: Mapping[str, float]
+        self,
+        started: float,
+        label: str,
+        setpoints: Mapping[str, float],
+        values: Mapping[str, float],
+        settled: Settled,
     ) -> Reading:
         finished = self._clock.now()
         record = StepRecord(
@@ -358,7 +369,7 @@ class Engine:
             finished=finished,
             phase=self._phase,
             label=label,
-            settled=True,
+            settled=settled,
             setpoints=setpoints,
             values=tuple(values[name] for name in self._names),
         )
@@ -379,17 +390,19 @@ class Engine:
             raise ConfigurationError(f"{name} is no device that takes a set-point; there are: {known}")
         return actuators[name]
 
-    def _send(self, setpoints: Mapping[str, float]) -> None:
+    def _send(self, setpoints: Mapping[str, float]) -> list[Status]:
         actuators = {name: self._actuator(name) for name in setpoints}
         for name, value in setpoints.items():
             actuators[name].check(value)
-        for name, value in setpoints.items():
-            actuators[name].set(value)
+        return [actuators[name].set(value) for name, value in setpoints.items()]
 
-    def _settle(self, settle: Dwell | UntilSteady, started: float) -> None:
+    def _settle(self, settle: Settle, statuses: Sequence[Status], started: float) -> tuple[Settled, Exception | None]:
+        """Let the rig settle; return how, and what to raise once the reading is recorded."""
         if isinstance(settle, Dwell):
             self._hold_until(started + settle.seconds, started)
-            return
+            return Settled.DWELL, None
+        if isinstance(settle, Arrived):
+            return self._await_arrival(settle, statuses, started)
         agility = agility_for(drift=settle.drift, noise=settle.noise, period=self._period)
         estimator = DriftEstimator(noise=settle.noise, agility=agility)
         earliest, latest = started + settle.minimum, started + settle.timeout
@@ -402,13 +415,31 @@ class Engine:
                 raise DeviceError(settle.signal, f"reads {value}, so it cannot become steady")
             estimator.update(now, value)
             if now >= earliest and estimator.is_steady(settle.drift):
-                return
+                return Settled.STEADY, None
             if now >= latest:
                 unit = next(signal.unit for signal in self._rig.signals if signal.name == settle.signal)
-                raise SettleTimeoutError(
+                return Settled.NOT_STEADY, SettleTimeoutError(
                     f"{settle.signal} is not steady after {settle.timeout:g} s: it drifts by {estimator.drift:.3g} ± "
                     f"{estimator.uncertainty:.2g} {unit}/s, and {settle.drift:g} {unit}/s is allowed"
                 )
+
+    def _await_arrival(
+        self, settle: Arrived, statuses: Sequence[Status], started: float
+    ) -> tuple[Settled, Exception | None]:
+        latest = started + settle.timeout
+        self._hold_until(started + settle.minimum, started)
+        while True:
+            waiting = [status for status in statuses if not status.update()]
+            for status in statuses:
+                if isinstance(error := status.exception(), Exception):
+                    return Settled.NOT_ARRIVED, error
+            if not waiting:
+                return Settled.ARRIVED, None
+            if self._clock.now() >= latest:
+                names = ", ".join(status.device for status in waiting)
+                return Settled.NOT_ARRIVED, SettleTimeoutError(f"{names} did not arrive within {settle.timeout:g} s")
+            self._sleep_until(min(self._clock.now() + self._period, latest))
+            self._tick()
 
     def _hold_until(self, end: float, started: float) -> None:
         tick = 1
@@ -430,7 +461,7 @@ class Engine:
         return values
 
     def _tick_after(self, tick: float) -> float:
-        """Return when the tick after one is due; those that were missed meanwhile are not made up for."""
+        """Return when the tick after one is due; missed ticks are skipped, not caught up."""
         return tick + self._period * (1 + max(0, math.floor((self._clock.now() - tick) / self._period)))
 
     def _values(self, ask: Callable[[], dict[str, float]]) -> dict[str, float]:
@@ -487,7 +518,7 @@ class Engine:
             except Exception as error:
                 self._observers = tuple(other for other in self._observers if other is not observer)
                 name = type(observer).__name__
-                self._event("WARN", "observer", f"{name} is told no more: {type(error).__name__}: {error}")
+                self._event("WARN", "observer", f"{name} was dropped: {type(error).__name__}: {error}")
 
     def _finish(self, error: Exception | None, start: float, safe_state: Mapping[str, str]) -> Outcome:
         if error is None:
@@ -514,14 +545,14 @@ class Engine:
 
 
 def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan) -> None:
-    """Hold what a protocol will do, as its dry run says, against a rig's needs and limits.
+    """Check the plan of a dry run against the rig's devices and limits.
 
     Raises
     ------
     ConfigurationError
         If the rig lacks something, or a set-point would leave a device's limits; nothing has moved.
     """
-    rig.check_needs(definition.name, definition.needs)
+    rig.check_needs(definition.name, definition.names)
     rig.check_needs(definition.name, sorted(expected.watched))
     if expected.watched:
         preload()

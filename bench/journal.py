@@ -1,25 +1,26 @@
-"""The durable record of a run: one SQLite file, written before anything else is told.
+"""The durable record of a run: one SQLite file, written before any observer is notified.
 
 The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
 it is handed over; what `Journal` has returned from survives the death of the process and of the machine.
 Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
 becomes one self-contained file, which can be read where nothing can be written.
 
-Schema, version 1
+Schema, version 2
 -----------------
 `meta(key, value)`
-    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `overrides`, `protocol`,
-    `parameters`, `seed`, `clock`, `epoch` (time of day at t = 0), `devices` (identity by name),
-    `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and whether it was clean),
-    `host` (with the room's time at the start), `controls` (the signal under control), `plan`, `dashboard`,
-    and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished` (laboratory s),
-    `safe_state` (outcome by device). A file without `status` is of a run that is going on or whose process
-    died.
+    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
+    extends and the overrides), `overrides`, `protocol`, `parameters`, `slots` (device and signal by name), `seed`,
+    `clock`, `epoch` (time of day at t = 0), `devices` (identity by name), `calibration`, `operator`, `command`,
+    `packages` (versions), `git` (commit and whether it was clean), `host` (with the wall-clock time at the start),
+    `controls` (the signal under control), `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`,
+    `failed`), `reason`, `finished` (laboratory s), `safe_state` (outcome by device). A file without `status` is of a
+    run that is going on or whose process died.
 `signals(position, name, unit, description, precision)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …)`
-    One row a finished step; times are laboratory s; `setpoints` is JSON by device; then one REAL column a
-    signal, the reading.
+    One row a finished step; times are laboratory s; `settled` says how (`dwell`, `steady`, `arrived`,
+    `controlled`; `not steady` or `not arrived` in the step that ended a run); `setpoints` is JSON by device; then
+    one REAL column a signal, the reading. Version 1 has 1 for each `settled`.
 `telemetry(tick, t, step, "<signal>", …)`
     One row a tick of a hold: quick readings.
 `events(event, t, level, kind, text)`
@@ -44,9 +45,14 @@ import numpy.typing as npt
 from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
+from bench.settling import Settled
 
-SCHEMA = 1
+SCHEMA = 2
+_READABLE = (1, SCHEMA)
 FILE_NAME = "journal.sqlite"
+
+_SETTLED = "settled NOT IN ({})".format(", ".join(f"'{each}'" for each in Settled if each.failed))
+"""Whether the settling rule was met, for SQL."""
 
 _OWN_COLUMNS = ("step", "started", "finished", "phase", "label", "settled", "setpoints", "tick", "t")
 
@@ -72,8 +78,8 @@ class StepRecord:
         Laboratory time, s.
     phase, label : str
         Where in the protocol.
-    settled : bool
-        Whether the settling rule was met.
+    settled : Settled
+        How it settled.
     setpoints : mapping of str to float
         What was sent, by device.
     values : tuple of float
@@ -85,7 +91,7 @@ class StepRecord:
     finished: float
     phase: str
     label: str
-    settled: bool
+    settled: Settled
     setpoints: Mapping[str, float]
     values: tuple[float, ...]
 
@@ -151,7 +157,7 @@ class Journal:
             self._db.execute(
                 "CREATE TABLE steps (step INTEGER PRIMARY KEY, started REAL NOT NULL, "
                 "finished REAL NOT NULL, phase TEXT NOT NULL, label TEXT NOT NULL, "
-                f"settled INTEGER NOT NULL, setpoints TEXT NOT NULL{columns})"
+                f"settled TEXT NOT NULL, setpoints TEXT NOT NULL{columns})"
             )
             self._db.execute(
                 f"CREATE TABLE telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, step INTEGER NOT NULL{columns})"
@@ -188,7 +194,7 @@ class Journal:
                 record.finished,
                 record.phase,
                 record.label,
-                int(record.settled),
+                record.settled.value,
                 json.dumps({name: float(value) for name, value in record.setpoints.items()}),
                 *map(float, record.values),
             ),
@@ -308,10 +314,10 @@ class Record:
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             self._db.close()
             raise DataError(f"{self.path} is not a readable journal: {error}") from error
-        if self.meta.get("schema") != SCHEMA:
+        if self.meta.get("schema") not in _READABLE:
             self._db.close()
             raise DataError(
-                f"{self.path} has schema version {self.meta.get('schema')}; this bench reads version {SCHEMA}"
+                f"{self.path} has schema version {self.meta.get('schema')}; this bench reads versions 1 and {SCHEMA}"
             )
 
     def __enter__(self) -> Self:
@@ -331,7 +337,7 @@ class Record:
         return next((s.unit for s in self.signals if s.name == signal), others)
 
     def steps(self) -> Table:
-        """Return the readings: columns `step`, `started`, `finished`, `settled`, and one a signal."""
+        """Return the readings: columns `step`, `started`, `finished`, `settled` (1 or 0), and one a signal."""
         return self._table("steps", ("step", "started", "finished", "settled"))
 
     def step_records(self) -> Iterator[StepRecord]:
@@ -345,7 +351,7 @@ class Record:
                     finished,
                     phase,
                     label,
-                    bool(settled),
+                    Settled.UNRECORDED if settled == 1 else Settled(settled),
                     json.loads(setpoints),
                     tuple(map(_number, values)),
                 )
@@ -375,7 +381,7 @@ class Record:
 
     def _table(self, table: str, leading: tuple[str, ...]) -> Table:
         names = leading + tuple(signal.name for signal in self.signals)
-        columns = ", ".join(_quoted(name) for name in names)
+        columns = ", ".join(_SETTLED if name == "settled" else _quoted(name) for name in names)
         rows = self._query(f"SELECT {columns} FROM {table} ORDER BY 1")  # noqa: S608 - own names
         try:
             data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))

@@ -18,6 +18,7 @@ from typing import Any
 
 from rich.console import Console
 
+from bench.binding import Slots
 from bench.clock import Stopwatch, make_clock, room_date
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
@@ -25,7 +26,8 @@ from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.terminal import ProgressDisplay, ask_operator
 
 RECORDING_NAME = "run.rrd"
@@ -41,8 +43,8 @@ class Run:
     ----------
     protocol : ProtocolDefinition
         What to carry out.
-    parameters : ProtocolParameters
-        Its parameters.
+    settings : mapping
+        Parameters of it that were set, as texts or values; the others have the rig's defaults or its own.
     rig : str
         Name of a packaged rig or path of a rig file.
     overrides : mapping of str to str
@@ -60,7 +62,7 @@ class Run:
     """
 
     protocol: ProtocolDefinition
-    parameters: ProtocolParameters
+    settings: Mapping[str, Any]
     rig: str
     folder: Path
     overrides: Mapping[str, str] = field(default_factory=dict)
@@ -109,10 +111,16 @@ def carry_out(run: Run, console: Console) -> RunResult:
     clock = make_clock(run.clock)
     if run.clock != "wall" and any(not _is_emulated(entry.settings) for entry in rig_file.devices):
         raise ConfigurationError(f"rig {rig_file.name} has real devices, which know only the wall clock")
-    expected = plan(run.protocol, run.parameters)
+    parameters = run.protocol.parse(
+        run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
+    )
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     with ExitStack() as stack:
-        rig = stack.enter_context(Rig(rig_file, clock, run.seed))
+        rig = Rig(rig_file, clock, run.seed)
+        # The lines only: the engine brings the devices into their safe state, and says how that went.
+        stack.callback(rig.close)
+        slots = rig.slots(run.protocol)
+        expected = plan(run.protocol, parameters, slots)
         check_before_moving(rig, run.protocol, expected)
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
@@ -121,8 +129,8 @@ def carry_out(run: Run, console: Console) -> RunResult:
             )
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = _metadata(run, rig, expected, folder.name)
-        signals = rig.signals + trace_signals(run.protocol, rig)
+        meta = _metadata(run, rig, parameters, slots, expected, folder.name)
+        signals = rig.signals + trace_signals(run.protocol, rig, slots)
         journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
         observers: list[Any] = []
@@ -139,7 +147,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         observers.append(stack.enter_context(progress))
         interrupts = stack.enter_context(Interrupts(_say_at_once))
         ask = partial(ask_operator, console) if operator_is_there else None
-        outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, run.parameters)
+        outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, parameters)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
     return RunResult(folder, outcome, stopwatch.seconds())
@@ -183,30 +191,35 @@ def _dashboard(run: Run, rig: Rig, signals: Sequence[Signal], meta: Mapping[str,
         live=run.live,
         card=run_card(meta),
         properties={"rig": rig.file.name, "protocol": run.protocol.name, "seed": run.seed},
-        controls=run.protocol.controls,
+        controls=str(meta["controls"]),
     )
 
 
-def trace_signals(protocol: ProtocolDefinition, rig: Rig) -> tuple[Signal, ...]:
+def trace_signals(protocol: ProtocolDefinition, rig: Rig, slots: Slots) -> tuple[Signal, ...]:
     """Return the signals that a protocol's controllers add to the rig's."""
-    if not protocol.controls:
+    controlled = protocol.controlled(slots)
+    if not controlled:
         return ()
-    rig.check_needs(protocol.name, [protocol.controls])
-    unit = next(signal.unit for signal in rig.signals if signal.name == protocol.controls)
+    rig.check_needs(protocol.name, [controlled])
+    unit = next(signal.unit for signal in rig.signals if signal.name == controlled)
     return (*(replace(signal, unit=unit) for signal in TRACES), LATENESS)
 
 
-def _metadata(run: Run, rig: Rig, expected: Plan, name: str) -> dict[str, Any]:
+def _metadata(
+    run: Run, rig: Rig, parameters: ProtocolParameters, slots: Slots, expected: Plan, name: str
+) -> dict[str, Any]:
     return {
         "run": name,
         "rig": rig.file.name,
         "rig_title": rig.file.rig.title,
         "rig_file": rig.file.text,
+        "rig_content": rig.file.content,
         "overrides": dict(run.overrides),
         "protocol": run.protocol.name,
         "protocol_summary": run.protocol.summary,
-        "parameters": run.parameters.model_dump(mode="json"),
-        "controls": run.protocol.controls,
+        "parameters": parameters.model_dump(mode="json"),
+        "controls": run.protocol.controlled(slots),
+        "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
         "clock": run.clock,

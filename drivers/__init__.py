@@ -1,1 +1,1 @@
-"""One module an instrument: the driver that speaks its real protocol on a real wire."""
+"""Drivers: one module or folder per instrument, which speaks its real protocol on a real wire."""

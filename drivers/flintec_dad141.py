@@ -1,11 +1,11 @@
-"""Driver of the Flintec DAD 141.1, the amplifier of a strain-gauge load cell, by Modbus RTU.
+"""The Flintec DAD 141.1, the amplifier of a strain-gauge load cell, by Modbus RTU.
 
 Sources: Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3, for the registers; Flintec DAD 141.1
 Technical Manual, Rev 2.5, 10.1 (identity), 10.4 (filters) and 10.5 (taring); MODBUS over Serial Line,
 Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
 
-The instrument is calibrated at its own keys, for a weight in a unit of the user's; the settings turn that into
-newtons. Nothing is saved in its EEPROM: filter and tare are what they were before after a power cycle.
+The instrument is calibrated at its own keys, for a weight in a unit that the user chose; the settings convert it to
+newtons. Nothing is saved in its EEPROM: a power cycle restores the previous filter and tare.
 
 Assumptions: register 0x202C holds the 1410 that the command ID returns, as a number or digit by digit; the first
 byte of the firmware register is the higher one, and holds the minor version; an integer weight has the digits of
@@ -15,24 +15,22 @@ was; characters have 8 bits and one stop bit.
 
 from __future__ import annotations
 
-import logging
 import math
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, NamedTuple
 
-import serial
 from pydantic import Field, field_validator
 from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
 from bench.clock import Clock
-from bench.devices import DriverSettings, Identity, LoadCell
+from bench.devices import Identity, LoadCell
 from bench.errors import DeviceConnectionError, DeviceError
-
-# Everything that pymodbus logs as an error is raised here with the name of the device.
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+from drivers.device import LineDevice, Slope
+from drivers.modbus import exception_text, pack, swapped, unpack
+from drivers.serial_line import SerialSettings, lost_line, open_port
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
 """3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
@@ -71,25 +69,10 @@ _STALE_LOOKS = 10
 _FAST_LINE = 19200  # Bd above which the pause between frames does not get shorter
 _FAST_PAUSE = 1.75e-3  # s
 
-_EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal data address",
-    3: "illegal data value",
-    4: "device failure",
-    5: "acknowledge",
-    6: "device busy",
-    8: "memory parity error",
-    10: "gateway path unavailable",
-    11: "gateway target does not respond",
-}
 
+class DAD141Settings(SerialSettings):
+    """Rig-file settings of a DAD 141.1."""
 
-class DAD141Settings(DriverSettings):
-    """What a rig file says of a DAD 141.1."""
-
-    port: str = Field(
-        min_length=1, description="line, as pyserial opens it: /dev/ttyUSB0, socket://host:port, emulated://load"
-    )
     address: int = Field(default=1, ge=1, le=247, description="Modbus address (menu 8.3), 1 to 247")
     baudrate: int = Field(
         default=115200, ge=9600, le=115200, description="speed of the line (menu 8.1) in Bd, 9600 to 115200"
@@ -98,33 +81,22 @@ class DAD141Settings(DriverSettings):
         default="N", description="parity (menu 8.7): N for none, E for even, O for odd"
     )
     timeout: float = Field(
-        default=0.2,
-        ge=0.02,
-        le=10.0,
-        description="wait for a reply in s, 0.02 to 10; a request is sent twice at most",
+        default=0.2, ge=0.02, le=10.0, description="wait for a reply, s: 0.02 to 10; a request is sent twice at most"
     )
     pause: float | None = Field(
         default=None,
         ge=0.0,
         le=1.0,
-        description="silence between a reply and the next request in s, 0 to 1; unless given, the 3.5 characters "
-        "that Modbus asks for, or 1.75 ms above 19200 Bd",
+        description="silence before a request, s: 0 to 1; unless given, 3.5 characters, or 1.75 ms above 19200 Bd",
     )
     filter: int = Field(
-        default=3,
-        ge=0,
-        le=7,
-        description="digital low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1 and 0.5 Hz",
+        default=3, ge=0, le=7, description="low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1, 0.5 Hz"
     )
     samples: int = Field(default=5, ge=1, le=1000, description="readings averaged in one measurement, 1 to 1000")
     interval: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=60.0,
-        description="time from reading to reading of a measurement in s, 0 to 60; unless given, half a period of "
-        "the filter's cut-off, which makes their noise nearly independent",
+        default=None, ge=0.0, le=60.0, description="time between readings, s; default: half a period of the cut-off"
     )
-    newtons_per_unit: float = Field(
+    newtons_per_unit: Slope = Field(
         default=1.0,
         description="calibration: N for each unit of weight, not 0; 9.80665 for kg, negative to turn the sign",
     )
@@ -132,7 +104,7 @@ class DAD141Settings(DriverSettings):
         default=0.0, description="calibration: force in N at which the gross weight reads zero"
     )
     force_limits: tuple[float, float] = Field(
-        description="calibrated range in N, low and high; a gross force beyond, whatever the tare, is an error"
+        description="calibrated range in N, low and high; a gross force beyond, with any tare, is an error"
     )
     keep_tare: bool = Field(
         default=False, description="whether a tare found on connecting stays; otherwise it is reset"
@@ -151,13 +123,6 @@ class DAD141Settings(DriverSettings):
         default=(1410, 0x1410), min_length=1, description="values of register 0x202C (device identity) to accept"
     )
 
-    @field_validator("newtons_per_unit")
-    @classmethod
-    def _check_slope(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("must be a number other than 0")
-        return value
-
     @field_validator("force_limits")
     @classmethod
     def _check_limits(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -173,47 +138,24 @@ class _Client(ModbusSerialClient):
     pymodbus looks whether bytes have come, sleeps for a millisecond or more, and looks again whether more have:
     two naps for each reply. The head of a reply says how long it is, so that the port itself can wait for
     exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
-
-    Parameters
-    ----------
-    settings : DAD141Settings
-        What the rig file says.
     """
 
-    def __init__(self, settings: DAD141Settings) -> None:
-        # Sending again is up to the caller, who has to let late replies pass first.
+    def __init__(self, name: str, settings: DAD141Settings) -> None:
+        # Sending again is left to the caller, which lets late replies pass first.
         super().__init__(
-            settings.port,
-            baudrate=settings.baudrate,
-            parity=settings.parity,
-            timeout=settings.timeout,
-            retries=0,
+            settings.port, baudrate=settings.baudrate, parity=settings.parity, timeout=settings.timeout, retries=0
         )
-        self.socket: Any = None
+        self.socket: Any = open_port(name, settings, parity=settings.parity, exclusive=True)
         self._received = 0
-
-    def open(self) -> None:
-        """Open the line; raises what the port raises."""
-        parameters = self.comm_params
-        self.socket = serial.serial_for_url(
-            parameters.host,
-            baudrate=parameters.baudrate,
-            bytesize=parameters.bytesize,
-            parity=parameters.parity,
-            stopbits=parameters.stopbits,
-            timeout=parameters.timeout_connect,
-            write_timeout=parameters.timeout_connect,
-            exclusive=True,
-        )
 
     def connect(self) -> bool:
         """Return whether the line is open; a line that was lost stays closed."""
         return self.socket is not None
 
     def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:  # noqa: ARG002 - pymodbus's form
-        """Send a request, and forget whatever came before it."""
-        with _LineErrors(self):
-            self._forget()
+        """Send a request, and discard what came before it."""
+        with self._line_errors():
+            self._discard()
             self._received = 0
             sent: int = self.socket.write(request)
         return sent
@@ -222,7 +164,7 @@ class _Client(ModbusSerialClient):
         """Wait for a reply, up to the timeout, and return what has come of it."""
         if self._received > _LONGEST_REPLY:
             return b""  # it never becomes a reply
-        with _LineErrors(self):
+        with self._line_errors():
             reply: bytes = self.socket.read(_SHORTEST_REPLY)
             if len(reply) == _SHORTEST_REPLY and (missing := _reply_length(reply) - _SHORTEST_REPLY) > 0:
                 reply += self.socket.read(missing)
@@ -230,34 +172,29 @@ class _Client(ModbusSerialClient):
         return reply
 
     def drain(self) -> None:
-        """Let whatever still arrives pass, until nothing has come for a timeout."""
-        with _LineErrors(self):
+        """Discard what still arrives, until nothing has come for a timeout."""
+        with self._line_errors():
             for _ in range(_MOST_STRAY // _LONGEST_REPLY):
                 if not self.socket.read(_LONGEST_REPLY):
                     return
         raise ConnectionException("the line does not fall silent")
 
-    def _forget(self) -> None:
+    def _discard(self) -> None:
         # A socket says only that something is waiting, not how much; hence byte by byte at worst.
         for _ in range(_MOST_STRAY):
             if not (waiting := self.socket.in_waiting):
                 return
             self.socket.read(waiting)
 
-
-class _LineErrors:
-    """Turns what a port raises into what pymodbus raises."""
-
-    def __init__(self, client: _Client) -> None:
-        self._client = client
-
-    def __enter__(self) -> None:
-        if self._client.socket is None:
+    @contextmanager
+    def _line_errors(self) -> Iterator[None]:
+        """Turn what the port raises into what pymodbus raises."""
+        if self.socket is None:
             raise ConnectionException("the line is closed")
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if isinstance(error, OSError):
-            self._client.close()  # type: ignore[no-untyped-call]
+        try:
+            yield
+        except OSError as error:
+            self.close()  # type: ignore[no-untyped-call]
             raise ConnectionException(str(error)) from error
 
 
@@ -271,25 +208,19 @@ def _reply_length(head: bytes) -> int:
     return len(head)
 
 
+class _Block(NamedTuple):
+    """The combined registers, in the unit of weight."""
+
+    gross: float
+    net: float
+    qualifier: int
+
+
 class _Line:
     """The serial line to one instrument: its registers, and sending again.
 
     Modbus RTU does not say which request a reply belongs to. So after a request without a good reply the line
     is given time for a late one to pass before anything else is sent.
-
-    Parameters
-    ----------
-    name : str
-        Name of the device, for messages.
-    settings : DAD141Settings
-        What the rig file says.
-    clock : Clock
-        The clock of the run, for the pauses between frames.
-
-    Raises
-    ------
-    DeviceConnectionError
-        If the line cannot be opened.
     """
 
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock) -> None:
@@ -298,11 +229,7 @@ class _Line:
         self._clock = clock
         self._pause = _frame_pause(settings)
         self._silent_since = clock.now()
-        self._client = _Client(settings)
-        try:
-            self._client.open()
-        except Exception as error:  # pyserial lets errors of the system pass that are no OSError
-            raise DeviceConnectionError(name, f"cannot open {settings.port}: {error}") from None
+        self._client = _Client(name, settings)
 
     def close(self) -> None:
         """Release the line."""
@@ -327,9 +254,13 @@ class _Line:
         """Get a 32-bit integer."""
         return _integer(self.read(address, 2))
 
+    def read_block(self) -> _Block:
+        """Get the combined registers."""
+        return _Block(*unpack("ffH", self.read(_COMBINED, 5)))
+
     def set_integer(self, title: str, address: int, value: int) -> None:
         """Set a 32-bit integer and read it back; `title` is its name for messages."""
-        words = list(struct.unpack(">2H", struct.pack(">i", value)))
+        words = pack("i", value)
         unit = self._settings.address
         self._exchange(
             lambda: self._client.write_registers(address, words, device_id=unit), f"writing register 0x{address:04X}"
@@ -354,23 +285,19 @@ class _Line:
         try:
             for _ in range(_RESENDS):
                 try:
-                    return self._checked(self._once(request), doing)
+                    return self._once(request, doing)
                 except ModbusIOException:
                     self._client.drain()
-            return self._checked(self._once(request), doing)
+            return self._once(request, doing)
         except ModbusException as error:
             raise self._lost(error) from error
 
-    def _once(self, request: Callable[[], ModbusPDU]) -> ModbusPDU:
+    def _once(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
         self._clock.sleep_until(self._silent_since + self._pause)
         response = request()
         self._silent_since = self._clock.now()
-        return response
-
-    def _checked(self, response: ModbusPDU, doing: str) -> ModbusPDU:
         if response.isError():
-            code = response.exception_code
-            raise _RefusedError(self._name, code, doing)
+            raise _RefusedError(self._name, response.exception_code, doing)
         return response
 
     def _lost(self, error: Exception) -> DeviceConnectionError:
@@ -378,9 +305,7 @@ class _Line:
         settings = self._settings
         self.close()
         if isinstance(error, ConnectionException):
-            return DeviceConnectionError(
-                self._name, f"lost the line {settings.port} ({error.string}); check the cable, then connect again"
-            )
+            return lost_line(self._name, settings, error.string, ", then connect again")
         return DeviceConnectionError(
             self._name,
             f"no good reply within {settings.timeout:g} s at {settings.port}, address {settings.address}, after "
@@ -393,51 +318,26 @@ class _RefusedError(DeviceError):
     """The instrument answered with a Modbus exception."""
 
     def __init__(self, device: str, code: int, doing: str) -> None:
-        super().__init__(device, f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'unknown')}) on {doing}")
+        super().__init__(device, exception_text(code, doing))
 
 
-class _Block(NamedTuple):
-    """What one read of the combined registers gives."""
-
-    gross: float
-    net: float
-    qualifier: int
-
-
-class FlintecDAD141(LoadCell):
-    """A load cell behind a DAD 141.1.
+class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
+    """A load cell on a DAD 141.1.
 
     Every reading is one request for gross weight, net weight and qualifier together, so that they belong to one
     conversion. The force is the net one while the instrument has a tare, and the gross one otherwise; a tare
     that was set or lost without the bench is an error, as the force would jump by it. `measure` averages
     `samples` readings, `glance` takes one.
 
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    clock : Clock
-        The clock of the run.
-    settings : DAD141Settings
-        What the rig file says.
-    line : _Line
-        The open line; `connect` makes it.
-    identity : Identity
-        What the instrument said of itself.
-    tared : bool
-        Whether the instrument has a tare that counts.
+    `connect` checks the order of words in the instrument's values, and sets filter and tare.
     """
 
     Settings: ClassVar[type[DAD141Settings]] = DAD141Settings
 
-    def __init__(
-        self, name: str, clock: Clock, settings: DAD141Settings, line: _Line, identity: Identity, tared: bool
-    ) -> None:
-        super().__init__(name, clock)
-        self._settings = settings
-        self._line = line
-        self._identity = identity
-        self._tared = tared
+    def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
+        super().__init__(name, settings, clock, line)
+        self._tared = False
+        # Half a period of the filter's cut-off makes the noise of the readings nearly independent.
         self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
         self._gross = math.nan
         self._gross_since = 0.0
@@ -446,34 +346,16 @@ class FlintecDAD141(LoadCell):
         self._adc_looks = 0
 
     @classmethod
-    def connect(cls, name: str, settings: DAD141Settings, clock: Clock) -> FlintecDAD141:
-        """Open the line, check that a DAD 141.1 answers and how it orders words, and set filter and tare.
+    def _open_line(cls, name: str, settings: DAD141Settings, clock: Clock) -> _Line:
+        return _Line(name, settings, clock)
 
-        Raises
-        ------
-        DeviceConnectionError
-            If the line cannot be opened, nobody answers, or another device, or with swapped words.
-        DeviceError
-            If the instrument does not take a setting.
-        """
-        line = _Line(name, settings, clock)
-        try:
-            identity = _identify(name, settings, line)
-            line.set_integer("filter mode", _FILTER_MODE, _IIR)
-            line.set_integer("filter", _FILTER, settings.filter)
-            tared = settings.keep_tare and bool(_decode(line.read(_COMBINED, 5)).qualifier & _TARE_SET)
-            cell = cls(name, clock, settings, line, identity, tared)
-            if not tared:
-                cell.clear_tare()
-        except BaseException:
-            line.close()
-            raise
-        return cell
-
-    @property
-    def identity(self) -> Identity:
-        """Get the identity that the instrument gave on connecting."""
-        return self._identity
+    def _start(self) -> None:
+        settings, line = self._settings, self._line
+        line.set_integer("filter mode", _FILTER_MODE, _IIR)
+        line.set_integer("filter", _FILTER, settings.filter)
+        self._tared = settings.keep_tare and bool(line.read_block().qualifier & _TARE_SET)
+        if not self._tared:
+            self.clear_tare()
 
     @property
     def tared(self) -> bool:
@@ -536,13 +418,52 @@ class FlintecDAD141(LoadCell):
     def safe(self) -> None:
         """Do nothing: a load cell is safe in any state."""
 
-    def close(self) -> None:
-        """Release the line."""
-        self._line.close()
+    def _identify(self) -> Identity:
+        """Check that the instrument is the right one and orders words as this driver does."""
+        settings, line = self._settings, self._line
+        try:
+            words = line.read(_DEVICE_ID, 2)
+            if _integer(words) not in settings.device_ids:
+                known = " or ".join(str(each) for each in settings.device_ids)
+                raise self._wrong(
+                    swapped(words, lambda order: _integer(order) in settings.device_ids)
+                    or f"is no DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or "
+                    "add the number to `device_ids` if it is one"
+                )
+            high, low = line.read(_FIRMWARE, 2)
+            if high or not low:
+                raise self._wrong(
+                    f"gives 0x{high:04X}{low:04X} for its firmware, which no DAD 141.1 does; check the address"
+                )
+            serial_number = line.read_integer(_SERIAL_NUMBER)
+            self._check_order()
+        except _RefusedError as error:
+            reason = str(error).removeprefix(f"{self.name}: ")
+            raise self._wrong(f"is no DAD 141.1: {reason}; check the address") from error
+        minor, major = low >> 8, low & 0xFF
+        return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
+
+    def _check_order(self) -> None:
+        """Raise unless the same weight as floating-point number and as integer has the same digits."""
+        for _ in range(_ORDER_TRIALS):
+            block = self._line.read_block()
+            digits = self._line.read_integer(_INTEGER_GROSS)
+            # Out of range the weight may be anything; the identity has shown the order already.
+            if block.qualifier & (_UNDER_RANGE | _OVER_RANGE) or _agree(block.gross, digits):
+                return
+        raise self._wrong(
+            f"gives the same weight as {block.gross:g} and, as an integer, {digits}; is there a gateway in between "
+            "that changes the order of words or bytes?"
+        )
+
+    def _wrong(self, what: str) -> DeviceConnectionError:
+        return DeviceConnectionError(
+            self.name, f"the device at {self._settings.port}, address {self._settings.address}, {what}"
+        )
 
     def _await_tare(self, wanted: bool) -> None:
         end = self._clock.now() + _TARE_TIMEOUT
-        while bool(_decode(self._line.read(_COMBINED, 5)).qualifier & _TARE_SET) is not wanted:
+        while bool(self._line.read_block().qualifier & _TARE_SET) is not wanted:
             if self._clock.now() >= end:
                 done, advice = (
                     ("took no tare", "is the load at rest?") if wanted else ("keeps its tare", "reset it by its keys")
@@ -563,19 +484,15 @@ class FlintecDAD141(LoadCell):
                 self.name, f"the instrument {what} Set the tare again, or clear it, so that its force can be trusted"
             )
         gross = settings.newtons_per_unit * block.gross + settings.zero_newtons
-        low, high = settings.force_limits
-        if not low <= gross <= high:
-            raise DeviceError(
-                self.name,
-                f"force {gross:.6g} N is outside of its calibrated range {low:g} to {high:g} N; "
-                "take load off, or extend the calibration and `force_limits`",
-            )
+        text = f"force {gross:.6g} N is outside of its calibrated range"
+        advice = "take load off, or extend the calibration and `force_limits`"
+        self._check_range(text, gross, settings.force_limits, "N", advice)
         self._check_fresh(block.gross)
         return settings.newtons_per_unit * block.net if self._tared else gross
 
     def _checked_block(self) -> _Block:
         """Read the combined registers; raise what they say is wrong."""
-        block = _decode(self._line.read(_COMBINED, 5))
+        block = self._line.read_block()
         if block.qualifier & (_UNDER_RANGE | _OVER_RANGE):
             side = "over" if block.qualifier & _OVER_RANGE else "under"
             raise DeviceError(
@@ -614,74 +531,18 @@ class FlintecDAD141(LoadCell):
             )
 
 
-def _identify(name: str, settings: DAD141Settings, line: _Line) -> Identity:
-    """Check that the instrument is the right one and orders words as this driver does."""
-    where = f"the device at {settings.port}, address {settings.address},"
-    try:
-        words = line.read(_DEVICE_ID, 2)
-        if _integer(words) not in settings.device_ids:
-            raise DeviceConnectionError(name, f"{where} {_found(words, settings)}")
-        high, low = line.read(_FIRMWARE, 2)
-        if high or not low:
-            raise DeviceConnectionError(
-                name,
-                f"{where} gives 0x{high:04X}{low:04X} for its firmware, which no DAD 141.1 does; check the address",
-            )
-        serial_number = line.read_integer(_SERIAL_NUMBER)
-        _check_order(name, where, line)
-    except _RefusedError as error:
-        reason = str(error).removeprefix(f"{name}: ")
-        raise DeviceConnectionError(name, f"{where} is no DAD 141.1: {reason}; check the address") from error
-    minor, major = low >> 8, low & 0xFF
-    return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
-
-
-def _found(words: Sequence[int], settings: DAD141Settings) -> str:
-    """Say what stands in the device identity instead of that of a DAD 141.1."""
-    if _integer(words[::-1]) in settings.device_ids:
-        return "sends the words of a value in swapped order; is there a gateway in between?"
-    if _integer([(word & 0xFF) << 8 | word >> 8 for word in words]) in settings.device_ids:
-        return "sends the bytes of a word in swapped order; is there a gateway in between?"
-    known = " or ".join(str(each) for each in settings.device_ids)
-    return (
-        f"is no DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or add the number to "
-        "`device_ids` if it is one"
-    )
-
-
-def _check_order(name: str, where: str, line: _Line) -> None:
-    """Raise unless the same weight as floating-point number and as integer has the same digits."""
-    for _ in range(_ORDER_TRIALS):
-        block = _decode(line.read(_COMBINED, 5))
-        digits = line.read_integer(_INTEGER_GROSS)
-        # Out of range the weight may be anything; the identity has shown the order already.
-        if block.qualifier & (_UNDER_RANGE | _OVER_RANGE) or _agree(block.gross, digits):
-            return
-    raise DeviceConnectionError(
-        name,
-        f"{where} gives the same weight as {block.gross:g} and, as an integer, {digits}; is there a gateway in "
-        "between that changes the order of words or bytes?",
-    )
-
-
 def _agree(weight: float, digits: int) -> bool:
     """Return whether an integer has the digits of a weight, give or take some motion."""
     tolerance = 2.5 + 0.02 * abs(digits)
     return any(abs(weight * 10.0**decimals - digits) <= tolerance for decimals in range(_MOST_DECIMALS + 1))
 
 
-def _decode(words: Sequence[int]) -> _Block:
-    gross, net, qualifier = struct.unpack(">ffH", struct.pack(">5H", *words))
-    return _Block(gross, net, qualifier)
-
-
 def _integer(words: Sequence[int]) -> int:
-    value: int = struct.unpack(">i", struct.pack(">2H", *words))[0]
-    return value
+    return int(unpack("i", words)[0])
 
 
 def _frame_pause(settings: DAD141Settings) -> float:
-    """Return the silence between frames in s."""
+    """Return the silence between frames in s; by default the 3.5 characters of Modbus, 1.75 ms above 19200 Bd."""
     if settings.pause is not None:
         return settings.pause
     if settings.baudrate > _FAST_LINE:

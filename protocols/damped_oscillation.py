@@ -1,44 +1,49 @@
-"""Characterization by nested loops: a damped oscillation of the temperature that fills the Preisach plane."""
+"""Characterization by nested loops: a damped oscillation of the drive that fills the Preisach plane."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
 from bench.identification import excitation
-from bench.protocol import Dwell, Messages, Phase, ProtocolParameters, Step, UntilSteady, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
+
+_DRIVE = unit_of("drive")
 
 
-class Parameters(ProtocolParameters):
+class Parameters(LoadedParameters):
     """What can be set."""
 
-    low: float = parameter(21.0, unit="°C", low=-20, high=150, help="lowest temperature, where the memory is reset")
-    high: float = parameter(84.0, unit="°C", low=-20, high=150, help="highest temperature, the first reversal")
+    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
+    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point, the first reversal")
     center: float = parameter(
-        54.0, unit="°C", low=-20, high=150, help="temperature about which the oscillation decays"
+        from_slot("drive", lambda drive: drive.at(0.5), "middle of the range of drive"),
+        unit=_DRIVE,
+        help="set-point about which the oscillation decays",
     )
     half_cycles: int = parameter(36, unit="1", low=1, high=1000, help="number of half-cycles after the first rise")
-    increment: float = parameter(0.35, unit="K", low=0.01, high=20, help="difference of neighbouring set-points")
-    dwell: float = parameter(8.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
+    increment: float = parameter(
+        from_slot("drive", "increment"), unit=_DRIVE, help="difference of neighbouring set-points"
+    )
+    dwell: float = parameter(
+        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+    )
 
 
-@protocol(needs=("tec", "tec_temperature", "curvature"))
-def damped_oscillation(parameters: Parameters) -> Messages:
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+def damped_oscillation(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis by nested minor loops.
 
-    Rises from `low` to `high`, then swings about `center` with shrinking amplitude, in steps of `increment`
-    with a fixed dwell and one reading each, so that every cell of the Preisach plane is swept (Zhang et al.
-    2013, section IV-B: 21 to 84 °C, 8 s, about 3000 set-points). `low` has to be below the phase transition:
-    the run begins by resetting the memory to negative saturation there.
+    Rises from `low` to `high`, then swings about `center` with shrinking amplitude, in steps of `increment` with a
+    fixed dwell and one reading each, so that every cell of the Preisach plane is swept (Zhang et al. 2013, section
+    IV-B: 21 to 84 °C, 8 s, about 3000 set-points). `low` has to saturate the specimen: the run begins by resetting
+    the memory to negative saturation there.
     """
+    drive = slots["drive"].device
     setpoints = excitation.damped_oscillation(
         parameters.low, parameters.high, parameters.center, parameters.half_cycles, parameters.increment
     )
-    yield Phase("reset to negative saturation")
-    yield Step(
-        {"tec": float(setpoints[0])},
-        UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=parameters.dwell),
-        label="reset",
-    )
+    yield from reset(slots, float(setpoints[0]), parameters.dwell, load=parameters.load)
     yield Phase("rise")
     direction = 1.0
     for previous, target in pairwise(setpoints.tolist()):
@@ -47,4 +52,4 @@ def damped_oscillation(parameters: Parameters) -> Messages:
             yield Phase("damped oscillation")
         if reversal:
             direction = -direction
-        yield Step({"tec": target}, Dwell(parameters.dwell), label="reversal" if reversal else "")
+        yield Step({drive: target}, Dwell(parameters.dwell), label="reversal" if reversal else "")

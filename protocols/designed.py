@@ -6,23 +6,28 @@ import numpy as np
 
 from bench.hysteresis import uniform_levels
 from bench.identification import covering_sequence, design
-from bench.protocol import Dwell, Messages, Phase, ProtocolParameters, Step, UntilSteady, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
+
+_DRIVE = unit_of("drive")
 
 
-class Parameters(ProtocolParameters):
+class Parameters(LoadedParameters):
     """What can be set."""
 
-    low: float = parameter(21.0, unit="°C", low=-20, high=150, help="lowest temperature, where the memory is reset")
-    high: float = parameter(84.0, unit="°C", low=-20, high=150, help="highest temperature")
-    plane_low: float = parameter(30.0, unit="°C", low=-20, high=150, help="lower end of the Preisach plane")
-    plane_high: float = parameter(70.0, unit="°C", low=-20, high=150, help="upper end of the Preisach plane")
+    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
+    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point")
+    plane_low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lower end of the Preisach plane")
+    plane_high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="upper end of the Preisach plane")
     levels: int = parameter(40, unit="1", low=2, high=200, help="levels of the sequence, as the model's or finer")
     per_cell: int = parameter(2, unit="1", low=1, high=20, help="set-points from one level to the next")
-    dwell: float = parameter(8.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
+    dwell: float = parameter(
+        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+    )
 
 
-@protocol(needs=("tec", "tec_temperature", "curvature"))
-def covering(parameters: Parameters) -> Messages:
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+def covering(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis in the fewest set-points that cover every cell.
 
     Loops that shrink level by level: each cell of the plane is told apart from all others by the difference of two
@@ -30,17 +35,18 @@ def covering(parameters: Parameters) -> Messages:
     set-points each, average noise as the damped oscillation does for a model of 20 levels, in half its time.
     `bench design` shows what each sequence costs.
     """
-    yield from _carry_out(parameters, covering_sequence(*_grid(parameters), per_cell=parameters.per_cell))
+    yield from _carry_out(parameters, slots, covering_sequence(*_grid(parameters), per_cell=parameters.per_cell))
 
 
-@protocol(needs=("tec", "tec_temperature", "curvature"))
-def first_order_reversals(parameters: Parameters) -> Messages:
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+def first_order_reversals(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis by first-order reversal curves.
 
     From positive saturation down to each level in turn, and up again level by level (Mayergoyz, *Mathematical
     Models of Hysteresis and Their Applications*, 2003, chapter 1).
     """
-    yield from _carry_out(parameters, design.first_order_reversals(*_grid(parameters), per_cell=parameters.per_cell))
+    sequence = design.first_order_reversals(*_grid(parameters), per_cell=parameters.per_cell)
+    yield from _carry_out(parameters, slots, sequence)
 
 
 def _grid(parameters: Parameters) -> tuple[np.ndarray, tuple[float, float]]:
@@ -48,13 +54,8 @@ def _grid(parameters: Parameters) -> tuple[np.ndarray, tuple[float, float]]:
     return grid, (parameters.low, parameters.high)
 
 
-def _carry_out(parameters: Parameters, setpoints: np.ndarray) -> Messages:
-    yield Phase("reset to negative saturation")
-    yield Step(
-        {"tec": parameters.low},
-        UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=parameters.dwell),
-        label="reset",
-    )
+def _carry_out(parameters: Parameters, slots: Slots, setpoints: np.ndarray) -> Messages:
+    yield from reset(slots, parameters.low, parameters.dwell, load=parameters.load)
     yield Phase("designed sequence")
     for target in setpoints.tolist():
-        yield Step({"tec": target}, Dwell(parameters.dwell))
+        yield Step({slots["drive"].device: target}, Dwell(parameters.dwell))

@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.control.loops import Playback
 from bench.hybrid_runs import BASE, DEFLECTION, TIP
-from bench.protocol import Dwell, FastLoop, Messages, Phase, ProtocolParameters, Step, parameter, protocol
+from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Step, parameter, protocol
 from protocols.muscle import parse_numbers
 
 SENSORS = (DEFLECTION, BASE, TIP)
@@ -41,13 +41,13 @@ def current_sine(parameters: CurrentSineParameters) -> Messages:
         if not 0 < frequency <= parameters.rate / 10:
             raise ValueError(f"frequencies: expected more than 0 and at most {parameters.rate / 10:g} Hz")
         yield Phase(f"sine of {frequency:g} Hz")
-        yield FastLoop(
-            Playback(_sine(parameters.amplitude, frequency)),
-            parameters.rate,
-            parameters.periods / frequency,
-            SENSORS,
-            ("tec",),
-            ((-parameters.amplitude, parameters.amplitude),),
+        yield FixedRate(
+            controller=Playback(_sine(parameters.amplitude, frequency)),
+            rate=parameters.rate,
+            duration=parameters.periods / frequency,
+            inputs=SENSORS,
+            actuators=("tec",),
+            limits=((-parameters.amplitude, parameters.amplitude),),
             label=f"{frequency:g} Hz",
         )
 
@@ -76,13 +76,13 @@ def current_steps(parameters: CurrentStepsParameters) -> Messages:
         return levels[min(int(number), len(levels) - 1)] if within < parameters.on else 0.0
 
     yield Phase("steps of the current")
-    yield FastLoop(
-        Playback(current),
-        parameters.rate,
-        len(levels) * cycle,
-        SENSORS,
-        ("tec",),
-        ((min(0.0, *levels), max(0.0, *levels)),),
+    yield FixedRate(
+        controller=Playback(current),
+        rate=parameters.rate,
+        duration=len(levels) * cycle,
+        inputs=SENSORS,
+        actuators=("tec",),
+        limits=((min(0.0, *levels), max(0.0, *levels)),),
         label="current steps",
     )
 
@@ -132,13 +132,13 @@ def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
         return amplitudes[cycle] * math.sin(2.0 * math.pi * parameters.frequency * t)
 
     yield Phase("loops of the voltage")
-    yield FastLoop(
-        Playback(voltage),
-        parameters.rate,
-        len(amplitudes) / parameters.frequency,
-        SENSORS,
-        ("piezo",),
-        ((-largest, largest),),
+    yield FixedRate(
+        controller=Playback(voltage),
+        rate=parameters.rate,
+        duration=len(amplitudes) / parameters.frequency,
+        inputs=SENSORS,
+        actuators=("piezo",),
+        limits=((-largest, largest),),
         label="piezo loops",
     )
 
@@ -160,13 +160,13 @@ def piezo_step(parameters: PiezoStepParameters) -> Messages:
     millisecond, so that this rate is for an emulated rig.
     """
     yield Phase("step of the voltage")
-    yield FastLoop(
-        Playback(lambda t: parameters.voltage if t >= parameters.rest else 0.0),
-        parameters.rate,
-        parameters.rest + parameters.duration,
-        (DEFLECTION,),
-        ("piezo",),
-        ((min(0.0, parameters.voltage), max(0.0, parameters.voltage)),),
+    yield FixedRate(
+        controller=Playback(lambda t: parameters.voltage if t >= parameters.rest else 0.0),
+        rate=parameters.rate,
+        duration=parameters.rest + parameters.duration,
+        inputs=(DEFLECTION,),
+        actuators=("piezo",),
+        limits=((min(0.0, parameters.voltage), max(0.0, parameters.voltage)),),
         label="piezo step",
     )
 
@@ -189,16 +189,16 @@ def hybrid_excitation(parameters: ExcitationParameters) -> Messages:
     Rakotondrabe and Ivan 2010, eq. 22, has both parts.
     """
     yield Phase("both at once")
-    yield FastLoop(
-        Playback(
+    yield FixedRate(
+        controller=Playback(
             _sine(parameters.current, parameters.current_frequency),
             _sine(parameters.voltage, parameters.voltage_frequency),
         ),
-        parameters.rate,
-        parameters.duration,
-        SENSORS,
-        ("tec", "piezo"),
-        ((-parameters.current, parameters.current), (-parameters.voltage, parameters.voltage)),
+        rate=parameters.rate,
+        duration=parameters.duration,
+        inputs=SENSORS,
+        actuators=("tec", "piezo"),
+        limits=((-parameters.current, parameters.current), (-parameters.voltage, parameters.voltage)),
         label="both at once",
     )
 

@@ -19,7 +19,7 @@ from bench.control.hybrid import (
 )
 from bench.control.loops import SampledController
 from bench.hybrid_runs import BASE, DEFLECTION, TIP, WITNESS
-from bench.protocol import FastLoop, Messages, Phase, ProtocolParameters, parameter, protocol
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
 from bench.results.model_file import load_model
 from protocols.muscle import parse_numbers
 
@@ -75,12 +75,12 @@ def hybrid_control(parameters: Parameters) -> Messages:
         )
         controller = HybridController(model, reference, numbers, estimator=estimator)
     yield Phase(parameters.controller)
-    yield FastLoop(
-        controller,
-        parameters.rate,
-        duration,
-        (DEFLECTION, BASE, TIP),
-        ("tec", "piezo"),
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=duration,
+        inputs=(DEFLECTION, BASE, TIP),
+        actuators=("tec", "piezo"),
         watched=(WITNESS,) if parameters.witness else (),
         record_every=max(1, round(parameters.rate / parameters.record_rate)),
         label=parameters.reference,
@@ -112,12 +112,12 @@ def fine_step(parameters: StepParameters) -> Messages:
         FineParameters(rate=parameters.rate),
     )
     yield Phase("fine step")
-    yield FastLoop(
-        controller,
-        parameters.rate,
-        parameters.rest + parameters.duration,
-        (DEFLECTION,),
-        ("piezo",),
+    yield FixedRate(
+        controller=controller,
+        rate=parameters.rate,
+        duration=parameters.rest + parameters.duration,
+        inputs=(DEFLECTION,),
+        actuators=("piezo",),
         watched=(WITNESS,) if parameters.witness else (),
         label="fine step",
     )

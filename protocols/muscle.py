@@ -79,13 +79,13 @@ def hang(load: float) -> Part[Reading]:
     """Have a load (N) hung on the muscle, and see by the load cell that it was."""
     tolerance = 0.15 + 0.02 * load
     reading = yield Prompt(
-        f"Hang {load:g} N on the muscle, hook and magnet included, and let it come to rest",
-        "load",
-        load,
-        _SETTLE_LOAD,
-        FORCE,
-        load - tolerance,
-        load + tolerance,
+        text=f"Hang {load:g} N on the muscle, hook and magnet included, and let it come to rest",
+        task="load",
+        value=load,
+        settle=_SETTLE_LOAD,
+        signal=FORCE,
+        low=load - tolerance,
+        high=load + tolerance,
     )
     return reading
 
@@ -114,13 +114,13 @@ def fasten() -> Part[Reading]:
     """Have the end of the cold muscle fastened to the stage."""
     yield Step({"supply": 0.0, "stage": 0.0}, Dwell(5.0), label="fasten")
     reading = yield Prompt(
-        "Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
-        "stage",
-        0.0,
-        _SETTLE_LOAD,
-        FORCE,
-        -0.3,
-        1.0,
+        text="Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
+        task="stage",
+        value=0.0,
+        settle=_SETTLE_LOAD,
+        signal=FORCE,
+        low=-0.3,
+        high=1.0,
     )
     return reading
 
@@ -128,12 +128,11 @@ def fasten() -> Part[Reading]:
 def stretch(force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> Part[Reading]:
     """Stretch the muscle until it pulls with a force (N); or hold that force for a time (s)."""
     reading = yield Control(
-        Stretch(force, tolerance=tolerance, duration=duration),
-        "stage",
-        "stage_position",
-        FORCE,
-        None,
-        duration + _STRETCH_TIMEOUT,
+        task=Stretch(force, tolerance=tolerance, duration=duration),
+        actuator="stage",
+        drive="stage_position",
+        response=FORCE,
+        timeout=duration + _STRETCH_TIMEOUT,
         label="stretch",
     )
     return reading

@@ -158,12 +158,12 @@ def _reach(
 ) -> Part[float]:
     """Go to a target and read; return the error (m or N)."""
     yield Control(
-        ReachMuscleTarget(controller, target),
-        "supply",
-        "supply_voltage",
-        signal,
-        controller.limits,
-        parameters.duration + _GRACE,
+        task=ReachMuscleTarget(controller, target),
+        actuator="supply",
+        drive="supply_voltage",
+        response=signal,
+        limits=controller.limits,
+        timeout=parameters.duration + _GRACE,
         label=REACH,
         others=others,
     )

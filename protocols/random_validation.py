@@ -1,30 +1,43 @@
-"""Validation: a random temperature sequence that no model was fitted to."""
+"""Validation: a random sequence of set-points that no model was fitted to."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bench.identification import excitation
-from bench.protocol import Dwell, Messages, Phase, ProtocolParameters, Step, UntilSteady, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
+
+_DRIVE = unit_of("drive")
 
 
-class Parameters(ProtocolParameters):
+class Parameters(LoadedParameters):
     """What can be set."""
 
-    low: float = parameter(21.0, unit="°C", low=-20, high=150, help="lowest temperature, where the memory is reset")
-    high: float = parameter(84.0, unit="°C", low=-20, high=150, help="highest temperature")
-    inner_low: float = parameter(40.0, unit="°C", low=-20, high=150, help="lower end of the range of most targets")
-    inner_high: float = parameter(72.0, unit="°C", low=-20, high=150, help="upper end of the range of most targets")
+    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
+    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point")
+    inner_low: float = parameter(
+        from_slot("drive", lambda drive: drive.at(0.3), "30 % of the range of drive"),
+        unit=_DRIVE,
+        help="lower end of the range of most targets",
+    )
+    inner_high: float = parameter(
+        from_slot("drive", lambda drive: drive.at(0.8), "80 % of the range of drive"),
+        unit=_DRIVE,
+        help="upper end of the range of most targets",
+    )
     count: int = parameter(600, unit="1", low=10, high=100000, help="number of set-points")
     increment: float = parameter(
-        1.2, unit="K", low=0.01, high=20, help="largest difference of neighbouring set-points"
+        from_slot("drive", "increment"), unit=_DRIVE, help="largest difference of neighbouring set-points"
     )
-    dwell: float = parameter(8.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
-    sequence_seed: int = parameter(5, unit="1", low=0, help="seed of the sequence, the same whatever the rig's seed")
+    dwell: float = parameter(
+        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+    )
+    sequence_seed: int = parameter(5, unit="1", low=0, help="seed of the sequence, independent of the rig's seed")
 
 
-@protocol(needs=("tec", "tec_temperature", "curvature"))
-def random_validation(parameters: Parameters) -> Messages:
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+def random_validation(parameters: Parameters, slots: Slots) -> Messages:
     """Measure along a random sequence of set-points.
 
     Four of five targets lie within the inner range, the others anywhere, and ramps of `increment` join them
@@ -38,12 +51,7 @@ def random_validation(parameters: Parameters) -> Messages:
         transition=(parameters.inner_low, parameters.inner_high),
         step=parameters.increment,
     )
-    yield Phase("reset to negative saturation")
-    yield Step(
-        {"tec": float(setpoints[0])},
-        UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=300.0, minimum=parameters.dwell),
-        label="reset",
-    )
+    yield from reset(slots, float(setpoints[0]), parameters.dwell, load=parameters.load)
     yield Phase("random sequence")
     for target in setpoints[1:].tolist():
-        yield Step({"tec": target}, Dwell(parameters.dwell))
+        yield Step({slots["drive"].device: target}, Dwell(parameters.dwell))

@@ -21,19 +21,20 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.devices import Device, DriverSettings, Identity, PositionSensor, TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices import protocol_emulated
-from sim_devices.instruments.labjack_t7 import (
-    DisplacementSensor,
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.instruments.t7_roles import (
     EmulatedHighVoltageSupply,
     EmulatedPositionSensor,
-    EmulatedT7,
     EmulatedTemperatureSensor,
-    PiezoAmplifier,
-    Thermistor,
 )
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
+from sim_devices.transducers.displacement import DisplacementSensor
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World

@@ -18,15 +18,18 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices import protocol_emulated
-from sim_devices.instruments.dynamixel import COUNT, EmulatedDrum, EmulatedMX28, HardwareError
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_drum import EmulatedDrum
+from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
-from sim_devices.instruments.labjack_t7 import EmulatedT7, RatiometricSensor
+from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
+from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server

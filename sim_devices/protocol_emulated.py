@@ -1,9 +1,9 @@
 """The `emulated://NAME` address: a serial port whose other end is an emulated instrument in this process.
 
-pyserial finds this module by its name once `install` has been called, so whatever opens its line with
-`serial.serial_for_url` (our drivers, pymodbus, python-can) reaches the emulator without knowing of it. No
-thread, no sleep: a write is answered before it returns, a read that would wait lets the clock pass its
-timeout instead, and each byte costs the wire time of its baud rate on the clock.
+pyserial finds this module by its name once `install` has been called, so that every client that opens its line with
+`serial.serial_for_url` (our drivers, pymodbus, python-can) reaches the emulator unchanged. There are no threads and
+no sleeps: a write is answered before it returns, a read that would wait advances the clock by its timeout, and each
+byte takes the time of its baud rate on the clock.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _servers: dict[str, tuple[WireServer, Clock]] = {}
 
 
 def install() -> None:
-    """Let pyserial know of the scheme; calling it again changes nothing."""
+    """Register the scheme with pyserial; calling it again changes nothing."""
     package = __name__.rpartition(".")[0]
     if package not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(package)

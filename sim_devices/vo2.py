@@ -10,11 +10,12 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 from sim_devices import protocol_emulated
-from sim_devices.instruments.labjack_t7 import EmulatedT7, NormalisedPSD
+from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
+from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World

@@ -1,14 +1,16 @@
 """One emulated laboratory's time: a plant and the instruments around it, brought up to the clock together.
 
-Nothing here has a thread. Whoever asks an emulated instrument anything first calls `World.advance`, which
-integrates the plant from where it was to the clock's time and lets whatever the instruments do by
-themselves, such as a watchdog that expires, happen at its own instant in between.
+There are no threads. Every request to an emulated instrument first calls `World.advance`, which integrates
+the plant from where it was to the clock's time. What the instruments do by themselves, such as a watchdog
+that expires, happens at its own instant in between.
 """
 
 from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 from bench.clock import Clock
@@ -61,13 +63,20 @@ class World:
         return self._time
 
     def add(self, timed: Timed) -> None:
-        """Have an instrument's deadlines kept."""
+        """Keep the deadlines of an instrument."""
         self._timed.append(timed)
+
+    @contextmanager
+    def at_present(self) -> Iterator[None]:
+        """Hold the lock, with plant and instruments at the clock's present time."""
+        with self.lock:
+            self.advance()
+            yield
 
     def advance(self) -> None:
         """Bring the plant and everything due to the clock's present time."""
         with self.lock:
-            # Whoever asks while something is due sees that instant, not the end.
+            # A request from within `expire` sees that instant, not the end.
             if self._advancing:
                 return
             self._advancing = True

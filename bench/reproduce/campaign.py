@@ -67,7 +67,7 @@ class Campaign:
         result = carry_out(
             Run(
                 protocol=definition,
-                parameters=definition.parse(settings),
+                settings=settings,
                 rig=rig or self.rig,
                 overrides=overrides or {},
                 seed=next(self._seeds),

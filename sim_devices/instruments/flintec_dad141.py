@@ -28,18 +28,17 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from bench.devices import Identity, LoadCell
 from bench.errors import DeviceError
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
+from sim_devices.instruments.emulated import EmulatedDevice
+from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
@@ -73,8 +72,6 @@ _COMMANDS = RESET_ZERO | SET_ZERO | RESET_TARE | SET_TARE | RESET_MAXIMUM | TRIG
 _SAVE_SET_UP = 0x0004
 _SAVES = 0x0001 | 0x0002 | _SAVE_SET_UP | 0x0010
 
-_FORMATS = {"F32": ">f", "I32": ">i", "U16": ">H"}
-
 
 def time_constant(setting: int) -> float:
     """Return the time constant in s of either lag of a filter setting, 0 to 7."""
@@ -87,26 +84,8 @@ def reading_interval(setting: int) -> float:
 
 
 @dataclass(frozen=True)
-class _Register:
-    kind: Literal["F32", "I32", "U16"]
-    read: Callable[[], float] | None
-    write: Callable[[int], None] | None
-
-    @property
-    def words(self) -> int:
-        return 1 if self.kind == "U16" else 2
-
-    def encode(self, value: float) -> tuple[int, ...]:
-        raw = struct.pack(_FORMATS[self.kind], value if self.kind == "F32" else int(value))
-        return struct.unpack(f">{self.words}H", raw)
-
-    def decode(self, words: Sequence[int]) -> int:
-        return int(struct.unpack(_FORMATS[self.kind], struct.pack(f">{self.words}H", *words))[0])
-
-
-@dataclass(frozen=True)
 class _SetUp:
-    """What command WP saves; the factory's values (Technical Manual, 10.3 and 10.4)."""
+    """The settings that command WP saves; the factory's values (Technical Manual, 10.3 and 10.4)."""
 
     filter: int = 3
     filter_mode: int = 0
@@ -114,7 +93,7 @@ class _SetUp:
     motion_time: int = 1000  # ms
 
 
-class EmulatedDAD141(LoadCell):
+class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
     """A DAD 141.1 with its load cell: the role, called directly, and a bank of Modbus registers for the wire.
 
     Every access brings the world up to date first and holds its lock. The filter sees the force as often as
@@ -122,10 +101,8 @@ class EmulatedDAD141(LoadCell):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The laboratory that the instrument stands in.
+    name, world
+        See `EmulatedDevice`.
     force : callable
         The force on the cell in N, positive in tension, from the plant.
     rng : numpy.random.Generator
@@ -178,7 +155,7 @@ class EmulatedDAD141(LoadCell):
         serial_number: int = 1410237,
         firmware: tuple[int, int] = (1, 10),
     ) -> None:
-        super().__init__(name, world.clock)
+        super().__init__(name, world, rng)
         if not (math.isfinite(newtons_per_unit) and newtons_per_unit != 0):
             raise ValueError(f"newtons_per_unit: expected a number other than 0, got {newtons_per_unit}")
         if not 0 <= decimals <= 5:
@@ -192,12 +169,10 @@ class EmulatedDAD141(LoadCell):
             raise ValueError(f"noise: expected zero or a positive number, got {noise}")
         if samples < 1:
             raise ValueError(f"samples: expected 1 or more, got {samples}")
-        self.world = world
         self.serial_number = serial_number
         self.firmware = firmware
         self.frozen = False
         self._force = force
-        self._rng = rng
         self._newtons_per_unit = newtons_per_unit
         self._zero_newtons = zero_newtons
         self._lowest, self._highest = low, high
@@ -208,17 +183,15 @@ class EmulatedDAD141(LoadCell):
         self._samples = samples
         self._saved = _SetUp()
         self._zero = self._tare = self._hold = self._peak = 0
-        self._words: dict[int, tuple[int, _Register]] = {}
-        self._build_map()
+        self._set_map_up(self._register_map())
         self.power_cycle()
         world.add(self)
 
-    # What the laboratory around the instrument does to it.
+    # The power supply.
 
     def power_cycle(self) -> None:
         """Switch the instrument off and on again."""
-        with self.world.lock:
-            self.world.advance()
+        with self.world.at_present():
             self._set_up = self._saved
             self._zero = self._tare = self._hold = 0
             self._tare_set = False
@@ -262,8 +235,8 @@ class EmulatedDAD141(LoadCell):
         # The noise behind the first lag has twice the variance of that behind the second, and a covariance with
         # it that equals the latter.
         spread = self._noise * math.sqrt(time_constant(0) / time_constant(self._set_up.filter))
-        self._noise_second = spread * self._rng.standard_normal()
-        self._noise_first = self._noise_second + spread * self._rng.standard_normal()
+        self._noise_second = self._draw(spread)
+        self._noise_first = self._noise_second + self._draw(spread)
         self._display()
         self._reference = self._digits
 
@@ -300,7 +273,7 @@ class EmulatedDAD141(LoadCell):
         second = 1 - known * (1 + 2 * lags + 2 * lags * lags)
         along = both / math.sqrt(first)
         across = math.sqrt(max(second - along * along, 0.0))
-        fresh, other = spread * self._rng.standard_normal(), spread * self._rng.standard_normal()
+        fresh, other = self._draw(spread), self._draw(spread)
         self._noise_second = decay * (self._noise_second + lags * self._noise_first) + along * fresh + across * other
         self._noise_first = decay * self._noise_first + math.sqrt(first) * fresh
 
@@ -341,115 +314,60 @@ class EmulatedDAD141(LoadCell):
 
     @contextmanager
     def _request(self) -> Iterator[None]:
-        with self.world.lock:
-            self.world.advance()
+        with self.world.at_present():
             self._convert()
             yield
 
-    def read_registers(self, address: int, count: int) -> list[int]:
-        """Return `count` registers from `address` on, all of one conversion; reading half a value is allowed.
+    def _check_write(self, register: Register, whole: bool) -> None:
+        # Here a register that can only be read is refused as such, also where half of it is written.
+        super()._check_write(register, whole or register.write is None)
 
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be read.
-        """
-        with self._request():
-            words = []
-            for each in range(address, address + count):
-                start, register = self._at(each)
-                if register.read is None:
-                    raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{each:04X} can only be written")
-                words.append(register.encode(register.read())[each - start])
-            return words
-
-    def write_registers(self, address: int, values: list[int]) -> None:
-        """Write registers from `address` on, in whole values.
-
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be written, or if a value is not allowed; the values before
-            it have been written then.
-        """
-        with self._request():
-            position = 0
-            while position < len(values):
-                start, register = self._at(address + position)
-                words = values[position : position + register.words]
-                if register.write is None:
-                    raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{start:04X} can only be read")
-                if start != address + position or len(words) < register.words:
-                    raise RegisterError(ILLEGAL_VALUE, f"register 0x{start:04X} is to be written as a whole")
-                register.write(register.decode(words))
-                position += register.words
-
-    def _at(self, address: int) -> tuple[int, _Register]:
-        try:
-            return self._words[address]
-        except KeyError:
-            raise RegisterError(ILLEGAL_ADDRESS, f"register 0x{address:04X} is not emulated") from None
-
-    def _add(
-        self,
-        address: int,
-        kind: Literal["F32", "I32", "U16"],
-        read: Callable[[], float] | None,
-        write: Callable[[int], None] | None = None,
-    ) -> None:
-        register = _Register(kind, read, write)
-        for word in range(register.words):
-            self._words[address + word] = (address, register)
-
-    def _build_map(self) -> None:
+    def _register_map(self) -> tuple[Register, ...]:
         major, minor = self.firmware
-        weights: dict[str, Callable[[], int]] = {
-            "gross": lambda: self._gross,
-            "net": lambda: self._net,
-            "peak": lambda: self._peak,
-            "hold": lambda: self._hold,
-        }
-        for address, weight in ((0x2000, "gross"), (0x2002, "net"), (0x2080, "peak"), (0x2084, "hold")):
-            self._add(address, "F32", partial(self._in_units, weights[weight]))
-        for address, weight in ((0x2020, "gross"), (0x2022, "net"), (0x2082, "peak"), (0x2086, "hold")):
-            self._add(address, "I32", weights[weight])
-        self._add(0x202A, "I32", lambda: self._adc)
-        self._add(0x202C, "I32", lambda: DEVICE_ID)
-        self._add(0x202E, "I32", lambda: minor << 8 | major)
-        self._add(0x2030, "I32", lambda: 1000 * self._status)
-        self._add(0x2034, "I32", lambda: self.serial_number)
-        self._add(0x2060, "U16", lambda: self._qualifier)
-        self._add(0x2061, "U16", None, self._command)
-        self._add(0x2066, "U16", None, self._save)
-        self._add_set_up(0x2106, "filter", 0, len(CUTOFF_HZ) - 1)
-        self._add_set_up(0x2110, "filter_mode", 0, 1)
-        self._add_set_up(0x2112, "motion_range", 1, 65535)
-        self._add_set_up(0x2114, "motion_time", 1, 65535)
-        self._add(0x2118, "I32", lambda: self._tare)
-        self._add(0x220C, "I32", lambda: self._highest)
-        self._add(0x220E, "I32", lambda: self._lowest)
-        self._add(0x2214, "I32", lambda: self._decimals)
-        self._add(0x2216, "I32", lambda: self._step)
-        self._add(0x3300, "I32", weights["gross"])
-        self._add(0x3302, "I32", weights["net"])
-        self._add(0x3304, "U16", lambda: self._qualifier)
-        self._add(0x3500, "F32", partial(self._in_units, weights["gross"]))
-        self._add(0x3502, "F32", partial(self._in_units, weights["net"]))
-        self._add(0x3504, "U16", lambda: self._qualifier)
+        return (
+            Register("gross weight", 0x2000, "F32", lambda: self._gross / self._scale),
+            Register("net weight", 0x2002, "F32", lambda: self._net / self._scale),
+            Register("gross digits", 0x2020, "I32", lambda: self._gross),
+            Register("net digits", 0x2022, "I32", lambda: self._net),
+            Register("ADC value", 0x202A, "I32", lambda: self._adc),
+            Register("device identity", 0x202C, "I32", lambda: DEVICE_ID),
+            Register("firmware version", 0x202E, "I32", lambda: minor << 8 | major),
+            Register("device status", 0x2030, "I32", lambda: 1000 * self._status),
+            Register("serial number", 0x2034, "I32", lambda: self.serial_number),
+            Register("weight status", 0x2060, "U16", lambda: self._qualifier),
+            Register("command", 0x2061, "U16", None, self._command),
+            Register("save", 0x2066, "U16", None, self._save),
+            Register("peak weight", 0x2080, "F32", lambda: self._peak / self._scale),
+            Register("peak digits", 0x2082, "I32", lambda: self._peak),
+            Register("hold weight", 0x2084, "F32", lambda: self._hold / self._scale),
+            Register("hold digits", 0x2086, "I32", lambda: self._hold),
+            self._set_up_register("filter", 0x2106, 0, len(CUTOFF_HZ) - 1),
+            self._set_up_register("filter_mode", 0x2110, 0, 1),
+            self._set_up_register("motion_range", 0x2112, 1, 65535),
+            self._set_up_register("motion_time", 0x2114, 1, 65535),
+            Register("tare digits", 0x2118, "I32", lambda: self._tare),
+            Register("largest weight", 0x220C, "I32", lambda: self._highest),
+            Register("smallest weight", 0x220E, "I32", lambda: self._lowest),
+            Register("decimals", 0x2214, "I32", lambda: self._decimals),
+            Register("display step", 0x2216, "I32", lambda: self._step),
+            Register("gross digits with status", 0x3300, "I32", lambda: self._gross),
+            Register("net digits with status", 0x3302, "I32", lambda: self._net),
+            Register("status of digits", 0x3304, "U16", lambda: self._qualifier),
+            Register("gross weight with status", 0x3500, "F32", lambda: self._gross / self._scale),
+            Register("net weight with status", 0x3502, "F32", lambda: self._net / self._scale),
+            Register("status of weights", 0x3504, "U16", lambda: self._qualifier),
+        )
 
-    def _add_set_up(self, address: int, field: str, low: int, high: int) -> None:
+    def _set_up_register(self, field: str, address: int, low: int, high: int) -> Register:
         def write(value: int) -> None:
             if not low <= value <= high:
-                raise RegisterError(ILLEGAL_VALUE, f"register 0x{address:04X}: allowed are {low} to {high}")
+                raise RegisterError(ILLEGAL_VALUE, f"{field}: allowed are {low} to {high}, got {value}")
             changed = replace(self._set_up, **{field: value})
             if changed != self._set_up:
                 self._set_up = changed
                 self._settle()
 
-        self._add(address, "I32", lambda: getattr(self._set_up, field), write)
-
-    def _in_units(self, digits: Callable[[], int]) -> float:
-        return digits() / self._scale
+        return Register(field, address, "I32", lambda: getattr(self._set_up, field), write)
 
     # The commands.
 
@@ -532,15 +450,10 @@ class EmulatedDAD141(LoadCell):
     def safe(self) -> None:
         """Do nothing: a load cell is safe in any state."""
 
-    def close(self) -> None:
-        """Do nothing: there is no line."""
-
     def _reading(self) -> float:
         with self._request():
             if self._qualifier & (UNDER_RANGE | OVER_RANGE):
                 side = "over" if self._qualifier & OVER_RANGE else "under"
-                raise DeviceError(
-                    self.name, f"is {side} its range: the weight is {self._in_units(lambda: self._gross)}"
-                )
+                raise DeviceError(self.name, f"is {side} its range: the weight is {self._gross / self._scale}")
             zero = 0.0 if self._tare_set else self._zero_newtons
             return self._newtons_per_unit * self._net / self._scale + zero

@@ -1,9 +1,9 @@
-"""An emulated LabJack T7, and the transducers and the high-voltage amplifier that are wired to it.
+"""An emulated LabJack T7 as a bank of Modbus registers.
 
 The register map is that of `ljm_constants.json` (repository labjack/ljm_constants), the behaviour that of the
 LabJack T-series datasheet: 14.1.7 (average, minimum and maximum), 14.3.0 (T7 analog inputs), 15.0 (analog
 outputs), A-3-1 (noise and resolution), the datasheet of the LJTick-DAC, and the descriptions of the watchdog
-registers in the map. Thermistors follow Steinhart and Hart 1968, Deep-Sea Research 15.
+registers in the map.
 
 Assumptions, where these say nothing:
 
@@ -17,7 +17,7 @@ Assumptions, where these say nothing:
 - DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
   offset. The register of a DAC reads back what was written.
 - After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
-  nothing as long as nobody communicates, so they are done once.
+  nothing while there is no communication, so they are done once.
 - A single conversion takes no laboratory time; a burst takes what its scan rate says.
 - Reading the register of a single digital line makes it an input, as the map says that it configures the
   direction too; an input that nothing drives is pulled high, as all lines are after power-up.
@@ -26,18 +26,17 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from bench.devices import Identity, Limits, PositionSensor, Status, Switch, TemperatureSensor, VoltageSupply
-from bench.errors import DeviceError
-from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
+from bench.devices import Identity
+from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
 
 CHANNELS = 14
@@ -88,56 +87,40 @@ _TDACS = 23
 _DIOS = 23
 _DAC_TOP = 5.0
 _TDAC_TOP = 10.0
-_KELVIN = 273.15
 
-_FORMATS = {"F32": ">f", "U32": ">I", "U16": ">H"}
+ALL_DIO = (1 << _DIOS) - 1
+"""Mask of all digital lines."""
 
 
-@dataclass(frozen=True)
-class Burst:
-    """What one burst of conversions gave, in V."""
+class Burst(NamedTuple):
+    """Result of one burst of conversions, V."""
 
     average: float
     maximum: float
     minimum: float
 
 
+_NO_BURST = Burst(0.0, 0.0, 0.0)
+
+
 class _DetailedError(RegisterError):
-    """A refusal that LAST_ERR_DETAIL explains."""
+    """A refusal with a detail for LAST_ERR_DETAIL."""
 
     def __init__(self, detail: int, message: str) -> None:
         super().__init__(DEVICE_FAILURE, message)
         self.detail = detail
 
 
-@dataclass(frozen=True)
-class _Register:
-    kind: Literal["F32", "U32", "U16"]
-    read: Callable[[], float] | None
-    write: Callable[[float], None] | None
-
-    @property
-    def words(self) -> int:
-        return 1 if self.kind == "U16" else 2
-
-    def encode(self, value: float) -> tuple[int, ...]:
-        raw = struct.pack(_FORMATS[self.kind], value if self.kind == "F32" else int(value))
-        return struct.unpack(f">{self.words}H", raw)
-
-    def decode(self, words: Sequence[int]) -> float:
-        return float(struct.unpack(_FORMATS[self.kind], struct.pack(f">{self.words}H", *words))[0])
-
-
 @dataclass
 class _Input:
     range: float = 10.0
     negative: int = SINGLE_ENDED
-    resolution_index: int = 0
-    settling_us: float = 0.0
+    resolution: int = 0
+    settling: float = 0.0
     feature: int = _EF_OFF
     samples: int = 200
     scan_rate: float = 6000.0
-    burst: Burst = Burst(0.0, 0.0, 0.0)
+    burst: Burst = _NO_BURST
 
 
 @dataclass
@@ -156,15 +139,11 @@ class _Watchdog:
     dac1: float = 0.0
 
 
-STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
-"""A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
-
-
-class EmulatedT7:
+class EmulatedT7(RegisterInstrument):
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
-    Every access brings the world up to date first and holds its lock. A burst lets the clock pass, as the
-    real instrument keeps whoever reads the average waiting.
+    Every access first brings the world up to date and holds its lock. A burst lets the clock pass, as the
+    real instrument answers only after the burst.
 
     Parameters
     ----------
@@ -215,16 +194,15 @@ class EmulatedT7:
         self._due = math.inf
         self._expired_at: float | None = None
         self._followers: list[Callable[[], None]] = []
-        self._words: dict[int, tuple[int, _Register]] = {}
-        self._build_map()
+        self._set_map_up(self._register_map())
         world.add(self)
 
     @property
     def identity(self) -> Identity:
-        """What the instrument says of itself."""
+        """Identity of the instrument."""
         return Identity("LabJack", "T7", str(self.serial_number), f"{self.firmware:.4f}")
 
-    # What the laboratory around the instrument sees of it.
+    # The outputs as the laboratory sees them.
 
     def dac_volts(self, number: int) -> float:
         """Return the voltage in V at DAC0 or DAC1, in its steps."""
@@ -237,19 +215,18 @@ class EmulatedT7:
     def dio_level(self, number: int, *, pulled_down: bool = False) -> bool:
         """Return the level of a digital line, 0 to 22.
 
-        A line that is not an output is pulled high by the instrument, weakly; `pulled_down` says that what it is
-        wired to pulls it low all the same.
+        The instrument pulls a line that is not an output weakly high; `pulled_down` says that the load pulls it
+        low all the same.
         """
         levels = self._dio_state & self._dio_direction if pulled_down else self._levels()
         return bool(levels >> number & 1)
 
     def add_follower(self, follow: Callable[[], None]) -> None:
-        """Have `follow()` called now, after every request and when the watchdog acts.
+        """Call `follow()` now, after every request and when the watchdog acts.
 
-        What is wired to the outputs looks at them then; the world stands at that instant.
+        A load at the outputs reads them then; the world stands at that instant.
         """
-        with self.world.lock:
-            self.world.advance()
+        with self.world.at_present():
             self._followers.append(follow)
             follow()
 
@@ -258,51 +235,7 @@ class EmulatedT7:
         """Whether the watchdog has run out since the last communication that feeds it."""
         return self._expired_at is not None
 
-    # The registers.
-
-    def read_registers(self, address: int, count: int) -> list[int]:
-        """Return `count` registers from `address` on; reading half a value is allowed.
-
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be read.
-        """
-        with self._request():
-            values: dict[int, tuple[int, ...]] = {}
-            words = []
-            for each in range(address, address + count):
-                start, register = self._at(each)
-                if register.read is None:
-                    raise RegisterError(ILLEGAL_ADDRESS, f"register {each} can only be written")
-                if start not in values:
-                    values[start] = register.encode(register.read())
-                words.append(values[start][each - start])
-            return words
-
-    def write_registers(self, address: int, values: list[int]) -> None:
-        """Write registers from `address` on, in whole values.
-
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be written, or if a value is not allowed; the values
-            before it have been written then.
-        """
-        with self._request():
-            position = 0
-            while position < len(values):
-                start, register = self._at(address + position)
-                words = values[position : position + register.words]
-                if start != address + position or len(words) < register.words:
-                    raise RegisterError(ILLEGAL_VALUE, f"register {start} is to be written as a whole")
-                if register.write is None:
-                    raise RegisterError(ILLEGAL_ADDRESS, f"register {start} can only be read")
-                value = register.decode(words)
-                if not math.isfinite(value):
-                    raise RegisterError(ILLEGAL_VALUE, f"register {start} takes numbers only")
-                register.write(value)
-                position += register.words
+    # The requests.
 
     @contextmanager
     def _request(self) -> Iterator[None]:
@@ -320,16 +253,6 @@ class EmulatedT7:
         for follow in self._followers:
             follow()
 
-    def read_value(self, address: int) -> float:
-        """Return the value that begins at `address`, as one request would."""
-        _, register = self._at(address)
-        return register.decode(self.read_registers(address, register.words))
-
-    def write_value(self, address: int, value: float) -> None:
-        """Write the value that begins at `address`, as one request would."""
-        _, register = self._at(address)
-        self.write_registers(address, list(register.encode(value)))
-
     # The watchdog.
 
     def deadline(self) -> float:
@@ -337,14 +260,14 @@ class EmulatedT7:
         return self._due
 
     def expire(self) -> None:
-        """Do what the watchdog is set to do."""
+        """Take the actions of the watchdog."""
         dog = self._watchdog
         if dog.dac0_enabled:
             self._set_dac(0, dog.dac0)
         if dog.dac1_enabled:
             self._set_dac(1, dog.dac1)
         if dog.dio_enabled:
-            affected = ~dog.dio_inhibit & _all_dio()
+            affected = ~dog.dio_inhibit & ALL_DIO
             self._dio_state = self._dio_state & ~affected | dog.dio_state & affected
             self._dio_direction = self._dio_direction & ~affected | dog.dio_direction & affected
         self._expired_at = self._due
@@ -398,21 +321,21 @@ class EmulatedT7:
         RegisterError
             If a setting is refused.
         """
-        self.write_value(4010, resolution_index)
+        self.write_value("STREAM_RESOLUTION_INDEX", resolution_index)
         for channel in channels:
-            self.write_value(40000 + 2 * channel, range_volts)
-            self.write_value(41000 + channel, SINGLE_ENDED)
-            self.write_value(41500 + channel, resolution_index)
-            self.write_value(9000 + 2 * channel, _EF_AVERAGE)
-            self.write_value(9300 + 2 * channel, samples)
-            self.write_value(10200 + 2 * channel, sample_rate)
+            self.write_value(f"AIN{channel}_RANGE", range_volts)
+            self.write_value(f"AIN{channel}_NEGATIVE_CH", SINGLE_ENDED)
+            self.write_value(f"AIN{channel}_RESOLUTION_INDEX", resolution_index)
+            self.write_value(f"AIN{channel}_EF_INDEX", _EF_AVERAGE)
+            self.write_value(f"AIN{channel}_EF_CONFIG_A", samples)
+            self.write_value(f"AIN{channel}_EF_CONFIG_D", sample_rate)
 
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
         # Nothing that a follower looks at changes, and nothing is refused.
         with self.world.lock:
             self._attend()
-            return self._convert(channel, self._inputs[channel].resolution_index or _DEFAULT_INDEX)
+            return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -477,11 +400,11 @@ class EmulatedT7:
             raise _DetailedError(ERROR_SETTLING, f"settling: {value:g} µs is not 0 to {longest:g} µs")
         return value
 
-    def _set_resolution(self, channel: int, value: float) -> None:
-        self._inputs[channel].resolution_index = self._checked_resolution(value)
+    def _set_index(self, channel: int, value: float) -> None:
+        self._inputs[channel].resolution = self._checked_resolution(value)
 
     def _set_settling(self, channel: int, value: float) -> None:
-        self._inputs[channel].settling_us = self._checked_settling(value, _LONGEST_SETTLING)
+        self._inputs[channel].settling = self._checked_settling(value, _LONGEST_SETTLING)
 
     def _set_stream_resolution(self, value: float) -> None:
         self._stream_index = self._checked_resolution(value)
@@ -523,973 +446,69 @@ class EmulatedT7:
         self._dio_state = self._dio_state | bit if value else self._dio_state & ~bit
 
     def _levels(self) -> int:
-        return self._dio_state & self._dio_direction | ~self._dio_direction & _all_dio()
+        return self._dio_state & self._dio_direction | ~self._dio_direction & ALL_DIO
 
     def _set_dio_bank(self, attribute: str, value: float) -> None:
-        affected = _all_dio() if attribute == "_dio_inhibit" else ~self._dio_inhibit & _all_dio()
+        affected = ALL_DIO if attribute == "_dio_inhibit" else ~self._dio_inhibit & ALL_DIO
         setattr(self, attribute, getattr(self, attribute) & ~affected | int(value) & affected)
 
     # The map.
 
-    def _at(self, address: int) -> tuple[int, _Register]:
-        try:
-            return self._words[address]
-        except KeyError:
-            raise RegisterError(ILLEGAL_ADDRESS, f"register {address} is not emulated") from None
+    def _register_map(self) -> tuple[Register, ...]:
+        """Return the emulated rows of `ljm_constants.json`."""
+        inputs, dog = self._inputs, self._dog
+        return (
+            Register("AIN#", 0, "F32", self.convert, None, CHANNELS),
+            Register("DAC#", 1000, "F32", self._dacs.__getitem__, self._set_dac, len(self._dacs)),
+            Register("DIO#", 2000, "U16", self._read_dio, self._set_dio, _DIOS),
+            Register("DIO_STATE", 2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state")),
+            Register("DIO_DIRECTION", 2850, "U32", *self._dio_bank("_dio_direction")),
+            Register("DIO_INHIBIT", 2900, "U32", *self._dio_bank("_dio_inhibit")),
+            Register("STREAM_SETTLING_US", 4008, "F32", lambda: self._stream_settling, self._set_stream_settling),
+            Register("STREAM_RESOLUTION_INDEX", 4010, "U32", lambda: self._stream_index, self._set_stream_resolution),
+            Register("AIN#_EF_READ_A", 7000, "F32", lambda n: self.burst(n).average, None, CHANNELS),
+            Register("AIN#_EF_READ_B", 7300, "F32", lambda n: inputs[n].burst.maximum, None, CHANNELS),
+            Register("AIN#_EF_READ_C", 7600, "F32", lambda n: inputs[n].burst.minimum, None, CHANNELS),
+            Register("AIN#_EF_INDEX", 9000, "U32", lambda n: inputs[n].feature, self._set_feature, CHANNELS),
+            Register("AIN#_EF_CONFIG_A", 9300, "U32", lambda n: inputs[n].samples, self._set_samples, CHANNELS),
+            Register("AIN#_EF_CONFIG_D", 10200, "F32", lambda n: inputs[n].scan_rate, self._set_scan_rate, CHANNELS),
+            Register("TDAC#", 30000, "F32", None, self._set_tdac, _TDACS),
+            Register("AIN#_RANGE", 40000, "F32", lambda n: inputs[n].range, self._set_range, CHANNELS),
+            Register("AIN#_NEGATIVE_CH", 41000, "U16", lambda n: inputs[n].negative, self._set_negative, CHANNELS),
+            Register(
+                "AIN#_RESOLUTION_INDEX", 41500, "U16", lambda n: inputs[n].resolution, self._set_index, CHANNELS
+            ),
+            Register("AIN#_SETTLING_US", 42000, "F32", lambda n: inputs[n].settling, self._set_settling, CHANNELS),
+            Register("LAST_ERR_DETAIL", 55000, "U16", lambda: self._last_error),
+            Register("TEST", 55100, "U32", lambda: 0x00112233),
+            Register("TEST_FLOAT32", 55124, "F32", lambda: -9999.0),
+            Register("PRODUCT_ID", 60000, "F32", lambda: 7.0),
+            Register("FIRMWARE_VERSION", 60004, "F32", lambda: self.firmware),
+            Register("SERIAL_NUMBER", 60028, "U32", lambda: self.serial_number),
+            Register("WATCHDOG_ENABLE_DEFAULT", 61600, "U32", dog("enabled")[0], self._enable_watchdog),
+            Register("WATCHDOG_TIMEOUT_S_DEFAULT", 61604, "U32", *dog("timeout")),
+            Register("WATCHDOG_STRICT_ENABLE_DEFAULT", 61610, "U32", *dog("strict")),
+            Register("WATCHDOG_STRICT_KEY_DEFAULT", 61612, "U32", *dog("key")),
+            Register("WATCHDOG_STRICT_CLEAR", 61614, "U32", None, self._clear_watchdog),
+            Register("WATCHDOG_DIO_ENABLE_DEFAULT", 61630, "U32", *dog("dio_enabled")),
+            Register("WATCHDOG_DIO_STATE_DEFAULT", 61632, "U32", *dog("dio_state")),
+            Register("WATCHDOG_DIO_DIRECTION_DEFAULT", 61634, "U32", *dog("dio_direction")),
+            Register("WATCHDOG_DIO_INHIBIT_DEFAULT", 61636, "U32", *dog("dio_inhibit")),
+            Register("WATCHDOG_DAC0_ENABLE_DEFAULT", 61640, "U32", *dog("dac0_enabled")),
+            Register("WATCHDOG_DAC0_DEFAULT", 61642, "F32", *dog("dac0")),
+            Register("WATCHDOG_DAC1_ENABLE_DEFAULT", 61650, "U32", *dog("dac1_enabled")),
+            Register("WATCHDOG_DAC1_DEFAULT", 61652, "F32", *dog("dac1")),
+        )
 
-    def _add(
-        self,
-        address: int,
-        kind: Literal["F32", "U32", "U16"],
-        read: Callable[[], float] | None,
-        write: Callable[[float], None] | None = None,
-    ) -> None:
-        register = _Register(kind, read, write)
-        for word in range(register.words):
-            self._words[address + word] = (address, register)
+    def _dog(self, attribute: str) -> tuple[Callable[[], float], Callable[[float], None]]:
+        """Return the functions that read and write a setting of the watchdog."""
 
-    def _build_map(self) -> None:
-        for channel in range(CHANNELS):
-            self._add_input(channel)
-        for number in range(2):
-            self._add(
-                1000 + 2 * number, "F32", partial(self._dacs.__getitem__, number), partial(self._set_dac, number)
-            )
-        for number in range(_TDACS):
-            self._add(30000 + 2 * number, "F32", None, partial(self._set_tdac, number))
-        for number in range(_DIOS):
-            self._add(2000 + number, "U16", partial(self._read_dio, number), partial(self._set_dio, number))
-        self._add(2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state"))
-        for address, attribute in ((2850, "_dio_direction"), (2900, "_dio_inhibit")):
-            self._add(
-                address,
-                "U32",
-                partial(getattr, self, attribute),
-                partial(self._set_dio_bank, attribute),
-            )
-        self._add(4008, "F32", lambda: self._stream_settling, self._set_stream_settling)
-        self._add(4010, "U32", lambda: self._stream_index, self._set_stream_resolution)
-        self._add(55000, "U16", lambda: self._last_error)
-        self._add(55100, "U32", lambda: 0x00112233)
-        self._add(55124, "F32", lambda: -9999.0)
-        self._add(60000, "F32", lambda: 7.0)
-        self._add(60004, "F32", lambda: self.firmware)
-        self._add(60028, "U32", lambda: self.serial_number)
-        self._add(61600, "U32", lambda: self._watchdog.enabled, self._enable_watchdog)
-        self._add(61614, "U32", None, self._clear_watchdog)
-        self._add_watchdog(61604, "U32", "timeout")
-        self._add_watchdog(61610, "U32", "strict")
-        self._add_watchdog(61612, "U32", "key")
-        self._add_watchdog(61630, "U32", "dio_enabled")
-        self._add_watchdog(61632, "U32", "dio_state")
-        self._add_watchdog(61634, "U32", "dio_direction")
-        self._add_watchdog(61636, "U32", "dio_inhibit")
-        self._add_watchdog(61640, "U32", "dac0_enabled")
-        self._add_watchdog(61642, "F32", "dac0")
-        self._add_watchdog(61650, "U32", "dac1_enabled")
-        self._add_watchdog(61652, "F32", "dac1")
-
-    def _add_input(self, channel: int) -> None:
-        settings = self._inputs[channel]
-        two = 2 * channel
-        self._add(two, "F32", partial(self.convert, channel))
-        self._add(7000 + two, "F32", lambda: self.burst(channel).average)
-        self._add(7300 + two, "F32", lambda: settings.burst.maximum)
-        self._add(7600 + two, "F32", lambda: settings.burst.minimum)
-        self._add(9000 + two, "U32", lambda: settings.feature, partial(self._set_feature, channel))
-        self._add(9300 + two, "U32", lambda: settings.samples, partial(self._set_samples, channel))
-        self._add(10200 + two, "F32", lambda: settings.scan_rate, partial(self._set_scan_rate, channel))
-        self._add(40000 + two, "F32", lambda: settings.range, partial(self._set_range, channel))
-        self._add(41000 + channel, "U16", lambda: settings.negative, partial(self._set_negative, channel))
-        self._add(41500 + channel, "U16", lambda: settings.resolution_index, partial(self._set_resolution, channel))
-        self._add(42000 + two, "F32", lambda: settings.settling_us, partial(self._set_settling, channel))
-
-    def _add_watchdog(self, address: int, kind: Literal["F32", "U32"], attribute: str) -> None:
         def write(value: float) -> None:
             if self._watchdog.enabled:
-                raise RegisterError(DEVICE_FAILURE, "the watchdog is to be disabled while it is set up")
-            setattr(self._watchdog, attribute, value if kind == "F32" else int(value))
+                raise RegisterError(DEVICE_FAILURE, "the watchdog must be disabled before its settings change")
+            setattr(self._watchdog, attribute, value)
 
-        self._add(address, kind, partial(getattr, self._watchdog, attribute), write)
+        return partial(getattr, self._watchdog, attribute), write
 
-
-def _all_dio() -> int:
-    return (1 << _DIOS) - 1
-
-
-def _bursts(name: str, instrument: EmulatedT7, channels: Sequence[int]) -> list[Burst]:
-    try:
-        return [instrument.burst(channel) for channel in channels]
-    except RegisterError as refusal:
-        raise DeviceError(name, f"the instrument refuses to measure: {refusal}") from refusal
-
-
-class EmulatedPositionSensor(PositionSensor):
-    """The role of a position sensor, played by an emulated T7 that is called directly, without a wire.
-
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here.
-    readout : {"voltage", "currents", "ratiometric"}
-        One normalised voltage, two amplified photocurrents, or an output that is a share of its supply.
-    channels : sequence of int
-        Inputs, 0 to 13: one for a voltage, those of the currents 1 and 2 for currents, those of output and supply
-        for a ratiometric sensor.
-    range_volts : float
-        Input range in V: 10, 1, 0.1 or 0.01.
-    resolution_index : int
-        Resolution index, 0 to 8.
-    samples : int
-        Conversions that one measurement averages, 1 to 16384.
-    sample_rate : float
-        Conversions in a second, Hz.
-    volts_per_metre, zero_volts : float
-        Calibration of a voltage.
-    psd_length, metres_per_metre, minimum_sum_volts : float
-        Length of the detector in m, movement of the spot per deflection, and the sum of both voltages in V
-        below which the light counts as lost.
-    stroke, zero_position : float
-        Stroke of a ratiometric sensor, and where on it the position reads zero, in m.
-    position_limits : tuple of float
-        Calibrated range in m.
-
-    Raises
-    ------
-    RegisterError
-        If the instrument refuses a setting.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        instrument: EmulatedT7,
-        *,
-        readout: Literal["voltage", "currents", "ratiometric"] = "voltage",
-        channels: Sequence[int] = (0,),
-        range_volts: float = 10.0,
-        resolution_index: int = 4,
-        samples: int = 10,
-        sample_rate: float = 1000.0,
-        volts_per_metre: float = 1e5,
-        zero_volts: float = 0.0,
-        psd_length: float = 0.037,
-        metres_per_metre: float = 185.0,
-        minimum_sum_volts: float = 0.5,
-        stroke: float = 0.035,
-        zero_position: float = 0.0,
-        position_limits: tuple[float, float] = (-90e-6, 90e-6),
-    ) -> None:
-        super().__init__(name, instrument.world.clock)
-        expected = 1 if readout == "voltage" else 2
-        if len(channels) != expected:
-            raise ValueError(f"channels: {readout} needs {expected}, got {len(channels)}")
-        self._instrument = instrument
-        self._readout = readout
-        self._channels = tuple(channels)
-        self._range = range_volts
-        self._volts_per_metre = volts_per_metre
-        self._zero_volts = zero_volts
-        self._metres_per_ratio = psd_length / 2 / metres_per_metre
-        self._minimum_sum = minimum_sum_volts
-        self._stroke = stroke
-        self._zero_position = zero_position
-        self._limits = position_limits
-        instrument.set_inputs_up(self._channels, range_volts, resolution_index, samples, sample_rate)
-
-    @property
-    def identity(self) -> Identity:
-        """Identity of the instrument."""
-        return self._instrument.identity
-
-    def measure(self) -> dict[str, float]:
-        """Measure the position in m, as a mean of conversions."""
-        return self._position(_bursts(self.name, self._instrument, self._channels))
-
-    def glance(self) -> dict[str, float]:
-        """Measure the position in m by one conversion."""
-        readings = [self._instrument.convert(channel) for channel in self._channels]
-        return self._position([Burst(volts, volts, volts) for volts in readings])
-
-    def safe(self) -> None:
-        """Do nothing: a sensor is safe in any state."""
-
-    def close(self) -> None:
-        """Do nothing: there is no line."""
-
-    def _position(self, bursts: Sequence[Burst]) -> dict[str, float]:
-        for channel, burst in zip(self._channels, bursts, strict=True):
-            if max(burst.maximum, -burst.minimum) >= 0.999 * self._range:
-                raise DeviceError(self.name, f"AIN{channel} is over its range of ±{self._range:g} V")
-        if self._readout == "voltage":
-            position = (bursts[0].average - self._zero_volts) / self._volts_per_metre
-        elif self._readout == "ratiometric":
-            position = self._along_the_stroke(*(burst.average for burst in bursts))
-        else:
-            first, second = (burst.average for burst in bursts)
-            if first + second < self._minimum_sum:
-                raise DeviceError(self.name, f"light lost: the currents add up to {first + second:.3g} V")
-            position = self._metres_per_ratio * (second - first) / (first + second)
-        low, high = self._limits
-        if not low <= position <= high:
-            raise DeviceError(self.name, f"position {position:g} m is outside of {low:g} to {high:g} m")
-        return {f"{self.name}_position": position}
-
-    def _along_the_stroke(self, output: float, supply: float) -> float:
-        if not 4.5 <= supply <= 5.5:
-            raise DeviceError(self.name, f"supply voltage of the sensor is {supply:.3g} V")
-        # At 10 and 90 % of the supply the magnet may be anywhere beyond the end.
-        share = (output / supply - 0.1) / 0.8
-        if not 0.0005 <= share <= 0.9995:
-            raise DeviceError(self.name, f"output of the sensor is {output / supply:.4g} of its supply")
-        return self._stroke * share - self._zero_position
-
-
-class EmulatedSwitch(Switch):
-    """The role of a switch, played by a digital line of an emulated T7 that is called directly, without a wire.
-
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its line is switched off and put under its watchdog here.
-    line : int
-        Number of the line, 0 to 22.
-    active_high : bool
-        Whether a high level is on.
-    watchdog : int
-        Silence in s after which the instrument switches the line off, 1 or more; a shorter time that is set
-        already for something else stays.
-
-    Raises
-    ------
-    RegisterError
-        If the instrument refuses a setting.
-    """
-
-    def __init__(
-        self, name: str, instrument: EmulatedT7, *, line: int, active_high: bool = True, watchdog: int = 5
-    ) -> None:
-        super().__init__(name, instrument.world.clock)
-        self._instrument = instrument
-        self._line = line
-        self._active_high = active_high
-        self._setpoint = math.nan
-        self._drive(False)
-        self._guard(watchdog)
-
-    @property
-    def identity(self) -> Identity:
-        """Identity of the instrument."""
-        return self._instrument.identity
-
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent, 0 or 1; 0 after the safe state and the watchdog, nan at first."""
-        return self._setpoint
-
-    def set(self, value: float) -> Status:
-        """Switch on (1) or off (0)."""
-        self.check(value)
-        self._setpoint = float(value)
-        self._drive(value == 1.0)
-        return Status.completed(self.name, self._clock)
-
-    def measure(self) -> dict[str, float]:
-        """Read back whether the line is on."""
-        level = int(self._instrument.read_value(2800)) >> self._line & 1
-        on = bool(level) == self._active_high
-        if self._setpoint == 1.0 and not on:
-            self._setpoint = 0.0
-            raise DeviceError(self.name, f"DIO{self._line} is off although it was switched on: the watchdog ran out")
-        return {f"{self.name}_state": float(on)}
-
-    def safe(self) -> None:
-        """Switch off."""
-        self._setpoint = 0.0
-        self._drive(False)
-
-    def close(self) -> None:
-        """Do nothing: there is no line of communication, and the digital line is left to the watchdog."""
-
-    def _drive(self, on: bool) -> None:
-        self._instrument.write_value(2000 + self._line, on == self._active_high)
-
-    def _guard(self, seconds: int) -> None:
-        read, write = self._instrument.read_value, self._instrument.write_value
-        bit = 1 << self._line
-        inhibit = int(read(61636)) if read(61600) and read(61630) else _all_dio()
-        if ~inhibit & ~bit & _all_dio() or (read(61600) and (read(61640) or read(61650))):
-            seconds = min(seconds, int(read(61604)))
-        state, direction = int(read(61632)), int(read(61634))
-        write(61600, 0)
-        write(61604, seconds)
-        write(61630, 1)
-        write(61632, state & ~bit if self._active_high else state | bit)
-        write(61634, direction | bit)
-        write(61636, inhibit & ~bit)
-        write(61600, 1)
-
-
-class EmulatedTemperatureSensor(TemperatureSensor):
-    """The role of a temperature sensor, played by an emulated T7 that is called directly, without a wire.
-
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here.
-    channels : tuple of int
-        Inputs of a thermistor's divider and of its excitation, 0 to 13.
-    reference_ohms, steinhart_hart : float and tuple of float
-        The divider and the thermistor, as those of `Thermistor`.
-    excitation_volts : float
-        Excitation in V; 20 % off is an error.
-    temperature_limits : tuple of float
-        Range in °C.
-    resolution_index, samples, sample_rate
-        Resolution index 0 to 8, conversions that one measurement averages, and conversions in a second in Hz.
-
-    Raises
-    ------
-    RegisterError
-        If the instrument refuses a setting.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        instrument: EmulatedT7,
-        *,
-        channels: tuple[int, int] = (0, 1),
-        reference_ohms: float = 10e3,
-        excitation_volts: float = 2.5,
-        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
-        temperature_limits: tuple[float, float] = (-40.0, 125.0),
-        resolution_index: int = 4,
-        samples: int = 10,
-        sample_rate: float = 1000.0,
-    ) -> None:
-        super().__init__(name, instrument.world.clock)
-        self._instrument = instrument
-        self._channels = channels
-        self._reference = reference_ohms
-        self._excitation = excitation_volts
-        self._steinhart_hart = steinhart_hart
-        self._limits = temperature_limits
-        instrument.set_inputs_up(channels, 10.0, resolution_index, samples, sample_rate)
-
-    @property
-    def identity(self) -> Identity:
-        """Identity of the instrument."""
-        return self._instrument.identity
-
-    def measure(self) -> dict[str, float]:
-        """Measure the temperature in °C, by means of conversions."""
-        return self._temperature(*(each.average for each in _bursts(self.name, self._instrument, self._channels)))
-
-    def glance(self) -> dict[str, float]:
-        """Measure the temperature in °C by one conversion."""
-        return self._temperature(*map(self._instrument.convert, self._channels))
-
-    def safe(self) -> None:
-        """Do nothing: a sensor is safe in any state."""
-
-    def close(self) -> None:
-        """Do nothing: there is no line."""
-
-    def _temperature(self, divider: float, excitation: float) -> dict[str, float]:
-        if not 0.8 <= excitation / self._excitation <= 1.2:
-            raise DeviceError(self.name, f"excitation of the thermistor is {excitation:.3g} V")
-        share = divider / excitation
-        if not 0.01 < share < 0.99:
-            raise DeviceError(self.name, f"thermistor {'open' if share > 0.5 else 'shorted'}")
-        a, b, c = self._steinhart_hart
-        log = math.log(self._reference * share / (1 - share))
-        temperature = 1 / (a + b * log + c * log**3) - _KELVIN
-        low, high = self._limits
-        if not low <= temperature <= high:
-            raise DeviceError(self.name, f"temperature {temperature:.4g} °C is outside of {low:g} to {high:g} °C")
-        return {f"{self.name}_temperature": temperature}
-
-
-class EmulatedHighVoltageSupply(VoltageSupply):
-    """The role of a voltage supply, played by an emulated T7 and the amplifier behind it, without a wire.
-
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument; its inputs are set up here, its line is switched off and put under its watchdog.
-    channels : tuple of int
-        Inputs of the amplifier's voltage monitor, current monitor and status output, 0 to 13.
-    analog_output : str
-        Output of the set-point: dac0, dac1, or tdac0 to tdac22.
-    line, active_high, watchdog
-        Line of the enable input, as those of `EmulatedSwitch`.
-    gain, offset_volts, volts_per_volt, amperes_per_volt : float
-        The amplifier, as those of `PiezoAmplifier`.
-    voltage_limits : tuple of float
-        Lowest and highest set-point in V.
-    resolution_index, samples, sample_rate
-        Resolution index 0 to 8, conversions that one measurement averages, and conversions in a second in Hz.
-
-    Raises
-    ------
-    RegisterError
-        If the instrument refuses a setting.
-    """
-
-    _STATUS_AGE = 0.1  # s, after which `set` looks at the status again
-
-    def __init__(
-        self,
-        name: str,
-        instrument: EmulatedT7,
-        *,
-        line: int,
-        channels: tuple[int, int, int] = (0, 1, 2),
-        analog_output: str = "tdac0",
-        active_high: bool = True,
-        watchdog: int = 5,
-        gain: float = 20.0,
-        offset_volts: float = 0.0,
-        volts_per_volt: float = 20.0,
-        amperes_per_volt: float = 0.01,
-        voltage_limits: tuple[float, float] = (-40.0, 40.0),
-        resolution_index: int = 4,
-        samples: int = 10,
-        sample_rate: float = 1000.0,
-    ) -> None:
-        super().__init__(name, instrument.world.clock)
-        self._instrument = instrument
-        self._channels = channels
-        kind, number = analog_output.split("dac")
-        self._address = (30000 if kind else 1000) + 2 * int(number)
-        self._gain = gain
-        self._offset = offset_volts
-        self._scales = (volts_per_volt, amperes_per_volt)
-        self._limits = Limits(*voltage_limits, "V")
-        self._setpoint = math.nan
-        self._enabled = False
-        self._looked = -math.inf
-        self._sent = Status.completed(name, instrument.world.clock)
-        instrument.set_inputs_up(channels, 10.0, resolution_index, samples, sample_rate)
-        self._send(0.0)
-        self._enable = EmulatedSwitch(name, instrument, line=line, active_high=active_high, watchdog=watchdog)
-
-    @property
-    def identity(self) -> Identity:
-        """Identity of the instrument."""
-        return self._instrument.identity
-
-    @property
-    def limits(self) -> Limits:
-        """The voltages that are allowed."""
-        return self._limits
-
-    @property
-    def output(self) -> str:
-        """What the set-point is: a constant voltage."""
-        return "dc"
-
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent in V; 0 when the output went off, nan at first."""
-        return self._setpoint
-
-    def set(self, value: float) -> Status:
-        """Send a voltage in V, and switch the amplifier on if it is off, at 0 V."""
-        self.check(value)
-        if not self._enabled:
-            self._switch_on()
-        elif self._clock.now() - self._looked >= self._STATUS_AGE:
-            self.glance()
-        self._setpoint = float(value)
-        self._send(value)
-        return self._sent
-
-    def measure(self) -> dict[str, float]:
-        """Measure voltage in V and current in A by the monitors, as means of conversions."""
-        return self._values(*(each.average for each in _bursts(self.name, self._instrument, self._channels)))
-
-    def glance(self) -> dict[str, float]:
-        """Measure voltage in V and current in A by one conversion."""
-        return self._values(*map(self._instrument.convert, self._channels))
-
-    def safe(self) -> None:
-        """Send 0 V and switch the enable line off."""
-        self._setpoint = 0.0
-        self._switch_off()
-
-    def close(self) -> None:
-        """Do nothing: there is no line of communication, and the enable line is left to the watchdog."""
-
-    def _send(self, volts: float) -> None:
-        self._instrument.write_value(self._address, self._offset + volts / self._gain)
-
-    def _switch_on(self) -> None:
-        self._setpoint = 0.0
-        self._send(0.0)
-        self._enable.set(1.0)
-        self._enabled = True
-        self.glance()
-
-    def _switch_off(self) -> None:
-        self._enabled = False
-        self._send(0.0)
-        self._enable.safe()
-
-    def _values(self, voltage: float, current: float, status: float) -> dict[str, float]:
-        self._looked = self._clock.now()
-        on = status >= 2.0
-        if on and not self._enabled:
-            raise DeviceError(self.name, "the amplifier reports that it is on although it was switched off")
-        if self._enabled and not on:
-            self._setpoint = 0.0
-            try:
-                self._enable.measure()
-                cause = "its enable line is on: its own protection has tripped"
-            except DeviceError:
-                cause = "its enable line is off: the watchdog has run out"
-            self._switch_off()
-            raise DeviceError(self.name, f"the amplifier went off by itself, while {cause}")
-        volts, amperes = self._scales
-        return {f"{self.name}_voltage": volts * voltage, f"{self.name}_current": amperes * current}
-
-
-class NormalisedPSD:
-    """A position-sensitive detector whose amplifier gives one voltage in proportion to the deflection.
-
-    Parameters
-    ----------
-    deflection : callable
-        The deflection in m, from the plant.
-    volts_per_metre : float
-        Sensitivity in V/m.
-    noise_volts : float
-        White noise of the amplifier in V rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Notes
-    -----
-    The amplifier saturates at ±10 V, noise included.
-    """
-
-    SATURATION = 10.0
-
-    def __init__(
-        self,
-        deflection: Callable[[], float],
-        volts_per_metre: float = 1e5,
-        noise_volts: float = 5e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self._deflection = deflection
-        self._volts_per_metre = volts_per_metre
-        self._noise = noise_volts
-        self._rng = rng
-
-    def __call__(self) -> float:
-        """Return the voltage in V at this instant."""
-        volts = self._deflection() * self._volts_per_metre + self._noise * self._rng.standard_normal()
-        return float(min(max(volts, -self.SATURATION), self.SATURATION))
-
-
-class TwoCurrentPSD:
-    """A position-sensitive detector whose two photocurrents are amplified to two voltages.
-
-    The spot at x on a detector of length L gives x = (L/2)(I2 − I1)/(I1 + I2) (Hamamatsu, S3270 datasheet).
-
-    Parameters
-    ----------
-    deflection : callable
-        The deflection in m, from the plant.
-    metres_per_metre : float
-        Movement of the spot per deflection, by the optical lever.
-    psd_length : float
-        Length of the detector in m.
-    sum_volts : float
-        Sum of both voltages in V while the light is on.
-    noise_volts : float
-        White noise of either amplifier in V rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Attributes
-    ----------
-    light : float
-        Share of the light that reaches the detector, 0 to 1; for faults and drift.
-
-    Notes
-    -----
-    A spot beyond the end of the detector gives no current at all. The amplifiers saturate at 0 and 10 V.
-    """
-
-    SATURATION = 10.0
-
-    def __init__(
-        self,
-        deflection: Callable[[], float],
-        metres_per_metre: float = 185.0,
-        psd_length: float = 0.037,
-        sum_volts: float = 8.0,
-        noise_volts: float = 5e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.light = 1.0
-        self._deflection = deflection
-        self._ratio_per_metre = 2 * metres_per_metre / psd_length
-        self._sum = sum_volts
-        self._noise = noise_volts
-        self._rng = rng
-
-    def first(self) -> float:
-        """Return the voltage in V of current 1 at this instant."""
-        return self._amplified(-1.0)
-
-    def second(self) -> float:
-        """Return the voltage in V of current 2 at this instant."""
-        return self._amplified(1.0)
-
-    def _amplified(self, side: float) -> float:
-        ratio = self._deflection() * self._ratio_per_metre
-        share = (1 + side * ratio) / 2 if abs(ratio) <= 1 else 0.0
-        volts = self.light * self._sum * share + self._noise * self._rng.standard_normal()
-        return float(min(max(volts, 0.0), self.SATURATION))
-
-
-class RatiometricSensor:
-    """A linear magnet sensor, of the kind of the SPS-L035-LATS, whose output is a share of its supply.
-
-    Assumption: the output goes from 10 to 90 % of a supply of 5 V over the stroke, and stays at its end for a
-    magnet that is beyond it.
-
-    Parameters
-    ----------
-    position : callable
-        The position of the magnet in m, counted from the start of the stroke, from the plant.
-    stroke : float
-        Stroke in m.
-    noise : float
-        White noise in m rms, drawn anew for every conversion; zero or positive.
-    resolution : float
-        Steps in which the sensor gives the position, in m.
-    supply_error : float
-        How far the supply of one instance is from 5 V, in V rms; drawn once.
-    rng : numpy.random.Generator
-        Source of the noise and of the error of the supply.
-
-    Attributes
-    ----------
-    supply_volts : float
-        Voltage of the supply in V; for faults and drift.
-    """
-
-    def __init__(
-        self,
-        position: Callable[[], float],
-        stroke: float = 0.035,
-        noise: float = 0.01e-3,
-        resolution: float = 0.04e-3,
-        supply_error: float = 20e-3,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.supply_volts = 5.0 + supply_error * rng.standard_normal()
-        self._position = position
-        self._stroke = stroke
-        self._noise = noise
-        self._resolution = resolution
-        self._rng = rng
-
-    def output(self) -> float:
-        """Return the output voltage in V at this instant."""
-        noisy = self._position() + self._noise * self._rng.standard_normal()
-        step = round(noisy / self._resolution) * self._resolution
-        share = min(max(step / self._stroke, 0.0), 1.0)
-        return self.supply_volts * (0.1 + 0.8 * share)
-
-    def supply(self) -> float:
-        """Return the voltage in V of the supply at this instant."""
-        return self.supply_volts
-
-
-class DisplacementSensor:
-    """An optical displacement sensor with a voltage in proportion to the displacement.
-
-    Parameters
-    ----------
-    displacement : callable
-        The displacement in m, from the plant.
-    volts_per_metre : float
-        Sensitivity in V/m.
-    reach : float
-        Displacement of either sign in m beyond which the output stays where it is.
-    noise : float
-        White noise in m rms, drawn anew for every conversion; zero or positive.
-    resolution : float
-        Steps in which the sensor gives the displacement, in m.
-    rng : numpy.random.Generator
-        Source of the noise.
-    """
-
-    def __init__(
-        self,
-        displacement: Callable[[], float],
-        volts_per_metre: float = 5e4,
-        reach: float = 200e-6,
-        noise: float = 10e-9,
-        resolution: float = 10e-9,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self._displacement = displacement
-        self._volts_per_metre = volts_per_metre
-        self._reach = reach
-        self._noise = noise
-        self._resolution = resolution
-        self._rng = rng
-
-    def __call__(self) -> float:
-        """Return the voltage in V at this instant."""
-        noisy = self._displacement() + self._noise * self._rng.standard_normal()
-        shown = round(noisy / self._resolution) * self._resolution
-        return self._volts_per_metre * min(max(shown, -self._reach), self._reach)
-
-
-class Thermistor:
-    """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
-
-    Assumptions: no self-heating, an exact reference resistor.
-
-    Parameters
-    ----------
-    temperature : callable
-        The temperature in °C, from the plant.
-    reference_ohms : float
-        Reference resistor in Ω.
-    steinhart_hart : tuple of float
-        A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive.
-    excitation_volts : float
-        Excitation in V.
-    excitation_error : float
-        How far the excitation of one instance is from that, in V rms; drawn once.
-    noise : float
-        White noise in K rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise and of the error of the excitation.
-
-    Attributes
-    ----------
-    excitation_volts : float
-        Voltage of the excitation in V; for faults and drift.
-    open, shorted : bool
-        Whether a wire of the thermistor is broken, or its wires touch; for faults.
-    """
-
-    def __init__(
-        self,
-        temperature: Callable[[], float],
-        reference_ohms: float = 10e3,
-        steinhart_hart: tuple[float, float, float] = STEINHART_HART,
-        excitation_volts: float = 2.5,
-        excitation_error: float = 10e-3,
-        noise: float = 0.02,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        self.excitation_volts = excitation_volts + excitation_error * rng.standard_normal()
-        self.open = False
-        self.shorted = False
-        self._temperature = temperature
-        self._reference = reference_ohms
-        self._steinhart_hart = steinhart_hart
-        self._noise = noise
-        self._rng = rng
-
-    def divider(self) -> float:
-        """Return the voltage in V at the input of the divider at this instant."""
-        if self.shorted:
-            return 0.0
-        if self.open:
-            return self.excitation_volts
-        ohms = self._ohms(self._temperature() + self._noise * self._rng.standard_normal())
-        return self.excitation_volts * ohms / (ohms + self._reference)
-
-    def excitation(self) -> float:
-        """Return the voltage in V of the excitation at this instant."""
-        return self.excitation_volts
-
-    def _ohms(self, celsius: float) -> float:
-        """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
-        a, b, c = self._steinhart_hart
-        half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
-        root = math.sqrt((b / (3 * c)) ** 3 + half**2)
-        return math.exp(math.cbrt(root - half) - math.cbrt(root + half))
-
-
-class PiezoLoad(Protocol):
-    """What a high-voltage amplifier drives."""
-
-    def apply(self, voltage: float) -> None:
-        """Apply a voltage, V; held until the next."""
-
-
-class PiezoAmplifier:
-    """A high-voltage amplifier of fixed gain with an enable input, two monitors and a status output; `Timed`.
-
-    The output goes to a new value as a lag of first order does. The monitors show it exactly. The load, which
-    holds a voltage until the next, gets it in even steps of `STEP` or less, each at the instant at which the
-    output passes the middle of the step, so that it is half a step off at most, and arrives. It never goes back on
-    its way, also when the next set-point comes before it arrives. The output is clipped at ±`SATURATION`, and goes
-    to 0 V while the amplifier is off.
-
-    Assumptions: the protection stays tripped until the enable input is taken away; the status output changes at
-    once.
-
-    Parameters
-    ----------
-    world : World
-        The laboratory that the amplifier stands in.
-    load : PiezoLoad
-        What is driven, 0 V at first.
-    gain : float
-        Gain in V/V.
-    offset_volts : float
-        Input in V at which the output is 0 V.
-    settling_time : float
-        Time constant of the output in s.
-    capacitance : float
-        Capacitance of the load in F, for the current.
-    volts_per_volt, amperes_per_volt : float
-        Output voltage and current per volt of their monitors.
-    scale_error : float
-        How far gain and voltage monitor of one instance are from their values, as a share, rms; drawn once.
-    noise_volts : float
-        White noise of either monitor in V rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise and of the errors of scale.
-    """
-
-    SATURATION = 45.0
-    STEP = 0.125
-    STATUS = 5.0
-
-    def __init__(
-        self,
-        world: World,
-        load: PiezoLoad,
-        *,
-        gain: float = 20.0,
-        offset_volts: float = 0.0,
-        settling_time: float = 0.2e-3,
-        capacitance: float = 20e-9,
-        volts_per_volt: float = 20.0,
-        amperes_per_volt: float = 0.01,
-        scale_error: float = 1e-3,
-        noise_volts: float = 0.2e-3,
-        rng: np.random.Generator,
-    ) -> None:
-        self._world = world
-        self._load = load
-        self._gain = gain * (1 + scale_error * rng.standard_normal())
-        self._offset = offset_volts
-        self._time_constant = settling_time
-        self._capacitance = capacitance
-        self._volts_per_volt = volts_per_volt * (1 + scale_error * rng.standard_normal())
-        self._amperes_per_volt = amperes_per_volt
-        self._noise = noise_volts
-        self._rng = rng
-        self._input = offset_volts
-        self._enabled = False
-        self._tripped = False
-        self._start = self._target = self._applied = 0.0
-        self._since = world.time
-        self._step = self._steps = 0
-        self._due = math.inf
-        world.add(self)
-
-    @property
-    def on(self) -> bool:
-        """Whether the output follows the input."""
-        return self._enabled and not self._tripped
-
-    @property
-    def voltage(self) -> float:
-        """Voltage of the output in V, where the world stands."""
-        elapsed = self._world.time - self._since
-        return self._target + (self._start - self._target) * math.exp(-elapsed / self._time_constant)
-
-    def drive(self, volts: float, enable: bool) -> None:
-        """Take what is at the inputs: the set-point in V, and whether the amplifier is enabled."""
-        if volts == self._input and enable == self._enabled:
-            return
-        self._input = volts
-        self._enabled = enable
-        self._tripped = self._tripped and enable
-        self._follow()
-
-    def trip(self) -> None:
-        """Have the protection switch the amplifier off, until the enable input is taken away."""
-        with self._world.lock:
-            self._world.advance()
-            self._tripped = self._enabled
-            self._follow()
-
-    def voltage_monitor(self) -> float:
-        """Return the voltage in V of the voltage monitor at this instant."""
-        return self.voltage / self._volts_per_volt + self._noise * self._rng.standard_normal()
-
-    def current_monitor(self) -> float:
-        """Return the voltage in V of the current monitor at this instant."""
-        amperes = self._capacitance * (self._target - self.voltage) / self._time_constant
-        return amperes / self._amperes_per_volt + self._noise * self._rng.standard_normal()
-
-    def status(self) -> float:
-        """Return the voltage in V of the status output: high while the amplifier is on."""
-        return self.STATUS if self.on else 0.0
-
-    def deadline(self) -> float:
-        """Return when the load gets its next step, in laboratory seconds; infinity when the output has settled."""
-        return self._due
-
-    def expire(self) -> None:
-        """Give the load its next step."""
-        self._step += 1
-        share = self._step / self._steps
-        self._apply(self._start + share * (self._target - self._start) if share < 1 else self._target)
-        self._schedule()
-
-    def _follow(self) -> None:
-        output = self._gain * (self._input - self._offset) if self.on else 0.0
-        target = min(max(output, -self.SATURATION), self.SATURATION)
-        if target == self._target:
-            return
-        self._start = self.voltage
-        self._target = target
-        self._since = self._world.time
-        self._apply(self._start)
-        self._step = 0
-        self._steps = math.ceil(abs(target - self._start) / self.STEP)
-        self._schedule()
-
-    def _schedule(self) -> None:
-        left = self._steps - self._step - 0.5
-        self._due = self._since + self._time_constant * math.log(self._steps / left) if left > 0 else math.inf
-
-    def _apply(self, volts: float) -> None:
-        # A load that is ahead of the output waits for it: going back would be a loop of its hysteresis.
-        low, high = (volts, self._target) if volts < self._target else (self._target, volts)
-        volts = min(max(self._applied, low), high)
-        if volts != self._applied:
-            self._applied = volts
-            self._load.apply(volts)
+    def _dio_bank(self, attribute: str) -> tuple[Callable[[], float], Callable[[float], None]]:
+        return partial(getattr, self, attribute), partial(self._set_dio_bank, attribute)

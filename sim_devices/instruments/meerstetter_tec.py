@@ -1,9 +1,7 @@
 """Emulated Meerstetter TEC-1091: a thermoelectric cooler's amplifier and temperature controller.
 
 The instrument is its parameter table, its state machine and its protections; the plant behind it is the
-physics. The numbers, types and ranges of the parameters are those of Meerstetter 5136 (TEC controller
-communication protocol) as a TEC-1091 reports them, the error numbers those of Meerstetter 5216 (TEC-family
-user manual). Defaults are ours.
+physics. The error numbers are those of Meerstetter 5216 (TEC-family user manual).
 
 Assumptions, where the manuals are silent or were not at hand:
 
@@ -23,17 +21,26 @@ current. The error thresholds of current and voltage act.
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from enum import IntEnum
-from typing import Literal, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
 from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceError
+from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.meerstetter_table import (
+    CONTROLLER,
+    ENABLE_LIVE,
+    ENABLE_OFF,
+    ENABLE_ON,
+    LIVE,
+    PARAMETERS,
+    DeviceStatus,
+    Parameter,
+    ServerError,
+    stored,
+)
 from sim_devices.world import World
 
 RESET_DELAY = 0.2
@@ -54,147 +61,10 @@ _OUTPUT_RESOLUTION = 1e-3  # A and V
 _DEVICE_TEMPERATURE = 35.0
 _DEVICE_TYPE = 1091
 _HARDWARE_VERSION = 120
-_STATIC, _LIVE, _CONTROLLER = 0, 1, 2  # values of parameter 2000
-_ENABLE_OFF, _ENABLE_ON, _ENABLE_LIVE = 0, 1, 2  # values of parameter 2010
-_HIGHEST_INT = 2**31 - 1
-
-
-class DeviceStatus(IntEnum):
-    """Values of parameter 104 (Meerstetter 5136)."""
-
-    INIT = 0
-    READY = 1
-    RUN = 2
-    ERROR = 3
-    BOOTLOADER = 4
-    RESET_PENDING = 5
-
-
-class ServerError(IntEnum):
-    """Why a request is refused (Meerstetter 5117, server error codes)."""
-
-    COMMAND_NOT_AVAILABLE = 1
-    BUSY = 2
-    COMMUNICATION = 3
-    FORMAT = 4
-    PARAMETER_NOT_AVAILABLE = 5
-    READ_ONLY = 6
-    OUT_OF_RANGE = 7
-    INSTANCE_NOT_AVAILABLE = 8
-    GENERAL = 9
-
-
-class RequestRefusedError(Exception):
-    """The device answers a request with a server error."""
-
-    def __init__(self, reason: ServerError) -> None:
-        super().__init__(reason.name)
-        self.reason = reason
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One row of the parameter table.
-
-    Attributes
-    ----------
-    number : int
-        Number of the parameter.
-    kind : {"INT32", "FLOAT32"}
-        How the value is coded on the wire.
-    low, high : float
-        Range of the values.
-    default : float
-        Value as delivered.
-    writable : bool
-        Whether the host may write it.
-    volatile : bool
-        Whether it lives in RAM only and starts from its default after each reset.
-    """
-
-    number: int
-    kind: Literal["INT32", "FLOAT32"]
-    low: float
-    high: float
-    default: float
-    writable: bool = True
-    volatile: bool = False
-
-
-def _integer(number: int, high: float, default: float = 0, *, low: float = 0) -> Parameter:
-    return Parameter(number, "INT32", low, high, default)
-
-
-def _real(number: int, low: float, high: float, default: float) -> Parameter:
-    return Parameter(number, "FLOAT32", low, high, default)
-
-
-def _integer_reading(number: int) -> Parameter:
-    return Parameter(number, "INT32", 0, _HIGHEST_INT, 0, writable=False)
-
-
-def _real_reading(number: int) -> Parameter:
-    return Parameter(number, "FLOAT32", -math.inf, math.inf, 0.0, writable=False)
-
-
-def _live(number: int, kind: Literal["INT32", "FLOAT32"], low: float, high: float) -> Parameter:
-    return Parameter(number, kind, low, high, 0, volatile=True)
-
-
-PARAMETERS = {
-    parameter.number: parameter
-    for parameter in (
-        *(_integer_reading(number) for number in (100, 101, 102, 103, 104, 105, 106, 107, 109, 1200)),
-        *(_real_reading(number) for number in (1000, 1001, 1010, 1011, 1020, 1021, 1060, 1063)),
-        Parameter(108, "INT32", 0, 1, 0, volatile=True),
-        _integer(2000, 2, _CONTROLLER),
-        _integer(2010, 3, _ENABLE_OFF),
-        _real(2020, -4.0, 4.0, 0.0),
-        _real(2021, 0.0, 21.0, 0.0),
-        _real(2030, 0.0, 4.0, 4.0),
-        _real(2031, 0.0, 21.0, 21.0),
-        _real(2032, 0.0, 5.6, 5.0),
-        _real(2033, 0.0, 25.0, 22.0),
-        _integer(2040, 2),
-        _integer(2050, 1_000_000, 57600, low=4800),
-        _integer(2051, 254, 1, low=1),
-        _integer(2052, 100_000),
-        _real(2060, 0.0, 600.0, 0.0),
-        _real(3000, -273.0, 1000.0, 25.0),
-        _real(3002, 0.0, 200.0, 1.0),
-        _real(3003, 1e-6, 50.0, 50.0),
-        _real(3010, 0.0, 10000.0, 10.0),
-        _real(3011, 1e-4, 10000.0, 300.0),
-        _real(3012, 0.0, 10000.0, 0.0),
-        _real(3013, 0.0, 1.0, 0.3),
-        _integer(3034, 1, 1),
-        _real(4010, -273.0, 1000.0, 0.0),
-        _real(4011, -273.0, 1000.0, 105.0),
-        _real(4012, 1.0, 100_000.0, 50.0),
-        _real(4040, 0.0, 50.0, 0.1),
-        _real(4041, 0.0, 86400.0, 1.0),
-        _real(4042, 0.0, 86400.0, 0.0),
-        _real(5010, -273.0, 1000.0, 0.0),
-        _real(5011, -273.0, 1000.0, 70.0),
-        _real(5012, 1.0, 200.0, 50.0),
-        _real(6310, 0.0, 86400.0, 0.0),
-        _integer(6320, 20_000_000, 1, low=-1),
-        _live(50000, "INT32", 0, 1),
-        _live(50001, "FLOAT32", -4.0, 4.0),
-        _live(50002, "FLOAT32", 0.0, 21.0),
-        _live(50011, "INT32", 0, 1),
-        _live(50012, "FLOAT32", -273.0, 1000.0),
-    )
-}
-"""The emulated part of a TEC-1091's parameter table, by parameter number.
-
-4040 to 4042 are the stability window (K), the least time in it (s) and the longest time to get there (s, 0
-for no limit); 6320 is the time in saturation (ms, −1 for never) that leads to error 108.
-"""
 
 
 class PeltierLoad(Protocol):
-    """What the output stage is connected to; a positive current heats the plate."""
+    """The load of the output stage; a positive current heats the plate."""
 
     @property
     def plate_temperature(self) -> float:
@@ -222,15 +92,13 @@ class PeltierLoad(Protocol):
         """Switch the output off."""
 
 
-class EmulatedTEC(TECAmplifier):
+class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     """One TEC-1091 with its Peltier element, as the parameter table and as the role of a TEC amplifier.
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The time of the emulated laboratory; the instrument enters its own deadlines there.
+    name, world
+        See `EmulatedDevice`.
     load : PeltierLoad
         The plant's Peltier element.
     serial_number : int
@@ -256,14 +124,12 @@ class EmulatedTEC(TECAmplifier):
         firmware: int = 410,
         rng: np.random.Generator | None = None,
     ) -> None:
-        super().__init__(name, world.clock)
-        self._world = world
+        super().__init__(name, world, rng)
         self._load = load
-        self._rng = rng
         self._identity = Identity(
             "Meerstetter Engineering", f"TEC-{_DEVICE_TYPE}", str(serial_number), f"{firmware / 100:.2f}"
         )
-        self._saved = {number: _stored(row, row.default) for number, row in PARAMETERS.items()}
+        self._saved = {number: stored(row, row.default) for number, row in PARAMETERS.items()}
         self._values = dict(self._saved)
         self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 102: serial_number, 103: firmware}
         self._readings: dict[int, Callable[[], float]] = {
@@ -283,7 +149,6 @@ class EmulatedTEC(TECAmplifier):
             1200: self._stability,
         }
         self.flash_writes = 0
-        self._setpoint = math.nan
         self._status = DeviceStatus.READY
         self._error = self._error_instance = self._error_parameter = 0
         self._output: tuple[str, float, float] | None = None
@@ -291,45 +156,36 @@ class EmulatedTEC(TECAmplifier):
         self._supervised_at = world.time
         self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
         self._started_at = self._in_window_since = self._saturated_since = math.nan
-        self._plugged_in = True
-        self._corrupt_next = self._drop_next = False
         world.add(self)
 
-    # The device as its manual has it: parameters and commands.
-
-    @property
-    def world(self) -> World:
-        """The time of the emulated laboratory."""
-        return self._world
+    # Parameters and commands.
 
     @property
     def address(self) -> int:
-        """Get the device address, 1 to 254 (parameter 2051)."""
+        """The device address, 1 to 254 (parameter 2051)."""
         return int(self._values[2051])
 
     @property
     def identification(self) -> str:
-        """Get the identification string, 20 characters; the wording is an assumption."""
+        """The identification string, 20 characters; the wording is an assumption."""
         return f"{self._identity.model} v{self._identity.firmware}".ljust(20)
 
     @property
     def status(self) -> DeviceStatus:
-        """Get the state of the device at the clock's present time; does not feed the watchdog."""
-        with self._world.lock:
-            self._world.advance()
+        """The state of the device at the clock's present time; does not feed the watchdog."""
+        with self._world.at_present():
             return self._status
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the watchdog: a request has arrived."""
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             now = self._world.time
             if now > self._supervised_at:
                 self._supervise(now)
             self._feed(now)
 
     def parameter(self, number: int, instance: int = 1) -> Parameter:
-        """Get the row of the parameter table.
+        """Return the row of the parameter table.
 
         Raises
         ------
@@ -344,7 +200,7 @@ class EmulatedTEC(TECAmplifier):
         return row
 
     def read_parameter(self, number: int, instance: int = 1) -> float:
-        """Get the value of a parameter, in the unit of the table.
+        """Return the value of a parameter, in the unit of the table.
 
         Raises
         ------
@@ -369,13 +225,13 @@ class EmulatedTEC(TECAmplifier):
             self.attend()
             if not row.writable:
                 raise RequestRefusedError(ServerError.READ_ONLY)
-            stored = _stored(row, value)
-            inside = _stored(row, row.low) <= stored <= _stored(row, row.high)
+            kept = stored(row, value)
+            inside = stored(row, row.low) <= kept <= stored(row, row.high)
             if not inside or (number == 2060 and 0.0 < value < 0.1):
                 raise RequestRefusedError(ServerError.OUT_OF_RANGE)
-            self._values[number] = stored
+            self._values[number] = kept
             if not row.volatile and not self._values[108]:
-                self._saved[number] = stored
+                self._saved[number] = kept
                 self.flash_writes += 1
             if number == 2060:
                 self._feed(self._world.time)
@@ -396,12 +252,7 @@ class EmulatedTEC(TECAmplifier):
             self._restart_due = self._world.time + RESET_DELAY
             self._apply()
 
-    # Faults to try the bench with.
-
-    @property
-    def plugged_in(self) -> bool:
-        """Get whether requests reach the device."""
-        return self._plugged_in
+    # Faults.
 
     def trip(self, error_number: int, *, parameter: int = 0) -> None:
         """Put the device into its error state.
@@ -413,49 +264,17 @@ class EmulatedTEC(TECAmplifier):
         parameter : int
             The parameter that parameter 107 will name.
         """
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             self._trip(error_number, parameter)
 
-    def unplug(self) -> None:
-        """Let no request arrive and no answer leave; the device works on, and its watchdog expires."""
-        with self._world.lock:
-            self._world.advance()
-            self._plugged_in = False
-
-    def plug_in(self) -> None:
-        """Undo `unplug`."""
-        with self._world.lock:
-            self._world.advance()
-            self._plugged_in = True
-
-    def corrupt_next_answer(self) -> None:
-        """Have one bit of the next answer turned over on its way; the device has acted all the same."""
-        self._corrupt_next = True
-
-    def drop_next_answer(self) -> None:
-        """Have the next answer lost on its way; the device has acted all the same."""
-        self._drop_next = True
-
-    def transmit(self, answer: bytes) -> bytes:
-        """Return what arrives at the host of an answer, after the faults of the line."""
-        if self._drop_next:
-            self._drop_next = False
-            return b""
-        if self._corrupt_next:
-            self._corrupt_next = False
-            middle = len(answer) // 2
-            return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
-        return answer
-
-    # What happens by itself.
+    # Timed events.
 
     def deadline(self) -> float:
         """Return when the watchdog, a restart or the next check of the protections is due (s)."""
         return min(self._watchdog_due, self._restart_due, self._supervision_due)
 
     def expire(self) -> None:
-        """Do what is due."""
+        """Carry out what is due."""
         now = self._world.time
         if now >= self._watchdog_due:
             self._watchdog_due = math.inf
@@ -466,7 +285,7 @@ class EmulatedTEC(TECAmplifier):
             self._supervision_due = now + SUPERVISION_INTERVAL
             self._supervise(now)
 
-    # The role of a TEC amplifier, as a host on the spot would play it.
+    # The role of a TEC amplifier.
 
     @property
     def identity(self) -> Identity:
@@ -475,16 +294,16 @@ class EmulatedTEC(TECAmplifier):
 
     @property
     def mode(self) -> TECMode:
-        """What is held constant (parameter 2000)."""
-        return TECMode.TEMPERATURE if self._values[2000] == _CONTROLLER else TECMode.CURRENT
+        """The quantity that is held constant (parameter 2000)."""
+        return TECMode.TEMPERATURE if self._values[2000] == CONTROLLER else TECMode.CURRENT
 
     def select_mode(self, mode: TECMode) -> None:
-        """Choose what is held constant; a change switches the output off."""
+        """Choose the quantity that is held constant; a change switches the output off."""
         with self._request():
             if mode is not self.mode:
                 for number in (50000, 2010, 50001):
                     self.write_parameter(number, 0)
-                self.write_parameter(2000, _CONTROLLER if mode is TECMode.TEMPERATURE else _LIVE)
+                self.write_parameter(2000, CONTROLLER if mode is TECMode.TEMPERATURE else LIVE)
                 self._setpoint = math.nan
 
     @property
@@ -493,11 +312,6 @@ class EmulatedTEC(TECAmplifier):
         if self.mode is TECMode.TEMPERATURE:
             return Limits(self._values[4010], self._values[4011], "°C")
         return Limits(-self._values[2030], self._values[2030], "A")
-
-    @property
-    def setpoint(self) -> float:
-        """The set-point that `set` or `stop` last took, °C or A; nan before the first."""
-        return self._setpoint
 
     def set(self, value: float) -> Status:
         """Send a set-point in °C or A, and switch the output on if it is off."""
@@ -509,7 +323,7 @@ class EmulatedTEC(TECAmplifier):
                 self.write_parameter(50011, 1)
             else:
                 self.write_parameter(50001, self._polarity * value)
-            self.write_parameter(2010, _ENABLE_LIVE)
+            self.write_parameter(2010, ENABLE_LIVE)
             self.write_parameter(50000, 1)
             self._setpoint = value
             self._refuse_fault()
@@ -546,10 +360,7 @@ class EmulatedTEC(TECAmplifier):
         """Switch the output stage off."""
         with self._request():
             self.write_parameter(50000, 0)
-            self.write_parameter(2010, _ENABLE_OFF)
-
-    def close(self) -> None:
-        """Do nothing: there is no line."""
+            self.write_parameter(2010, ENABLE_OFF)
 
     def _arrived(self) -> bool:
         with self._request():
@@ -557,14 +368,6 @@ class EmulatedTEC(TECAmplifier):
             if self._status is not DeviceStatus.RUN:
                 raise DeviceError(self.name, "the output was switched off before the temperature was reached")
             return self._read(1200) == 2
-
-    @contextmanager
-    def _request(self) -> Iterator[None]:
-        with self._world.lock:
-            if not self._plugged_in:
-                raise DeviceConnectionError(self.name, "does not answer: it was unplugged")
-            self.attend()
-            yield
 
     def _refuse_fault(self) -> None:
         if self._status is DeviceStatus.ERROR:
@@ -582,17 +385,16 @@ class EmulatedTEC(TECAmplifier):
     def _read(self, number: int) -> float:
         reading = self._readings.get(number)
         value = self._values[number] if reading is None else reading()
-        return _stored(PARAMETERS[number], value)
+        return stored(PARAMETERS[number], value)
 
     def _object_temperature(self) -> float:
-        noise = 0.0 if self._rng is None else OBJECT_NOISE * self._rng.standard_normal()
-        return _rounded(self._load.plate_temperature + noise, _OBJECT_RESOLUTION)
+        return _rounded(self._load.plate_temperature + self._draw(OBJECT_NOISE), _OBJECT_RESOLUTION)
 
     def _target(self) -> float:
         return self._values[50012] if self._values[50011] else self._values[3000]
 
     def _stability(self) -> int:
-        if self._status is not DeviceStatus.RUN or self._values[2000] != _CONTROLLER:
+        if self._status is not DeviceStatus.RUN or self._values[2000] != CONTROLLER:
             return 0
         # A comparison with nan, outside of the window, is false.
         return 2 if self._world.time - self._in_window_since >= self._values[4041] else 1
@@ -610,7 +412,7 @@ class EmulatedTEC(TECAmplifier):
         if error_number == 183:
             for number, row in PARAMETERS.items():
                 if row.volatile and number >= 50000:
-                    self._values[number] = _stored(row, row.default)
+                    self._values[number] = stored(row, row.default)
         if self._values[6310] > 0.0:
             self._restart_due = self._world.time + self._values[6310]
         self._apply()
@@ -627,15 +429,15 @@ class EmulatedTEC(TECAmplifier):
         """Bring the output stage into the state that the table asks for."""
         values = self._values
         enable = values[2010]
-        wanted = enable == _ENABLE_ON or (enable == _ENABLE_LIVE and values[50000] == 1)
+        wanted = enable == ENABLE_ON or (enable == ENABLE_LIVE and values[50000] == 1)
         on = wanted and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
         output: tuple[str, float, float] | None = None
         if on:
             limit = values[2030]
-            if values[2000] == _CONTROLLER:
+            if values[2000] == CONTROLLER:
                 output = ("regulate", self._target(), limit)
             else:
-                asked = values[50001] if values[2000] == _LIVE else values[2020]
+                asked = values[50001] if values[2000] == LIVE else values[2020]
                 output = ("drive", self._polarity * min(max(asked, -limit), limit), limit)
         if output == self._output:
             return
@@ -696,7 +498,7 @@ class EmulatedTEC(TECAmplifier):
             self._saturated_since = now
         elif 0 <= values[6320] < 1e3 * (now - self._saturated_since):
             self._trip(108, 6320)
-        if self._status is not DeviceStatus.RUN or values[2000] != _CONTROLLER:
+        if self._status is not DeviceStatus.RUN or values[2000] != CONTROLLER:
             return
         if abs(self._load.plate_temperature - self._target()) > values[4040]:
             self._in_window_since = math.nan
@@ -705,16 +507,6 @@ class EmulatedTEC(TECAmplifier):
         late = values[4042] > 0.0 and now - self._started_at > values[4042]
         if late and self._stability() != 2:
             self._trip(182, 4042)
-
-
-def _stored(row: Parameter, value: float) -> float:
-    """Return a value as the device keeps it: an integer, or a number of single precision."""
-    if row.kind == "INT32":
-        return int(value)
-    try:
-        return float(struct.unpack(">f", struct.pack(">f", value))[0])
-    except OverflowError:
-        return math.copysign(math.inf, value)
 
 
 def _rounded(value: float, resolution: float) -> float:

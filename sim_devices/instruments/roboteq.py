@@ -29,8 +29,7 @@ Kept in the dictionary without effect: the consumer heartbeat times (0x1016).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from typing import Literal, Protocol
@@ -38,7 +37,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from bench.devices import Identity, Limits, Status, VoltageSupply
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceError
+from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
 from sim_devices.world import World
 
 CHANNELS = 2
@@ -114,14 +114,6 @@ class AbortCode(IntEnum):
     VALUE = 0x0609_0030
 
 
-class TransferAbortedError(Exception):
-    """The device refuses to read or write an object."""
-
-    def __init__(self, code: AbortCode) -> None:
-        super().__init__(code.name)
-        self.code = code
-
-
 Kind = Literal["S8", "U8", "S16", "U16", "S32", "U32", "text"]
 
 
@@ -174,7 +166,7 @@ _INDICES = frozenset(index for index, _ in DICTIONARY)
 
 
 class HeatingLoad(Protocol):
-    """What the first motor output is connected to."""
+    """The load at the first motor output."""
 
     def apply(self, voltage: float) -> None:
         """Apply a voltage, V: the average with an LC filter, the RMS value without; held until the next."""
@@ -184,17 +176,15 @@ class HeatingLoad(Protocol):
         """Current through the load, A."""
 
 
-class EmulatedRoboteq(VoltageSupply):
+class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     """One SDC2160 with its load, as the object dictionary and as the role of a voltage supply.
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The time of the emulated laboratory; the instrument enters its own deadlines there.
+    name, world
+        See `EmulatedDevice`.
     load : HeatingLoad
-        What is heated.
+        The heated load.
     output : {"average", "rms"}
         Whether an LC filter is between output and load, so that it sees the average, or none.
     voltage_limits : tuple of float
@@ -212,7 +202,7 @@ class EmulatedRoboteq(VoltageSupply):
     bitrate : int
         Speed of the bus, bit/s.
     device_name : str
-        What object 0x1008 says.
+        Value of object 0x1008.
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
@@ -234,8 +224,7 @@ class EmulatedRoboteq(VoltageSupply):
         device_name: str = "Roboteq SDC2160",
         rng: np.random.Generator | None = None,
     ) -> None:
-        super().__init__(name, world.clock)
-        self._world = world
+        super().__init__(name, world, rng)
         self._load = load
         self._output = output
         self._limits = Limits(*voltage_limits, "V")
@@ -245,7 +234,6 @@ class EmulatedRoboteq(VoltageSupply):
         self._power_limit = power_limit
         self.node = node
         self.bitrate = bitrate
-        self._rng = rng
         self._texts = {0x1008: device_name, 0x1009: "1.0", 0x100A: "v2.0 11/20/2019"}
         self._identity = Identity(
             "Roboteq", device_name.removeprefix("Roboteq").strip(), "unknown", self._texts[0x100A]
@@ -263,9 +251,6 @@ class EmulatedRoboteq(VoltageSupply):
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = False
         self._heartbeat_since = world.clock.now()
-        self._plugged_in = True
-        self._drop_next = self._damage_next = False
-        self._setpoint = math.nan
         self._battery_used = math.nan
         self._readings: dict[int, Callable[[int], int]] = {
             0x1000: lambda _: DEVICE_TYPE,
@@ -285,30 +270,23 @@ class EmulatedRoboteq(VoltageSupply):
         }
         world.add(self)
 
-    # The device as its manual has it: objects and network management.
-
-    @property
-    def world(self) -> World:
-        """The time of the emulated laboratory."""
-        return self._world
+    # Objects and network management.
 
     @property
     def state(self) -> NodeState:
-        """Get the NMT state."""
+        """The NMT state."""
         return self._state
 
     @property
     def power(self) -> int:
-        """Get the applied power at the clock's present time, ‰; does not feed the watchdog."""
-        with self._world.lock:
-            self._world.advance()
+        """The applied power at the clock's present time, ‰; does not feed the watchdog."""
+        with self._world.at_present():
             return self._power
 
     @property
     def voltage(self) -> float:
-        """Get the voltage that the load sees at the clock's present time, V."""
-        with self._world.lock:
-            self._world.advance()
+        """The voltage that the load sees at the clock's present time, V."""
+        with self._world.at_present():
             return self._applied_voltage
 
     def entry(self, index: int, sub: int) -> Entry:
@@ -316,27 +294,27 @@ class EmulatedRoboteq(VoltageSupply):
 
         Raises
         ------
-        TransferAbortedError
+        RequestRefusedError
             If there is no such object or no such subindex of it.
         """
         row = DICTIONARY.get((index, sub))
         if row is None:
-            raise TransferAbortedError(AbortCode.NO_SUBINDEX if index in _INDICES else AbortCode.NO_OBJECT)
+            raise RequestRefusedError(AbortCode.NO_SUBINDEX if index in _INDICES else AbortCode.NO_OBJECT)
         return row
 
     def read_object(self, index: int, sub: int = 0) -> int | str:
-        """Get the value of an object, in the unit of the manual.
+        """Return the value of an object, in the unit of the manual.
 
         Raises
         ------
-        TransferAbortedError
+        RequestRefusedError
             If there is no such object, or it can only be written.
         """
         with self._world.lock:
             row = self.entry(index, sub)
             self._world.advance()
             if not row.readable:
-                raise TransferAbortedError(AbortCode.WRITE_ONLY)
+                raise RequestRefusedError(AbortCode.WRITE_ONLY)
             return self._texts[index] if row.kind == "text" else self._readings[index](sub)
 
     def write_object(self, index: int, value: int, sub: int = 0) -> None:
@@ -344,14 +322,14 @@ class EmulatedRoboteq(VoltageSupply):
 
         Raises
         ------
-        TransferAbortedError
+        RequestRefusedError
             If there is no such object, it can only be read, or the value is out of its range.
         """
         with self._world.lock:
             row = self.entry(index, sub)
             self._world.advance()
             if not row.writable:
-                raise TransferAbortedError(AbortCode.READ_ONLY)
+                raise RequestRefusedError(AbortCode.READ_ONLY)
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
@@ -362,8 +340,7 @@ class EmulatedRoboteq(VoltageSupply):
 
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -390,24 +367,22 @@ class EmulatedRoboteq(VoltageSupply):
             due += [self._state] * min(count, _LONGEST_HEARTBEAT_BACKLOG)
         return due if self._plugged_in else []
 
-    # Faults to try the bench with.
+    # Faults.
 
     @property
     def battery_voltage(self) -> float:
-        """Get or set the voltage of the power supply, V."""
+        """The voltage of the power supply, V."""
         return self._battery
 
     @battery_voltage.setter
     def battery_voltage(self, volts: float) -> None:
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             self._battery = volts
             self._apply()
 
     def trip(self, fault: Fault | ChannelFlag) -> None:
-        """Have the device report a fault, which drops the output, or a flag of the first channel."""
-        with self._world.lock:
-            self._world.advance()
+        """Report a fault, which drops the output, or a flag of the first channel."""
+        with self._world.at_present():
             if isinstance(fault, Fault):
                 self._trips |= fault
             else:
@@ -416,54 +391,26 @@ class EmulatedRoboteq(VoltageSupply):
 
     def clear(self) -> None:
         """Take the causes of all faults away."""
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             self._trips, self._channel_trips = Fault(0), ChannelFlag(0)
             self._apply()
 
     def power_cycle(self) -> None:
         """Interrupt the supply of the device: it starts anew, and says so by its boot-up message."""
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             self._restart(power=True)
-
-    @property
-    def plugged_in(self) -> bool:
-        """Get whether frames reach the device."""
-        return self._plugged_in
-
-    def unplug(self) -> None:
-        """Let no frame arrive and none leave; the device works on, and its watchdog expires."""
-        with self._world.lock:
-            self._world.advance()
-            self._plugged_in = False
 
     def plug_in(self) -> None:
         """Undo `unplug`; the heartbeats of meanwhile are lost."""
-        with self._world.lock:
-            self._world.advance()
+        with self._world.at_present():
             self.heartbeats()
             self._plugged_in = True
 
-    def drop_next_answer(self) -> None:
-        """Have the next answer lost on its way; the device has acted all the same."""
-        self._drop_next = True
+    def _corrupted(self, answer: bytes) -> bytes:
+        """Cut the adapter's line in its middle."""
+        return answer[: len(answer) // 2] + b"\r"
 
-    def damage_next_answer(self) -> None:
-        """Have the adapter's next line of an answer end in its middle; the device has acted all the same."""
-        self._damage_next = True
-
-    def transmit(self, line: bytes) -> bytes:
-        """Return what arrives at the host of an answer's line, after the faults of the line."""
-        if self._drop_next:
-            self._drop_next = False
-            return b""
-        if self._damage_next:
-            self._damage_next = False
-            return line[: len(line) // 2] + b"\r"
-        return line
-
-    # What happens by itself.
+    # Timed events.
 
     def deadline(self) -> float:
         """Return when the watchdog expires (s)."""
@@ -475,7 +422,7 @@ class EmulatedRoboteq(VoltageSupply):
         self._held = True
         self._apply()
 
-    # The role of a voltage supply, as a host on the spot would play it.
+    # The role of a voltage supply.
 
     @property
     def identity(self) -> Identity:
@@ -491,11 +438,6 @@ class EmulatedRoboteq(VoltageSupply):
     def limits(self) -> Limits:
         """The allowed set-points, V."""
         return self._limits
-
-    @property
-    def setpoint(self) -> float:
-        """The set-point that was last sent, V; nan before the first."""
-        return self._setpoint
 
     def set(self, value: float) -> Status:
         """Apply a voltage, V."""
@@ -533,17 +475,6 @@ class EmulatedRoboteq(VoltageSupply):
             self.write_object(0x200E, 1)
             self._setpoint = 0.0
 
-    def close(self) -> None:
-        """Do nothing: there is no line."""
-
-    @contextmanager
-    def _request(self) -> Iterator[None]:
-        with self._world.lock:
-            self._world.advance()
-            if not self._plugged_in:
-                raise DeviceConnectionError(self.name, "does not answer: it was unplugged")
-            yield
-
     def _refuse_fault(self) -> None:
         faults, flags = self._faults(), self._channel_flags()
         if faults or flags:
@@ -563,7 +494,7 @@ class EmulatedRoboteq(VoltageSupply):
     def _command(self, index: int, sub: int, value: int) -> None:
         if index == 0x2000:
             if abs(value) > _FULL:
-                raise TransferAbortedError(AbortCode.VALUE)
+                raise RequestRefusedError(AbortCode.VALUE)
             if not (sub == 1 and self._held and value != 0):
                 self._commands[sub - 1] = value
         elif index == 0x200C:
@@ -626,10 +557,7 @@ class EmulatedRoboteq(VoltageSupply):
     def _amps(self, channel: int) -> int:
         if channel != 1:
             return 0
-        return round(10.0 * (self._load.current + self._noise(CURRENT_NOISE)))
+        return round(10.0 * (self._load.current + self._draw(CURRENT_NOISE)))
 
     def _battery_reading(self) -> int:
-        return max(round(10.0 * (self._battery + self._noise(BATTERY_NOISE))), 0)
-
-    def _noise(self, deviation: float) -> float:
-        return 0.0 if self._rng is None else deviation * float(self._rng.standard_normal())
+        return max(round(10.0 * (self._battery + self._draw(BATTERY_NOISE))), 0)

@@ -1,1 +1,1 @@
-"""Plants of the emulated laboratory: physics only, advanced in time by whoever owns the clock."""
+"""Plants of the emulated laboratory: physics only, advanced in time by the owner of the clock."""

@@ -9,10 +9,14 @@ everything else is in SI units, and a positive current heats the beam.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from sim_devices.plants import cooler
+from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 
 # Nodes of the thermal chain, each joined to the next: insulated end and front of the block, back and
 # actuator face of the TEC, then the elements of the beam from its base to its tip.
@@ -35,9 +39,9 @@ FACTOR_ROWS = 3
 FLUCTUATION, ROOM, CURRENT, FACTORED, INTEGRAL = range(5)
 STATE_SIZE = 5
 
-# Command: regulated (1) or driven (0), current (A), target rise (K), current limit (A), step of the room (K).
-CLOSED, COMMAND, TARGET, LIMIT, ROOM_STEP = range(5)
-COMMAND_SIZE = 5
+# Command of the room, after those of the cooler: step of its temperature (K).
+ROOM_STEP = cooler.COMMAND_SIZE
+COMMAND_SIZE = ROOM_STEP + 1
 
 # Coefficients, prepared once from the parameters.
 (
@@ -86,6 +90,28 @@ FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
 Floats = NDArray[np.float64]
 
 
+class Thermal(NamedTuple):
+    """All numbers of the thermal part; the first three and the factors are changed in place.
+
+    Attributes
+    ----------
+    rise : ndarray
+        Node temperatures, K.
+    increment : ndarray
+        Change of them over the latest step that is known, K.
+    state, command, c, nodes, factors : ndarray
+        State, commands, coefficients, node table and factorised matrix.
+    """
+
+    rise: Floats
+    increment: Floats
+    state: Floats
+    command: Floats
+    c: Floats
+    nodes: Floats
+    factors: Floats
+
+
 @njit(cache=True)
 def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bool:
     """Set room temperature and current for the step that begins here.
@@ -97,7 +123,7 @@ def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bo
     state : ndarray
         State, changed in place.
     command : ndarray
-        What amplifier and room were told.
+        Commands to amplifier and room.
     c : ndarray
         Coefficients.
 
@@ -153,24 +179,19 @@ def factorise(current: float, c: Floats, nodes: Floats, factors: Floats) -> None
 
 
 @njit(cache=True)
-def look_ahead(
-    rise: Floats, increment: Floats, state: Floats, command: Floats, c: Floats, nodes: Floats, factors: Floats
-) -> None:
+def look_ahead(thermal: Thermal) -> None:
     """Find the change of the temperatures over the step that begins here.
 
     The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
-    balance to rounding. What convection has beyond that changes over seconds and is taken at the middle of
+    balance to rounding. The nonlinear part of convection changes over seconds and is taken at the middle of
     the step, extrapolated from the step before.
 
     Parameters
     ----------
-    rise : ndarray
-        Node temperatures, K.
-    increment : ndarray
-        On entry the change over the step before, on return that over this one, K.
-    state, command, c, nodes, factors : ndarray
-        See the functions above; `state` and `factors` are changed in place.
+    thermal : Thermal
+        On entry with the increment over the step before, on return with that over this one.
     """
+    rise, increment, state, command, c, nodes, factors = thermal
     saturated = take_commands(rise, state, command, c)
     if command[CLOSED] != 0.0:
         error = command[TARGET] - rise[FACE]
@@ -211,17 +232,7 @@ def look_ahead(
 
 
 @njit(cache=True)
-def advance_steps(
-    normals: Floats,
-    ahead: bool,
-    rise: Floats,
-    increment: Floats,
-    state: Floats,
-    command: Floats,
-    c: Floats,
-    nodes: Floats,
-    factors: Floats,
-) -> None:
+def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
     """Complete one grid step for each of `normals`.
 
     Parameters
@@ -230,12 +241,13 @@ def advance_steps(
         Standard normal numbers, one a step, for the room.
     ahead : bool
         Whether the first step's change is already known.
-    rise, increment, state, command, c, nodes, factors : ndarray
-        See `look_ahead`; the first three and `factors` are changed in place.
+    thermal : Thermal
+        See `look_ahead`.
     """
+    rise, increment, state, command, c, _, _ = thermal
     for row in range(normals.size):
         if not ahead:
-            look_ahead(rise, increment, state, command, c, nodes, factors)
+            look_ahead(thermal)
         ahead = False
         for j in range(NODES):
             rise[j] += increment[j]

@@ -8,6 +8,7 @@ the places in these arrays. Here stresses are in MPa, forces in N, lengths in mm
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -58,6 +59,29 @@ FIRST_HALVINGS = 5
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+
+class Parts(NamedTuple):
+    """All numbers of a wire, as the compiled loops take them.
+
+    Attributes
+    ----------
+    state, c : ndarray
+        State, and coefficients.
+    grains : ndarray
+        Grain table, `GRAIN_ROWS` rows.
+    martensite, oriented : ndarray
+        Committed grain states.
+    scratch : ndarray
+        Two rows of stresses, MPa.
+    """
+
+    state: Floats
+    c: Floats
+    grains: Floats
+    martensite: Flags
+    oriented: Flags
+    scratch: Floats
 
 
 @njit(cache=True)
@@ -163,22 +187,17 @@ def end_position(
 
 
 @njit(cache=True)
-def switching_stresses(
-    temperature: float, c: Floats, grains: Floats, martensite: Flags, oriented: Flags, scratch: Floats
-) -> None:
+def switching_stresses(temperature: float, parts: Parts) -> None:
     """Find the stress above which each grain will be martensite, and oriented, in a trial from its state.
 
     Parameters
     ----------
     temperature : float
         Temperature of the trial, °C.
-    c, grains : ndarray
-        Coefficients and grain table.
-    martensite, oriented : ndarray
-        Committed grain states.
-    scratch : ndarray
-        Two rows to write to: stresses for martensite and for orientation, MPa.
+    parts : Parts
+        Stresses for martensite and for orientation are written to the rows of `scratch`.
     """
+    _, c, grains, martensite, oriented, scratch = parts
     for g in range(martensite.size):
         cold = (temperature - grains[AUSTENITE, g] + grains[WIDTH, g]) * grains[SLOPE, g]
         hot = (temperature - grains[AUSTENITE, g]) * grains[SLOPE, g]
@@ -196,16 +215,7 @@ def switching_stresses(
 
 
 @njit(cache=True)
-def solve_stress(
-    position: float,
-    temperature: float,
-    committed: float,
-    c: Floats,
-    grains: Floats,
-    martensite: Flags,
-    oriented: Flags,
-    scratch: Floats,
-) -> float:
+def solve_stress(position: float, temperature: float, committed: float, parts: Parts) -> float:
     """Find the stress at which the wire is as long as imposed, by bisection on trials from the committed state.
 
     The trial length is non-decreasing in stress with a jump where a grain switches. Of the last
@@ -221,15 +231,16 @@ def solve_stress(
         Temperature, °C.
     committed : float
         Stress of the committed state, MPa.
-    c, grains, martensite, oriented, scratch : ndarray
-        See `switching_stresses`; the grain states are not changed.
+    parts : Parts
+        Only `scratch` is changed.
 
     Returns
     -------
     float
         Stress, MPa: 0 if the wire is slack, the stress limit if it cannot be stretched so far.
     """
-    count = martensite.size
+    c, scratch = parts.c, parts.scratch
+    count = parts.martensite.size
     limit = float(c[STRESS_LIMIT])
     below = np.zeros(2, dtype=np.int64)
     inside = np.zeros(2, dtype=np.int64)
@@ -247,7 +258,7 @@ def solve_stress(
             halvings = HALVINGS
             low = 0.0
             high = limit
-        switching_stresses(temperature, c, grains, martensite, oriented, scratch)
+        switching_stresses(temperature, parts)
         # Count the switches below the interval and move those inside it to the front of their row.
         for row in range(2):
             passed_by = 0
@@ -298,26 +309,17 @@ def solve_stress(
 
 
 @njit(cache=True)
-def commit(
-    temperature: float,
-    stress: float,
-    state: Floats,
-    c: Floats,
-    grains: Floats,
-    martensite: Flags,
-    oriented: Flags,
-) -> None:
+def commit(temperature: float, stress: float, parts: Parts) -> None:
     """Take over temperature and stress and bring the grains there.
 
     Parameters
     ----------
     temperature, stress : float
         Temperature, °C, and stress, MPa.
-    state, martensite, oriented : ndarray
-        Changed in place.
-    c, grains : ndarray
-        Coefficients and grain table.
+    parts : Parts
+        State and grain states are changed.
     """
+    state, c, grains, martensite, oriented, _ = parts
     martensites, orienteds = update_grains(temperature, stress, c[UNORIENTED_SHARE], grains, martensite, oriented)
     state[TEMPERATURE] = temperature
     state[STRESS] = stress
@@ -326,65 +328,50 @@ def commit(
 
 
 @njit(cache=True)
-def load_to(stress: float, state: Floats, c: Floats, grains: Floats, martensite: Flags, oriented: Flags) -> None:
+def load_to(stress: float, parts: Parts) -> None:
     """Move the imposed stress at constant temperature, in sub-steps.
 
     Parameters
     ----------
     stress : float
         Stress to reach, MPa.
-    state, c, grains, martensite, oriented : ndarray
+    parts : Parts
         See `commit`.
     """
+    state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[STRESS]
     steps = math.ceil(abs(stress - begin) / c[STRESS_STEP])
     for k in range(1, steps + 1):
-        commit(temperature, begin + (stress - begin) * k / steps, state, c, grains, martensite, oriented)
+        commit(temperature, begin + (stress - begin) * k / steps, parts)
     state[STRESS] = stress
-    state[POSITION] = end_position(temperature, stress, state[MARTENSITE], state[ORIENTED], martensite.size, c)
+    state[POSITION] = end_position(temperature, stress, state[MARTENSITE], state[ORIENTED], parts.martensite.size, c)
 
 
 @njit(cache=True)
-def stretch_to(
-    position: float,
-    state: Floats,
-    c: Floats,
-    grains: Floats,
-    martensite: Flags,
-    oriented: Flags,
-    scratch: Floats,
-) -> None:
+def stretch_to(position: float, parts: Parts) -> None:
     """Move the imposed position at constant temperature, in sub-steps.
 
     Parameters
     ----------
     position : float
         Position to reach, mm.
-    state, c, grains, martensite, oriented, scratch : ndarray
+    parts : Parts
         See `commit` and `solve_stress`.
     """
+    state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[POSITION]
     steps = math.ceil(abs(position - begin) / c[LENGTH_STEP])
     for k in range(1, steps + 1):
         place = begin + (position - begin) * k / steps
-        stress = solve_stress(place, temperature, state[STRESS], c, grains, martensite, oriented, scratch)
-        commit(temperature, stress, state, c, grains, martensite, oriented)
+        stress = solve_stress(place, temperature, state[STRESS], parts)
+        commit(temperature, stress, parts)
     state[POSITION] = position
 
 
 @njit(cache=True)
-def heat_to(
-    temperature: float,
-    clamped: bool,
-    state: Floats,
-    c: Floats,
-    grains: Floats,
-    martensite: Flags,
-    oriented: Flags,
-    scratch: Floats,
-) -> None:
+def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
     """Move the temperature at constant load or at constant position, in sub-steps.
 
     Parameters
@@ -393,9 +380,10 @@ def heat_to(
         Temperature to reach, °C.
     clamped : bool
         Whether the position is held; the stress is otherwise.
-    state, c, grains, martensite, oriented, scratch : ndarray
+    parts : Parts
         See `commit` and `solve_stress`.
     """
+    state, c = parts.state, parts.c
     begin = state[TEMPERATURE]
     position = state[POSITION]
     steps = math.ceil(abs(temperature - begin) / c[TEMPERATURE_STEP])
@@ -403,26 +391,17 @@ def heat_to(
         warm = begin + (temperature - begin) * k / steps
         stress = state[STRESS]
         if clamped:
-            stress = solve_stress(position, warm, stress, c, grains, martensite, oriented, scratch)
-        commit(warm, stress, state, c, grains, martensite, oriented)
+            stress = solve_stress(position, warm, stress, parts)
+        commit(warm, stress, parts)
     state[TEMPERATURE] = temperature
     if not clamped:
         state[POSITION] = end_position(
-            temperature, state[STRESS], state[MARTENSITE], state[ORIENTED], martensite.size, c
+            temperature, state[STRESS], state[MARTENSITE], state[ORIENTED], parts.martensite.size, c
         )
 
 
 @njit(cache=True)
-def advance_steps(
-    normals: Floats,
-    state: Floats,
-    command: Floats,
-    c: Floats,
-    grains: Floats,
-    martensite: Flags,
-    oriented: Flags,
-    scratch: Floats,
-) -> None:
+def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each element of `normals`.
 
     The mechanical command is carried out first, at the temperature of the step before, and then the
@@ -432,15 +411,18 @@ def advance_steps(
     ----------
     normals : ndarray
         Standard normal numbers, one a step: the ambient temperature.
-    state, command, c, grains, martensite, oriented, scratch : ndarray
-        See the functions above; `state`, `martensite` and `oriented` are changed in place.
+    command : ndarray
+        Command.
+    parts : Parts
+        See `commit` and `solve_stress`.
     """
+    state, c = parts.state, parts.c
     clamped = command[CLAMPED] != 0.0
     for row in range(normals.size):
         if clamped:
-            stretch_to(command[PLACE], state, c, grains, martensite, oriented, scratch)
+            stretch_to(command[PLACE], parts)
         else:
-            load_to(command[LOAD] / c[AREA], state, c, grains, martensite, oriented)
+            load_to(command[LOAD] / c[AREA], parts)
         offset = c[AMBIENT_DECAY] * state[AMBIENT_OFFSET] + c[AMBIENT_KICK] * normals[row]
         state[AMBIENT_OFFSET] = offset
         rise = c[HEATING] * (1.0 + c[AMBIENT_GAIN] * offset) * command[VOLTAGE] * command[VOLTAGE]
@@ -450,4 +432,4 @@ def advance_steps(
             decay = c[FAN_DECAY]
         steady = c[AMBIENT] + offset + rise
         warm = steady + (state[TEMPERATURE] - steady) * decay
-        heat_to(warm, clamped, state, c, grains, martensite, oriented, scratch)
+        heat_to(warm, clamped, parts)

@@ -8,10 +8,13 @@ the places in these arrays. All temperatures are in degrees Celsius except insid
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 
 ZERO_CELSIUS = 273.15
 
@@ -22,10 +25,6 @@ STATE_SIZE = 7
 # Relay counters: relays that are on, up-thresholds and down-thresholds below the present drive.
 ON_COUNT, UP_BELOW, DOWN_BELOW = range(3)
 COUNTER_SIZE = 3
-
-# Command: loop closed (1) or open (0), target (°C), current limit (A), current command (A).
-CLOSED, TARGET, LIMIT, COMMAND = range(4)
-COMMAND_SIZE = 4
 
 # Coefficients, prepared once from the parameters.
 (
@@ -58,6 +57,32 @@ COEFFICIENT_SIZE = 23
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+
+class Parts(NamedTuple):
+    """All numbers of the film and its plate, as the compiled loops take them.
+
+    Attributes
+    ----------
+    state, c : ndarray
+        State and coefficients.
+    counters : ndarray
+        Relay counters.
+    up, down : ndarray
+        Up- and down-thresholds, °C, each sorted.
+    down_relay : ndarray
+        Relay number of each element of `down`.
+    on : ndarray
+        Relay states.
+    """
+
+    state: Floats
+    c: Floats
+    counters: Integers
+    up: Floats
+    down: Floats
+    down_relay: Integers
+    on: Flags
 
 
 @njit(cache=True)
@@ -108,17 +133,7 @@ def switch_relays(
 
 
 @njit(cache=True)
-def settle_film(
-    film: float,
-    coupling: float,
-    relay_step: float,
-    state: Floats,
-    counters: Integers,
-    up: Floats,
-    down: Floats,
-    down_relay: Integers,
-    on: Flags,
-) -> None:
+def settle_film(film: float, parts: Parts) -> None:
     """Sweep the effective temperature towards what the film temperature and the R fraction ask for.
 
     The R fraction of the previous sub-step feeds back (causal), so relays that switch in the last
@@ -128,15 +143,13 @@ def settle_film(
     ----------
     film : float
         Film temperature, °C.
-    coupling : float
-        Mean-field coupling, K.
-    relay_step : float
-        Largest sub-step of the effective temperature, K.
-    state, counters, up, down, down_relay, on : ndarray
-        See `switch_relays`; the effective temperature in `state` is changed in place.
+    parts : Parts
+        The effective temperature in the state, counters and relays are changed.
     """
+    state, c, counters, up, down, down_relay, on = parts
+    relay_step = c[RELAY_STEP]
     while True:
-        wanted = film + coupling * (counters[ON_COUNT] / up.size - 0.5)
+        wanted = film + c[COUPLING] * (counters[ON_COUNT] / up.size - 0.5)
         move = wanted - state[DRIVE]
         if abs(move) <= relay_step:
             state[DRIVE] = wanted
@@ -235,7 +248,7 @@ def step_plate(state: Floats, command: Floats, c: Floats) -> None:
     state : ndarray
         State, changed in place.
     command : ndarray
-        What the amplifier was told.
+        Commands to the amplifier.
     c : ndarray
         Coefficients.
     """
@@ -274,29 +287,22 @@ def step_plate(state: Floats, command: Floats, c: Floats) -> None:
 
 
 @njit(cache=True)
-def advance_steps(
-    normals: Floats,
-    state: Floats,
-    counters: Integers,
-    command: Floats,
-    c: Floats,
-    up: Floats,
-    down: Floats,
-    down_relay: Integers,
-    on: Flags,
-) -> None:
+def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each row of `normals`.
 
     Parameters
     ----------
     normals : ndarray
         Standard normal numbers, one row a step: wander, drift.
-    state, counters, command, c, up, down, down_relay, on : ndarray
-        See the functions above; `state`, `counters` and `on` are changed in place.
+    command : ndarray
+        Command.
+    parts : Parts
+        See `settle_film`.
     """
+    state, c = parts.state, parts.c
     for row in range(normals.shape[0]):
         step_plate(state, command, c)
         state[WANDER] = c[WANDER_DECAY] * state[WANDER] + c[WANDER_KICK] * normals[row, 0]
         state[DRIFT] = c[DRIFT_DECAY] * state[DRIFT] + c[DRIFT_KICK] * normals[row, 1]
         film = state[PLATE] + state[WANDER] + state[DRIFT] + c[OFFSET]
-        settle_film(film, c[COUPLING], c[RELAY_STEP], state, counters, up, down, down_relay, on)
+        settle_film(film, parts)

@@ -17,12 +17,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
+from sim_devices.plants.grid import NotNegative, Signed, check_temperature
 from sim_devices.plants.muscle import MILLIMETRE
 
 
@@ -77,39 +76,26 @@ class CoiledPolymerParameters(MuscleParameters):
     resistance: float = 12.0
     cold_stiffness: float = 1.3e3
     hot_stiffness: float = 0.9e3
-    softening: float = 60.0
+    softening: Signed = 60.0
     softening_width: float = 15.0
-    expansion: float = 0.07e-3
-    expansion_above: float = 0.07e-3
-    coil_contact: float = 1.0e6
-    coil_length: float = -6.0e-3
-    friction: float = 0.35
-    friction_load: float = 0.06
-    friction_coils: float = 0.1
-    slip: float = 0.4
-    arm_stiffness: float = 100.0
+    expansion: NotNegative = 0.07e-3
+    expansion_above: NotNegative = 0.07e-3
+    coil_contact: NotNegative = 1.0e6
+    coil_length: Signed = -6.0e-3
+    friction: NotNegative = 0.35
+    friction_load: NotNegative = 0.06
+    friction_coils: NotNegative = 0.1
+    slip: NotNegative = 0.4
+    arm_stiffness: NotNegative = 100.0
     arm_time: float = 6.0
-    ambient_temperature: float = 25.0
+    ambient_temperature: Signed = 25.0
     time_constant: float = 8.0
     fan_time_constant: float = 3.0
     rise: float = 95.0
     temperature_step: float = 1.0
-    ambient_sd: float = 0.0
+    ambient_sd: NotNegative = 0.0
     ambient_time: float = 120.0
-    ambient_gain: float = 0.004
-
-    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = (
-        "expansion",
-        "expansion_above",
-        "coil_contact",
-        "friction",
-        "friction_load",
-        "friction_coils",
-        "slip",
-        "arm_stiffness",
-        "ambient_sd",
-    )
-    _SIGNED: ClassVar[tuple[str, ...]] = ("softening", "coil_length", "ambient_temperature", "ambient_gain")
+    ambient_gain: Signed = 0.004
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -121,39 +107,10 @@ class CoiledPolymerParameters(MuscleParameters):
             raise ValueError(
                 f"hot_stiffness must not exceed cold_stiffness, not {self.hot_stiffness} > {self.cold_stiffness} N/m"
             )
-        if not self.ambient_temperature > -273.15:
-            raise ValueError(f"ambient_temperature must be above absolute zero, not {self.ambient_temperature} °C")
+        check_temperature("ambient_temperature", self.ambient_temperature)
 
 
-class CoiledPolymerSnapshot(NamedTuple):
-    """Every output of the plant at one instant.
-
-    Attributes
-    ----------
-    temperature, ambient_temperature : float
-        Temperature of the muscle and of the room, °C.
-    voltage : float
-        Effective heating voltage, V.
-    current : float
-        Current through the plating, A.
-    force : float
-        Tension of the muscle, N.
-    length : float
-        Elongation of the muscle from its resting length, m; contraction is negative.
-    position : float
-        Position of the moving end, m: elongation of muscle, frame and load cell.
-    """
-
-    temperature: float
-    ambient_temperature: float
-    voltage: float
-    current: float
-    force: float
-    length: float
-    position: float
-
-
-class CoiledPolymerMuscle(FrictionMuscle):
+class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
     """Length and force of a coiled polymer muscle, advanced in time.
 
     At temperature T and elongation x the tension is::
@@ -178,67 +135,52 @@ class CoiledPolymerMuscle(FrictionMuscle):
         The session's randomness: the temperature of the room. The plant spawns its own generator from it.
     """
 
+    OUTPUTS = ("temperature", "ambient_temperature", "voltage", "current", "force", "length", "position")
+
     def __init__(self, parameters: CoiledPolymerParameters, rng: np.random.Generator) -> None:
-        self._parameters = parameters
         room = parameters.ambient_temperature
         super().__init__(parameters, _coefficients(parameters), room, room + parameters.rise, rng)
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
-        self._state[kernels.OFFSET] = offset
+        self._state["offset"] = offset
         self._drive(room + offset, clamped=False)
-
-    @property
-    def parameters(self) -> CoiledPolymerParameters:
-        """The numbers of this plant."""
-        return self._parameters
 
     @property
     def temperature(self) -> float:
         """Temperature of the muscle, °C; 120 °C at 3 V."""
-        return float(self._state[kernels.DRIVE])
+        return float(self._state["drive"])
 
     @property
     def ambient_temperature(self) -> float:
         """Temperature of the room, °C."""
-        return float(self._parameters.ambient_temperature + self._state[kernels.OFFSET])
-
-    def snapshot(self) -> CoiledPolymerSnapshot:
-        """Take all outputs at the present instant.
-
-        Returns
-        -------
-        CoiledPolymerSnapshot
-            The outputs.
-        """
-        return CoiledPolymerSnapshot._make(getattr(self, name) for name in CoiledPolymerSnapshot._fields)
+        return float(self._parameters.ambient_temperature + self._state["offset"])
 
 
-def _coefficients(parameters: CoiledPolymerParameters) -> dict[int, float]:
+def _coefficients(parameters: CoiledPolymerParameters) -> Record:
     """Prepare the numbers that the compiled loops need every step."""
     p = parameters
-    ambient_decay = math.exp(-p.step / p.ambient_time)
-    return kernels.shared_coefficients(p) | {
-        kernels.KIND: kernels.THERMAL,
-        kernels.DRIVE_STEP: p.temperature_step,
-        kernels.BASE: p.ambient_temperature,
-        kernels.GAIN: p.rise / p.rated_voltage**2,
-        kernels.DECAY: math.exp(-p.step / p.time_constant),
-        kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
-        kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
-        kernels.OFFSET_DECAY: ambient_decay,
-        kernels.OFFSET_KICK: p.ambient_sd * math.sqrt(1.0 - ambient_decay**2),
-        kernels.OFFSET_GAIN: p.ambient_gain,
-        kernels.ARM: p.arm_stiffness * MILLIMETRE,
-        kernels.ARM_TIME: p.arm_time,
-        kernels.FRICTION: p.friction,
-        kernels.FRICTION_PRESS: p.friction_coils,
-        kernels.FRICTION_DRIVE: p.friction_load,
-        kernels.SLIP: p.slip,
-        kernels.COLD_STIFFNESS: p.cold_stiffness * MILLIMETRE,
-        kernels.HOT_STIFFNESS: p.hot_stiffness * MILLIMETRE,
-        kernels.SOFTENING: p.softening,
-        kernels.SOFTENING_WIDTH: p.softening_width,
-        kernels.EXPANSION: p.expansion / MILLIMETRE,
-        kernels.EXPANSION_ABOVE: p.expansion_above / MILLIMETRE,
-        kernels.CONTACT: p.coil_contact * MILLIMETRE**2,
-        kernels.CONTACT_AT: p.coil_length / MILLIMETRE,
-    }
+    return coefficients(
+        p,
+        p.ambient_sd,
+        p.ambient_time,
+        drive_step=p.temperature_step,
+        base=p.ambient_temperature,
+        gain=p.rise / p.rated_voltage**2,
+        decay=math.exp(-p.step / p.time_constant),
+        fan_decay=math.exp(-p.step / p.fan_time_constant),
+        fan_share=p.fan_time_constant / p.time_constant,
+        offset_gain=p.ambient_gain,
+        arm=p.arm_stiffness * MILLIMETRE,
+        arm_time=p.arm_time,
+        friction=p.friction,
+        friction_press=p.friction_coils,
+        friction_drive=p.friction_load,
+        slip=p.slip,
+        cold_stiffness=p.cold_stiffness * MILLIMETRE,
+        hot_stiffness=p.hot_stiffness * MILLIMETRE,
+        softening=p.softening,
+        softening_width=p.softening_width,
+        expansion=p.expansion / MILLIMETRE,
+        expansion_above=p.expansion_above / MILLIMETRE,
+        contact=p.coil_contact * MILLIMETRE**2,
+        contact_at=p.coil_length / MILLIMETRE,
+    )

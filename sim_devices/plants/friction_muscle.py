@@ -1,98 +1,53 @@
-"""What the braided pneumatic muscle and the coiled polymer muscle share: friction, equilibrium and time.
+"""The common part of the braided pneumatic and the coiled polymer muscle: friction, equilibrium and time.
 
-Both are an elastic backbone whose law depends on what drives it, pressure or temperature, in parallel with
-many dry contacts and with one weak Maxwell arm. The compiled loops keep their state in plain arrays, because
-passing a few arrays into a compiled function costs a microsecond and a plant is advanced hundreds of thousands
-of times a run. The constants below name the places in these arrays. Here lengths are in mm, forces in N,
-pressures in bar and temperatures in °C; `MuscleParameters` and the muscles' commands and outputs are in SI units.
+Both are an elastic backbone whose law depends on the drive, pressure or temperature, in parallel with many dry
+contacts and with one weak Maxwell arm. The compiled loops keep their numbers in records, which they change in
+place: passing records into a compiled function costs a few microseconds, and a plant is advanced hundreds of
+thousands of times a run. Here lengths are in mm, forces in N, pressures in bar and temperatures in °C;
+`MuscleParameters` and the muscles' commands and outputs are in SI units.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants.grid import NotNegative, PlantParameters, Seed, fluctuation
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, MILLIMETRE, PLACE, VOLTAGE, Muscle
 
-# What drives the muscle.
-PNEUMATIC, THERMAL = range(2)
 
-# Continuous state: pressure (bar) or temperature (°C), its free displacement (mm), pressure that the regulator
-# aims at (bar), deviation of supply (bar) or room (K), tension, length, position of the moving end (mm), force of
-# the Maxwell arm.
-DRIVE, FREED, SETTING, OFFSET, FORCE, LENGTH, POSITION, RELAXING = range(8)
-STATE_SIZE = 8
+def _record(names: str) -> np.dtype[np.void]:
+    return np.dtype([(name, np.float64) for name in names.split()])
+
+
+STATE = _record("drive freed setting offset force length position relaxing")
+"""State: pressure (bar) or temperature (°C), its free displacement (mm), pressure that the regulator aims at (bar),
+deviation of supply (bar) or room (K), tension, length, position of the moving end (mm), force of the Maxwell arm."""
+
+LAW = _record("level slope square cube stretch press press_from yielding yield_stretch yield_press yield_load free")
+"""The law at one value of the drive.
+
+Backbone: polynomial in the length, then two one-sided squares, one that resists stretching beyond a length and one
+that resists contraction beyond a length. Yield force of all contacts: a constant, and shares of the two one-sided
+forces and of the polynomial. Free displacement."""
+
+COEFFICIENTS = _record(
+    "pneumatic step rest_length rest series_compliance force_limit force_step length_step drive_step "
+    "base gain band decay fan_decay fan_share offset_decay offset_kick offset_gain arm arm_time "
+    "friction friction_stretch friction_press friction_drive slip pressure_area thread_length "
+    "bladder bladder_cube jam cold_stiffness hot_stiffness softening softening_width expansion expansion_above "
+    "contact contact_at"
+)
+"""Coefficients, prepared once from the parameters; `pneumatic` is 1 if pressure drives the muscle, 0 if temperature
+does. Those of the laws mean what the muscle's parameters say."""
 
 # Rows of the contact table: stiffness (N/mm), share of the yield force, share of the free displacement.
 STIFFNESS, WEIGHT, SHARE = range(3)
-CONTACT_ROWS = 3
-
-# The law at one value of the drive. Backbone: polynomial in the length, then two one-sided squares, one that
-# resists stretching beyond a length and one that resists contraction beyond a length. Yield force of all
-# contacts: a constant, and shares of the two one-sided forces and of the polynomial. Free displacement.
-(
-    LEVEL,
-    SLOPE,
-    SQUARE,
-    CUBE,
-    STRETCH,
-    PRESS,
-    PRESS_FROM,
-    YIELD,
-    YIELD_STRETCH,
-    YIELD_PRESS,
-    YIELD_LOAD,
-    FREE,
-) = range(12)
-LAW_SIZE = 12
-
-# Coefficients, prepared once from the parameters. Those of the laws mean what the muscle's parameters say.
-(
-    KIND,
-    STEP,
-    REST_LENGTH,
-    REST,
-    SERIES_COMPLIANCE,
-    FORCE_LIMIT,
-    FORCE_STEP,
-    LENGTH_STEP,
-    DRIVE_STEP,
-    BASE,
-    GAIN,
-    BAND,
-    DECAY,
-    FAN_DECAY,
-    FAN_SHARE,
-    OFFSET_DECAY,
-    OFFSET_KICK,
-    OFFSET_GAIN,
-    ARM,
-    ARM_TIME,
-    FRICTION,
-    FRICTION_STRETCH,
-    FRICTION_PRESS,
-    FRICTION_DRIVE,
-    SLIP,
-    PRESSURE_AREA,
-    THREAD_LENGTH,
-    BLADDER,
-    BLADDER_CUBE,
-    JAM,
-    COLD_STIFFNESS,
-    HOT_STIFFNESS,
-    SOFTENING,
-    SOFTENING_WIDTH,
-    EXPANSION,
-    EXPANSION_ABOVE,
-    CONTACT,
-    CONTACT_AT,
-) = range(38)
-COEFFICIENT_SIZE = 38
 
 # A tension counts as found this close, N, and the search never leaves this share of the resting length.
 TENSION_TOLERANCE = 1e-10
@@ -103,17 +58,39 @@ _MOST_TRIALS = 200
 _RELAXED = 1e-12
 
 Floats = NDArray[np.float64]
+Record = Any
+"""A record of one of the types above."""
+
+
+class Parts(NamedTuple):
+    """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place.
+
+    Attributes
+    ----------
+    state, law, c : record
+        State, law at the present drive, and coefficients.
+    contacts : ndarray
+        Contact table, three rows.
+    forces : ndarray
+        Forces of the contacts, N.
+    """
+
+    state: Record
+    law: Record
+    c: Record
+    contacts: Floats
+    forces: Floats
 
 
 @njit(cache=True)
-def expansion(temperature: float, c: Floats) -> float:
+def expansion(temperature: float, c: Record) -> float:
     """Contraction of the unloaded coiled muscle, mm, from 0 °C on; steeper above the softening temperature.
 
     Parameters
     ----------
     temperature : float
         Temperature, °C.
-    c : ndarray
+    c : record
         Coefficients.
 
     Returns
@@ -121,61 +98,62 @@ def expansion(temperature: float, c: Floats) -> float:
     float
         Contraction, mm; rises with temperature.
     """
-    above = (temperature - c[SOFTENING]) / c[SOFTENING_WIDTH]
+    above = (temperature - c.softening) / c.softening_width
     # log(1 + exp(above)) without overflow.
     soft = max(above, 0.0) + math.log1p(math.exp(-abs(above)))
-    contraction: float = c[EXPANSION] * temperature + c[EXPANSION_ABOVE] * c[SOFTENING_WIDTH] * soft
+    contraction: float = c.expansion * temperature + c.expansion_above * c.softening_width * soft
     return contraction
 
 
 @njit(cache=True)
-def law_at(drive: float, c: Floats, law: Floats) -> None:
+def law_at(drive: float, c: Record, law: Record) -> None:
     """Write the muscle's law at one value of its drive.
 
     Parameters
     ----------
     drive : float
         Pressure (bar) or temperature (°C).
-    c : ndarray
+    c : record
         Coefficients.
-    law : ndarray
+    law : record
         Written to.
     """
-    law[:] = 0.0
-    if c[KIND] == PNEUMATIC:
-        per_area = c[PRESSURE_AREA] * drive
-        rest = c[REST_LENGTH]
-        law[LEVEL] = per_area * (3.0 * rest * rest - c[THREAD_LENGTH] * c[THREAD_LENGTH])
-        law[SLOPE] = 6.0 * per_area * rest + c[BLADDER]
-        law[SQUARE] = 3.0 * per_area
-        law[CUBE] = c[BLADDER_CUBE]
-        law[STRETCH] = c[JAM]
-        law[YIELD] = c[FRICTION] + c[FRICTION_DRIVE] * drive
-        law[YIELD_STRETCH] = c[FRICTION_STRETCH]
-        law[FREE] = c[SLIP] * drive
+    law.square = law.cube = law.stretch = law.press = law.press_from = 0.0
+    law.yield_stretch = law.yield_press = law.yield_load = 0.0
+    if c.pneumatic:
+        per_area = c.pressure_area * drive
+        rest = c.rest_length
+        law.level = per_area * (3.0 * rest * rest - c.thread_length * c.thread_length)
+        law.slope = 6.0 * per_area * rest + c.bladder
+        law.square = 3.0 * per_area
+        law.cube = c.bladder_cube
+        law.stretch = c.jam
+        law.yielding = c.friction + c.friction_drive * drive
+        law.yield_stretch = c.friction_stretch
+        law.free = c.slip * drive
     else:
-        cold = 1.0 / (1.0 + math.exp(min((drive - c[SOFTENING]) / c[SOFTENING_WIDTH], 700.0)))
-        stiffness = c[HOT_STIFFNESS] + (c[COLD_STIFFNESS] - c[HOT_STIFFNESS]) * cold
-        contraction = expansion(drive, c) - expansion(c[BASE], c)
-        law[LEVEL] = stiffness * contraction
-        law[SLOPE] = stiffness
-        law[PRESS] = c[CONTACT]
-        law[PRESS_FROM] = c[CONTACT_AT]
-        law[YIELD] = c[FRICTION] * stiffness / c[COLD_STIFFNESS]
-        law[YIELD_PRESS] = c[FRICTION_PRESS]
-        law[YIELD_LOAD] = c[FRICTION_DRIVE]
-        law[FREE] = c[SLIP] * contraction
+        cold = 1.0 / (1.0 + math.exp(min((drive - c.softening) / c.softening_width, 700.0)))
+        stiffness = c.hot_stiffness + (c.cold_stiffness - c.hot_stiffness) * cold
+        contraction = expansion(drive, c) - expansion(c.base, c)
+        law.level = stiffness * contraction
+        law.slope = stiffness
+        law.press = c.contact
+        law.press_from = c.contact_at
+        law.yielding = c.friction * stiffness / c.cold_stiffness
+        law.yield_press = c.friction_press
+        law.yield_load = c.friction_drive
+        law.free = c.slip * contraction
 
 
 @njit(cache=True)
-def backbone(length: float, law: Floats) -> tuple[float, float, float, float]:
+def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
     """Tension of the elastic backbone and yield force of all contacts together.
 
     Parameters
     ----------
     length : float
         Length, mm.
-    law : ndarray
+    law : record
         Law at the present drive.
 
     Returns
@@ -183,41 +161,42 @@ def backbone(length: float, law: Floats) -> tuple[float, float, float, float]:
     tuple of float
         Tension (N) and its slope (N/mm), yield force and its slope; the tension rises with the length.
     """
-    smooth = law[LEVEL] + length * (law[SLOPE] + length * (law[SQUARE] + length * law[CUBE]))
-    smooth_slope = law[SLOPE] + length * (2.0 * law[SQUARE] + 3.0 * length * law[CUBE])
+    smooth = law.level + length * (law.slope + length * (law.square + length * law.cube))
+    smooth_slope = law.slope + length * (2.0 * law.square + 3.0 * length * law.cube)
     beyond = max(length, 0.0)
-    short = max(law[PRESS_FROM] - length, 0.0)
-    stretch = law[STRETCH] * beyond * beyond
-    stretch_slope = 2.0 * law[STRETCH] * beyond
-    press = law[PRESS] * short * short
-    press_slope = -2.0 * law[PRESS] * short
-    yielding = law[YIELD] + law[YIELD_STRETCH] * stretch + law[YIELD_PRESS] * press
-    yielding_slope = law[YIELD_STRETCH] * stretch_slope + law[YIELD_PRESS] * press_slope
+    short = max(law.press_from - length, 0.0)
+    stretch = law.stretch * beyond * beyond
+    stretch_slope = 2.0 * law.stretch * beyond
+    press = law.press * short * short
+    press_slope = -2.0 * law.press * short
+    yielding = law.yielding + law.yield_stretch * stretch + law.yield_press * press
+    yielding_slope = law.yield_stretch * stretch_slope + law.yield_press * press_slope
     if smooth > 0.0:
-        yielding += law[YIELD_LOAD] * smooth
-        yielding_slope += law[YIELD_LOAD] * smooth_slope
+        yielding += law.yield_load * smooth
+        yielding_slope += law.yield_load * smooth_slope
     return smooth + stretch - press, smooth_slope + stretch_slope - press_slope, yielding, yielding_slope
 
 
 @njit(cache=True)
-def tension(length: float, state: Floats, law: Floats, contacts: Floats, forces: Floats) -> tuple[float, float]:
+def tension(length: float, parts: Parts) -> tuple[float, float]:
     """Tension of a trial from the committed state.
 
     Parameters
     ----------
     length : float
         Length of the trial, mm.
-    state, law, contacts, forces : ndarray
-        Committed state, law at the trial's drive, contact table and committed forces of the contacts, N.
+    parts : Parts
+        With the law at the trial's drive, and the committed state and forces; nothing is changed.
 
     Returns
     -------
     tuple of float
         Tension, N, and its slope, N/mm.
     """
+    state, law, contacts, forces = parts.state, parts.law, parts.contacts, parts.forces
     total, slope, yielding, yielding_slope = backbone(length, law)
-    moved = length - state[LENGTH]
-    freed = law[FREE] - state[FREED]
+    moved = length - state.length
+    freed = law.free - state.freed
     for i in range(forces.size):
         trial = forces[i] + contacts[STIFFNESS, i] * (moved - contacts[SHARE, i] * freed)
         most = contacts[WEIGHT, i] * yielding
@@ -234,9 +213,7 @@ def tension(length: float, state: Floats, law: Floats, contacts: Floats, forces:
 
 
 @njit(cache=True)
-def solve_length(
-    clamped: bool, target: float, state: Floats, c: Floats, law: Floats, contacts: Floats, forces: Floats
-) -> float:
+def solve_length(clamped: bool, target: float, parts: Parts) -> float:
     """Find the length at which the tension is what the load or the held end asks for.
 
     The tension of a trial rises with its length, in smooth pieces: Newton's steps, inside an interval that
@@ -248,7 +225,7 @@ def solve_length(
         Whether the position is imposed; the load is otherwise.
     target : float
         Position, mm, or load, N.
-    state, c, law, contacts, forces : ndarray
+    parts : Parts
         See `tension`; nothing is changed.
 
     Returns
@@ -256,14 +233,15 @@ def solve_length(
     float
         Length, mm.
     """
-    length = float(state[LENGTH])
-    low = SHORTEST * c[REST_LENGTH]
-    high = LONGEST * c[REST_LENGTH]
+    c = parts.c
+    length = float(parts.state.length)
+    low = SHORTEST * c.rest_length
+    high = LONGEST * c.rest_length
     for _ in range(_MOST_TRIALS):
-        excess, slope = tension(length, state, law, contacts, forces)
+        excess, slope = tension(length, parts)
         if clamped:
-            excess -= (target + c[REST] - length) / c[SERIES_COMPLIANCE]
-            slope += 1.0 / c[SERIES_COMPLIANCE]
+            excess -= (target + c.rest - length) / c.series_compliance
+            slope += 1.0 / c.series_compliance
         else:
             excess -= target
         if abs(excess) <= TENSION_TOLERANCE:
@@ -282,52 +260,40 @@ def solve_length(
 
 
 @njit(cache=True)
-def settle(
-    clamped: bool, target: float, state: Floats, c: Floats, law: Floats, contacts: Floats, forces: Floats
-) -> None:
+def settle(clamped: bool, target: float, parts: Parts) -> None:
     """Find the equilibrium at the law's drive and take it over.
 
     Parameters
     ----------
     clamped, target
         See `solve_length`.
-    state, forces : ndarray
-        Changed in place.
-    c, law, contacts : ndarray
-        See `tension`.
+    parts : Parts
+        State and forces are changed.
     """
-    length = solve_length(clamped, target, state, c, law, contacts, forces)
+    state, law, c, contacts, forces = parts
+    length = solve_length(clamped, target, parts)
     force = target
     if clamped:
-        force = (target + c[REST] - length) / c[SERIES_COMPLIANCE]
-        if force < 0.0 or force > c[FORCE_LIMIT]:
+        force = (target + c.rest - length) / c.series_compliance
+        if force < 0.0 or force > c.force_limit:
             # Slack, or stretched further than can be.
-            force = 0.0 if force < 0.0 else c[FORCE_LIMIT]
-            length = solve_length(False, force, state, c, law, contacts, forces)
+            force = 0.0 if force < 0.0 else c.force_limit
+            length = solve_length(False, force, parts)
     yielding = backbone(length, law)[2]
-    moved = length - state[LENGTH]
-    freed = law[FREE] - state[FREED]
+    moved = length - state.length
+    freed = law.free - state.freed
     for i in range(forces.size):
         trial = forces[i] + contacts[STIFFNESS, i] * (moved - contacts[SHARE, i] * freed)
         most = contacts[WEIGHT, i] * yielding
         forces[i] = min(max(trial, -most), most)
-    state[LENGTH] = length
-    state[FORCE] = force
-    state[FREED] = law[FREE]
-    state[POSITION] = target if clamped else length - c[REST] + force * c[SERIES_COMPLIANCE]
+    state.length = length
+    state.force = force
+    state.freed = law.free
+    state.position = target if clamped else length - c.rest + force * c.series_compliance
 
 
 @njit(cache=True)
-def carry(
-    clamped: bool,
-    target: float,
-    seconds: float,
-    state: Floats,
-    c: Floats,
-    law: Floats,
-    contacts: Floats,
-    forces: Floats,
-) -> None:
+def carry(clamped: bool, target: float, seconds: float, parts: Parts) -> None:
     """Go to an equilibrium while the Maxwell arm relaxes for some time: exact for a length that moves evenly.
 
     Parameters
@@ -336,77 +302,71 @@ def carry(
         See `solve_length`.
     seconds : float
         Time that passes, s; 0 for a move at once.
-    state, c, law, contacts, forces : ndarray
-        See `settle`; the arm is added to `law`.
+    parts : Parts
+        See `settle`; the arm is added to the law.
     """
-    if c[ARM] == 0.0:
-        settle(clamped, target, state, c, law, contacts, forces)
+    state, law, c = parts.state, parts.law, parts.c
+    if c.arm == 0.0:
+        settle(clamped, target, parts)
         return
     left = 1.0
     mean = 1.0
     if seconds > 0.0:
-        left = math.exp(-seconds / c[ARM_TIME])
-        mean = -math.expm1(-seconds / c[ARM_TIME]) * c[ARM_TIME] / seconds
-    before = float(state[LENGTH])
-    kept = state[RELAXING] * left
-    law[LEVEL] += kept - c[ARM] * mean * before
-    law[SLOPE] += c[ARM] * mean
-    settle(clamped, target, state, c, law, contacts, forces)
-    arm = kept + c[ARM] * mean * (state[LENGTH] - before)
-    state[RELAXING] = arm if abs(arm) > _RELAXED else 0.0
+        left = math.exp(-seconds / c.arm_time)
+        mean = -math.expm1(-seconds / c.arm_time) * c.arm_time / seconds
+    before = float(state.length)
+    kept = state.relaxing * left
+    law.level += kept - c.arm * mean * before
+    law.slope += c.arm * mean
+    settle(clamped, target, parts)
+    arm = kept + c.arm * mean * (state.length - before)
+    state.relaxing = arm if abs(arm) > _RELAXED else 0.0
 
 
 @njit(cache=True)
-def load_to(load: float, state: Floats, c: Floats, law: Floats, contacts: Floats, forces: Floats) -> None:
+def load_to(load: float, parts: Parts) -> None:
     """Move the imposed force at a constant drive, at once, in sub-steps.
 
     Parameters
     ----------
     load : float
         Force to reach, N.
-    state, c, law, contacts, forces : ndarray
+    parts : Parts
         See `carry`.
     """
-    begin = state[FORCE]
-    steps = math.ceil(abs(load - begin) / c[FORCE_STEP])
+    state, law, c = parts.state, parts.law, parts.c
+    begin = state.force
+    steps = math.ceil(abs(load - begin) / c.force_step)
     for k in range(1, steps + 1):
-        law_at(state[DRIVE], c, law)
-        carry(False, begin + (load - begin) * k / steps, 0.0, state, c, law, contacts, forces)
+        law_at(state.drive, c, law)
+        carry(False, begin + (load - begin) * k / steps, 0.0, parts)
     # A slack end comes back to the muscle without any change of force.
-    state[FORCE] = load
-    state[POSITION] = state[LENGTH] - c[REST] + load * c[SERIES_COMPLIANCE]
+    state.force = load
+    state.position = state.length - c.rest + load * c.series_compliance
 
 
 @njit(cache=True)
-def stretch_to(position: float, state: Floats, c: Floats, law: Floats, contacts: Floats, forces: Floats) -> None:
+def stretch_to(position: float, parts: Parts) -> None:
     """Move the imposed position at a constant drive, at once, in sub-steps.
 
     Parameters
     ----------
     position : float
         Position to reach, mm.
-    state, c, law, contacts, forces : ndarray
+    parts : Parts
         See `carry`.
     """
-    begin = state[POSITION]
-    steps = math.ceil(abs(position - begin) / c[LENGTH_STEP])
+    state, law, c = parts.state, parts.law, parts.c
+    begin = state.position
+    steps = math.ceil(abs(position - begin) / c.length_step)
     for k in range(1, steps + 1):
-        law_at(state[DRIVE], c, law)
-        carry(True, begin + (position - begin) * k / steps, 0.0, state, c, law, contacts, forces)
-    state[POSITION] = position
+        law_at(state.drive, c, law)
+        carry(True, begin + (position - begin) * k / steps, 0.0, parts)
+    state.position = position
 
 
 @njit(cache=True)
-def drive_to(
-    drive: float,
-    seconds: float,
-    clamped: bool,
-    state: Floats,
-    c: Floats,
-    law: Floats,
-    contacts: Floats,
-    forces: Floats,
-) -> None:
+def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
     """Move pressure or temperature at constant load or at constant position, in sub-steps.
 
     Parameters
@@ -417,63 +377,56 @@ def drive_to(
         Time that it takes, s.
     clamped : bool
         Whether the position is held; the load is otherwise.
-    state, c, law, contacts, forces : ndarray
+    parts : Parts
         See `carry`.
     """
-    begin = state[DRIVE]
-    if drive == begin and state[RELAXING] == 0.0:
+    state, law, c = parts.state, parts.law, parts.c
+    begin = state.drive
+    if drive == begin and state.relaxing == 0.0:
         return
-    target = state[POSITION] if clamped else state[FORCE]
-    steps = max(math.ceil(abs(drive - begin) / c[DRIVE_STEP]), 1)
+    target = state.position if clamped else state.force
+    steps = max(math.ceil(abs(drive - begin) / c.drive_step), 1)
     for k in range(1, steps + 1):
         law_at(begin + (drive - begin) * k / steps, c, law)
-        carry(clamped, target, seconds / steps, state, c, law, contacts, forces)
-    state[DRIVE] = drive
+        carry(clamped, target, seconds / steps, parts)
+    state.drive = drive
 
 
 @njit(cache=True)
-def next_drive(state: Floats, command: Floats, c: Floats) -> float:
+def next_drive(state: Record, command: Floats, c: Record) -> float:
     """Pressure or temperature after one grid step: exact for a constant command.
 
     Parameters
     ----------
-    state : ndarray
-        State; the regulator's aim is changed in place.
-    command, c : ndarray
-        Command and coefficients.
+    state, c : record
+        State, in which the regulator's aim is changed, and coefficients.
+    command : ndarray
+        Command.
 
     Returns
     -------
     float
         Pressure, bar, or temperature, °C.
     """
-    decay = c[DECAY]
-    if c[KIND] == PNEUMATIC:
-        wanted = c[GAIN] * command[VOLTAGE]
-        state[SETTING] = min(max(state[SETTING], wanted - c[BAND]), wanted + c[BAND])
-        steady = max(state[SETTING] + state[OFFSET], 0.0)
-        if command[FAN] != 0.0 and steady < state[DRIVE]:
-            decay = c[FAN_DECAY]
+    decay = c.decay
+    if c.pneumatic:
+        wanted = c.gain * command[VOLTAGE]
+        state.setting = min(max(state.setting, wanted - c.band), wanted + c.band)
+        steady = max(state.setting + state.offset, 0.0)
+        if command[FAN] != 0.0 and steady < state.drive:
+            decay = c.fan_decay
     else:
-        rise = c[GAIN] * (1.0 + c[OFFSET_GAIN] * state[OFFSET]) * command[VOLTAGE] * command[VOLTAGE]
+        rise = c.gain * (1.0 + c.offset_gain * state.offset) * command[VOLTAGE] * command[VOLTAGE]
         if command[FAN] != 0.0:
-            rise *= c[FAN_SHARE]
-            decay = c[FAN_DECAY]
-        steady = c[BASE] + state[OFFSET] + rise
-    after: float = steady + (state[DRIVE] - steady) * decay
+            rise *= c.fan_share
+            decay = c.fan_decay
+        steady = c.base + state.offset + rise
+    after: float = steady + (state.drive - steady) * decay
     return after
 
 
 @njit(cache=True)
-def advance_steps(
-    normals: Floats,
-    state: Floats,
-    command: Floats,
-    c: Floats,
-    law: Floats,
-    contacts: Floats,
-    forces: Floats,
-) -> None:
+def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each element of `normals`.
 
     The mechanical command is carried out first, at the drive of the step before, and then the drive moves.
@@ -482,21 +435,24 @@ def advance_steps(
     ----------
     normals : ndarray
         Standard normal numbers, one a step: the deviation of supply or room.
-    state, command, c, law, contacts, forces : ndarray
-        See the functions above; `state`, `law` and `forces` are changed in place.
+    command : ndarray
+        Command.
+    parts : Parts
+        See `carry`.
     """
+    state, c = parts.state, parts.c
     clamped = command[CLAMPED] != 0.0
     for row in range(normals.size):
         if clamped:
-            stretch_to(command[PLACE], state, c, law, contacts, forces)
+            stretch_to(command[PLACE], parts)
         else:
-            load_to(command[LOAD], state, c, law, contacts, forces)
-        state[OFFSET] = c[OFFSET_DECAY] * state[OFFSET] + c[OFFSET_KICK] * normals[row]
-        drive_to(next_drive(state, command, c), c[STEP], clamped, state, c, law, contacts, forces)
+            load_to(command[LOAD], parts)
+        state.offset = c.offset_decay * state.offset + c.offset_kick * normals[row]
+        drive_to(next_drive(state, command, c), c.step, clamped, parts)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MuscleParameters:
+class MuscleParameters(PlantParameters):
     """Numbers that both muscles have; the defaults are theirs.
 
     Attributes
@@ -504,7 +460,7 @@ class MuscleParameters:
     contact_count : int
         Number of dry contacts, at least 1.
     specimen_seed : int
-        Seed of the contacts. The specimen is the same piece whatever the session's seed.
+        Seed of the contacts. The specimen does not depend on the session's seed.
     contact_stiffness : float
         Stiffness of all contacts together before any has slipped, N/m.
     contact_spread : float
@@ -528,13 +484,13 @@ class MuscleParameters:
     """
 
     contact_count: int = 40
-    specimen_seed: int = 2017
+    specimen_seed: Seed = 2017
     contact_stiffness: float
-    contact_spread: float
+    contact_spread: NotNegative
     rest_length: float
     series_stiffness: float = 20e3
     force_limit: float
-    pretension: float = 0.3
+    pretension: NotNegative = 0.3
     step: float = 0.1
     force_step: float = 0.1
     length_step: float = 0.1e-3
@@ -542,21 +498,8 @@ class MuscleParameters:
     maximum_voltage: float = 5.0
     resistance: float
 
-    # Parameters besides those listed that may be zero.
-    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ()
-    # Parameters that may have either sign.
-    _SIGNED: ClassVar[tuple[str, ...]] = ()
-
     def __post_init__(self) -> None:
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{name} must be finite, not {value}")
-            if name in ("contact_spread", "pretension", "specimen_seed", *self._NOT_NEGATIVE):
-                if not value >= 0:
-                    raise ValueError(f"{name} must not be negative, not {value}")
-            elif name not in self._SIGNED and not value > 0:
-                raise ValueError(f"{name} must be positive, not {value}")
+        super().__post_init__()
         if not self.pretension <= self.force_limit:
             raise ValueError(f"pretension must not exceed {self.force_limit:.4g} N, not {self.pretension} N")
         if not self.rated_voltage <= self.maximum_voltage:
@@ -585,21 +528,46 @@ def contact_table(parameters: MuscleParameters) -> Floats:
     return np.array([stiffness, weight / weight.sum(), share / share.mean()])
 
 
-def shared_coefficients(parameters: MuscleParameters) -> dict[int, float]:
-    """Return the coefficients that do not depend on the kind of muscle, by place."""
+def coefficients(parameters: MuscleParameters, deviation: float, time: float, **own: float) -> Record:
+    """Prepare the coefficients of the compiled loops.
+
+    Parameters
+    ----------
+    parameters : MuscleParameters
+        The numbers.
+    deviation, time : float
+        Standard deviation (bar or K) and correlation time (s) of supply or room.
+    **own : float
+        Coefficients of this kind of muscle by name; those that are left out are zero.
+
+    Returns
+    -------
+    record
+        `COEFFICIENTS`.
+    """
     p = parameters
-    values = dict.fromkeys(range(COEFFICIENT_SIZE), 0.0)
-    values[STEP] = p.step
-    values[REST_LENGTH] = p.rest_length / MILLIMETRE
-    values[SERIES_COMPLIANCE] = 1.0 / (p.series_stiffness * MILLIMETRE)
-    values[FORCE_LIMIT] = p.force_limit
-    values[FORCE_STEP] = p.force_step
-    values[LENGTH_STEP] = p.length_step / MILLIMETRE
-    values[ARM_TIME] = 1.0
-    return values
+    record = np.zeros(1, COEFFICIENTS)[0]
+    decay, kick = fluctuation(deviation, time, p.step)
+    values = {
+        "step": p.step,
+        "rest_length": p.rest_length / MILLIMETRE,
+        "series_compliance": 1.0 / (p.series_stiffness * MILLIMETRE),
+        "force_limit": p.force_limit,
+        "force_step": p.force_step,
+        "length_step": p.length_step / MILLIMETRE,
+        "arm_time": 1.0,
+        "offset_decay": decay,
+        "offset_kick": kick,
+    }
+    for name, value in (values | own).items():
+        record[name] = value
+    return record
 
 
-class FrictionMuscle(Muscle):
+M = TypeVar("M", bound=MuscleParameters)
+
+
+class FrictionMuscle(Muscle[M]):
     """A muscle with dry contacts, driven by pressure or temperature, that carries a load or is held.
 
     Each contact is a spring behind a slider (Iwan, Journal of Applied Mechanics 33, 1966): its force follows the
@@ -611,8 +579,8 @@ class FrictionMuscle(Muscle):
     ----------
     parameters : MuscleParameters
         The numbers.
-    coefficients : dict of int to float
-        Coefficients of the compiled loops, by place.
+    coefficients : record
+        Coefficients of the compiled loops.
     cold, rated : float
         Drive at 0 V and at the rated voltage: bar or °C.
     rng : numpy.random.Generator
@@ -621,31 +589,35 @@ class FrictionMuscle(Muscle):
 
     def __init__(
         self,
-        parameters: MuscleParameters,
-        coefficients: dict[int, float],
+        parameters: M,
+        coefficients: Record,
         cold: float,
         rated: float,
         rng: np.random.Generator,
     ) -> None:
         super().__init__(
-            parameters.step,
+            parameters,
             rng,
             maximum_voltage=parameters.maximum_voltage,
             resistance=parameters.resistance,
             largest_load=parameters.force_limit,
             reach=0.5 * parameters.rest_length,
         )
-        self._coefficients = np.array([coefficients[place] for place in range(COEFFICIENT_SIZE)])
-        self._contacts = contact_table(parameters)
-        self._forces = np.zeros(parameters.contact_count)
-        self._law = np.zeros(LAW_SIZE)
-        self._state = np.zeros(STATE_SIZE)
+        self._coefficients = coefficients
+        self._state = np.zeros(1, STATE)[0]
+        self._parts = Parts(
+            self._state,
+            np.zeros(1, LAW)[0],
+            coefficients,
+            contact_table(parameters),
+            np.zeros(parameters.contact_count),
+        )
         self._condition(parameters.pretension, cold, rated)
 
     @property
     def force(self) -> float:
         """Tension of the muscle, N."""
-        return float(self._state[FORCE])
+        return float(self._state["force"])
 
     @property
     def length(self) -> float:
@@ -653,31 +625,28 @@ class FrictionMuscle(Muscle):
 
         A slack muscle has the length that it has without tension.
         """
-        return float((self._state[LENGTH] - self._coefficients[REST]) * MILLIMETRE)
+        return float((self._state["length"] - self._coefficients["rest"]) * MILLIMETRE)
 
     @property
     def position(self) -> float:
         """Position of the moving end, m: elongation of muscle, frame and load cell; a servo imposes it."""
-        return float(self._state[POSITION] * MILLIMETRE)
+        return float(self._state["position"] * MILLIMETRE)
 
     def _take_steps(self, normals: Floats) -> None:
-        advance_steps(
-            normals, self._state, self._command, self._coefficients, self._law, self._contacts, self._forces
-        )
+        advance_steps(normals, self._command, self._parts)
 
     def _drive(self, drive: float, *, clamped: bool) -> None:
         """Move pressure or temperature so slowly that the Maxwell arm has no part in it."""
-        slowly = 1e6 * float(self._coefficients[ARM_TIME])
-        drive_to(drive, slowly, clamped, self._state, self._coefficients, self._law, self._contacts, self._forces)
+        drive_to(drive, 1e6 * float(self._coefficients["arm_time"]), clamped, self._parts)
 
     def _load(self, newton: float) -> None:
-        load_to(newton, self._state, self._coefficients, self._law, self._contacts, self._forces)
+        load_to(newton, self._parts)
 
     def _condition(self, pretension: float, cold: float, rated: float) -> None:
         """Train the muscle and find its resting length, outside time."""
-        self._state[DRIVE] = cold
-        law_at(cold, self._coefficients, self._law)
-        self._state[FREED] = self._law[FREE]
+        self._state["drive"] = cold
+        law_at(cold, self._coefficients, self._parts.law)
+        self._state["freed"] = self._parts.law["free"]
         self._load(pretension)
         self._drive(rated, clamped=False)
         self._drive(cold, clamped=False)
@@ -685,9 +654,9 @@ class FrictionMuscle(Muscle):
             self._drive(rated, clamped=True)
             self._drive(cold, clamped=True)
         self._load(0.0)
-        self._state[RELAXING] = 0.0
-        law_at(cold, self._coefficients, self._law)
-        settle(False, 0.0, self._state, self._coefficients, self._law, self._contacts, self._forces)
+        self._state["relaxing"] = 0.0
+        law_at(cold, self._coefficients, self._parts.law)
+        settle(False, 0.0, self._parts)
         # Lengths so far count from the muscle as made.
-        self._coefficients[REST] = self._state[LENGTH]
+        self._coefficients["rest"] = self._state["length"]
         self._load(0.0)

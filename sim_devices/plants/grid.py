@@ -4,40 +4,107 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections import namedtuple
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, ClassVar, Generic, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 # A grid point counts as reached this early (s), so that rounding in the caller's clock, even one that counts from
 # 1970, does not decide on which side of a call a step falls.
-_GRID_TOLERANCE = 5e-7
+GRID_TOLERANCE = 5e-7
 
 # Noise is drawn in blocks of this many grid steps.
 _NOISE_BLOCK = 4096
 
 
-class GridPlant(ABC):
-    """Counts grid steps and draws their noise; a plant says what one does.
+ABSOLUTE_ZERO = -273.15
+"""Absolute zero, °C."""
+
+
+NotNegative = Annotated[float, "zero or positive"]
+"""A parameter that may be zero."""
+
+Signed = Annotated[float, "signed"]
+"""A parameter of either sign."""
+
+Seed = Annotated[int, "zero or positive"]
+"""A seed of a specimen."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """Numbers that are finite, and positive unless their type says otherwise.
+
+    Raises
+    ------
+    ValueError
+        If a number is not allowed.
+    """
+
+    def __post_init__(self) -> None:
+        for name, hint in get_type_hints(type(self), include_extras=True).items():
+            value = getattr(self, name)
+            sign = getattr(hint, "__metadata__", ("positive",))[0]
+            if isinstance(value, float | int):
+                if not math.isfinite(value):
+                    raise ValueError(f"{name} must be finite, not {value}")
+                if (sign == "zero or positive" and value < 0) or (sign == "positive" and value <= 0):
+                    raise ValueError(f"{name} must be {sign}, not {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantParameters(Numbers):
+    """Numbers of a plant.
+
+    Attributes
+    ----------
+    step : float
+        Step of the time grid, s.
+    """
+
+    step: float
+
+
+P = TypeVar("P", bound=PlantParameters)
+
+
+class GridPlant(ABC, Generic[P]):
+    """Counts grid steps and draws their noise; subclasses define the step.
 
     Parameters
     ----------
-    step : float
-        Grid step, s.
+    parameters : PlantParameters
+        The numbers of the plant.
     rng : numpy.random.Generator
-        The session's randomness. A generator of the plant's own is spawned from it, so that nobody else's draws
-        change the plant, nor the plant's theirs.
+        The session's randomness. The plant spawns its own generator from it and never draws from `rng` itself, so
+        that other users of `rng` do not disturb the trajectory.
     noise_shape : tuple of int
         Shape of the standard normal numbers that one step takes.
     """
 
-    def __init__(self, step: float, rng: np.random.Generator, noise_shape: tuple[int, ...] = ()) -> None:
-        self._step = step
+    OUTPUTS: ClassVar[tuple[str, ...]]
+    """Names of the properties in a snapshot."""
+
+    def __init__(self, parameters: P, rng: np.random.Generator, noise_shape: tuple[int, ...] = ()) -> None:
+        self._parameters = parameters
+        self._step = parameters.step
         self._pending = 0.0
         (self._noise,) = rng.spawn(1)
         self._noise_shape = noise_shape
         self._normals = np.empty((0, *noise_shape))
         self._used = 0
+
+    @property
+    def parameters(self) -> P:
+        """The numbers of this plant."""
+        return self._parameters
+
+    def snapshot(self) -> tuple[float, ...]:
+        """Return all outputs at the present instant, as a named tuple."""
+        return _snapshot_type(self.OUTPUTS)(*(getattr(self, name) for name in self.OUTPUTS))
 
     def advance(self, dt: float) -> None:
         """Advance the plant in time.
@@ -56,7 +123,7 @@ class GridPlant(ABC):
         if not 0.0 <= dt < math.inf:
             raise ValueError(f"dt must be finite and not negative, not {dt} s")
         pending = self._pending + dt
-        due = math.floor((pending + _GRID_TOLERANCE) / self._step)
+        due = math.floor((pending + GRID_TOLERANCE) / self._step)
         self._pending = pending - due * self._step
         while due > 0:
             if self._used == self._normals.shape[0]:
@@ -72,27 +139,31 @@ class GridPlant(ABC):
         """Take as many grid steps as there are rows of noise."""
 
 
-def check_numbers(parameters: object, positive: Iterable[str], not_negative: Iterable[str]) -> None:
-    """Check that a plant's parameters are finite and of the sign that they must have.
+@cache
+def _snapshot_type(names: tuple[str, ...]) -> type[tuple[float, ...]]:
+    return namedtuple("Snapshot", names)  # the names are known at run time only
+
+
+def fluctuation(deviation: float, time: float, step: float) -> tuple[float, float]:
+    """Prepare a fluctuation with an exponential autocorrelation (Ornstein-Uhlenbeck) for a time grid.
 
     Parameters
     ----------
-    parameters : object
-        A dataclass of numbers.
-    positive, not_negative : iterable of str
-        Names of those that must be above zero, and of those that may be zero.
+    deviation : float
+        Standard deviation.
+    time, step : float
+        Correlation time and grid step, s.
 
-    Raises
-    ------
-    ValueError
-        If one is not.
+    Returns
+    -------
+    tuple of float
+        Share that remains after a step, and the factor of the standard normal number that is added.
     """
-    for name, value in vars(parameters).items():
-        if not math.isfinite(value):
-            raise ValueError(f"{name} must be finite, not {value}")
-    for name in positive:
-        if not getattr(parameters, name) > 0:
-            raise ValueError(f"{name} must be positive, not {getattr(parameters, name)}")
-    for name in not_negative:
-        if not getattr(parameters, name) >= 0:
-            raise ValueError(f"{name} must not be negative, not {getattr(parameters, name)}")
+    decay = math.exp(-step / time)
+    return decay, deviation * math.sqrt(1.0 - decay**2)
+
+
+def check_temperature(name: str, celsius: float) -> None:
+    """Raise `ValueError` unless a number is a temperature, °C."""
+    if not ABSOLUTE_ZERO < celsius < math.inf:
+        raise ValueError(f"{name} must be a temperature above absolute zero, not {celsius} °C")

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from sim_devices.plants import friction_muscle as kernels
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters
+from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
+from sim_devices.plants.grid import NotNegative
 from sim_devices.plants.muscle import MILLIMETRE
 
 _BAR = 1e5
@@ -81,30 +80,19 @@ class McKibbenParameters(MuscleParameters):
     thread_length: float = 131e-3
     turns: float = 3.5
     bladder_stiffness: float = 300.0
-    bladder_cube: float = 0.12e6
-    jam: float = 0.22e6
-    friction: float = 0.2
-    friction_coefficient: float = 0.0025
-    friction_jam: float = 0.08
-    slip: float = 1.5e-8
+    bladder_cube: NotNegative = 0.12e6
+    jam: NotNegative = 0.22e6
+    friction: NotNegative = 0.2
+    friction_coefficient: NotNegative = 0.0025
+    friction_jam: NotNegative = 0.08
+    slip: NotNegative = 1.5e-8
     pressure_gain: float = 0.5e5
-    pressure_band: float = 1.25e3
+    pressure_band: NotNegative = 1.25e3
     time_constant: float = 0.3
     exhaust_time_constant: float = 0.1
     pressure_step: float = 2e3
-    supply_sd: float = 0.0
+    supply_sd: NotNegative = 0.0
     supply_time: float = 10.0
-
-    _NOT_NEGATIVE: ClassVar[tuple[str, ...]] = (
-        "bladder_cube",
-        "jam",
-        "friction",
-        "friction_coefficient",
-        "friction_jam",
-        "slip",
-        "pressure_band",
-        "supply_sd",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,34 +118,7 @@ class McKibbenParameters(MuscleParameters):
         return math.pi * self.braid_diameter * self.rest_length
 
 
-class McKibbenSnapshot(NamedTuple):
-    """Every output of the plant at one instant.
-
-    Attributes
-    ----------
-    pressure : float
-        Gauge pressure in the muscle, Pa.
-    voltage : float
-        Voltage that sets the regulator, V.
-    current : float
-        Current into the regulator's input, A.
-    force : float
-        Tension of the muscle, N.
-    length : float
-        Elongation of the muscle from its resting length, m; contraction is negative.
-    position : float
-        Position of the moving end, m: elongation of muscle, frame and load cell.
-    """
-
-    pressure: float
-    voltage: float
-    current: float
-    force: float
-    length: float
-    position: float
-
-
-class McKibbenMuscle(FrictionMuscle):
+class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
     """Length and force of a braided pneumatic muscle, advanced in time.
 
     At gauge pressure p and braid length L the tension is::
@@ -182,53 +143,39 @@ class McKibbenMuscle(FrictionMuscle):
         The session's randomness: the regulator's supply. The plant spawns its own generator from it.
     """
 
+    OUTPUTS = ("pressure", "voltage", "current", "force", "length", "position")
+
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
-        self._parameters = parameters
         rated = parameters.pressure_gain * parameters.rated_voltage / _BAR
         super().__init__(parameters, _coefficients(parameters), 0.0, rated, rng)
-        self._state[kernels.OFFSET] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
-
-    @property
-    def parameters(self) -> McKibbenParameters:
-        """The numbers of this plant."""
-        return self._parameters
+        self._state["offset"] = parameters.supply_sd / _BAR * float(self._noise.standard_normal())
 
     @property
     def pressure(self) -> float:
         """Gauge pressure in the muscle, Pa; 1.5 bar at 3 V."""
-        return float(self._state[kernels.DRIVE] * _BAR)
-
-    def snapshot(self) -> McKibbenSnapshot:
-        """Take all outputs at the present instant.
-
-        Returns
-        -------
-        McKibbenSnapshot
-            The outputs.
-        """
-        return McKibbenSnapshot._make(getattr(self, name) for name in McKibbenSnapshot._fields)
+        return float(self._state["drive"] * _BAR)
 
 
-def _coefficients(parameters: McKibbenParameters) -> dict[int, float]:
+def _coefficients(parameters: McKibbenParameters) -> Record:
     """Prepare the numbers that the compiled loops need every step."""
     p = parameters
-    supply_decay = math.exp(-p.step / p.supply_time)
-    return kernels.shared_coefficients(p) | {
-        kernels.KIND: kernels.PNEUMATIC,
-        kernels.DRIVE_STEP: p.pressure_step / _BAR,
-        kernels.GAIN: p.pressure_gain / _BAR,
-        kernels.BAND: p.pressure_band / _BAR,
-        kernels.DECAY: math.exp(-p.step / p.time_constant),
-        kernels.FAN_DECAY: math.exp(-p.step / p.exhaust_time_constant),
-        kernels.OFFSET_DECAY: supply_decay,
-        kernels.OFFSET_KICK: p.supply_sd / _BAR * math.sqrt(1.0 - supply_decay**2),
-        kernels.FRICTION: p.friction,
-        kernels.FRICTION_STRETCH: p.friction_jam,
-        kernels.FRICTION_DRIVE: p.friction_coefficient * p.braid_surface * _BAR,
-        kernels.SLIP: p.slip * _BAR / MILLIMETRE,
-        kernels.PRESSURE_AREA: _BAR_NEWTON / (4.0 * math.pi * p.turns**2),
-        kernels.THREAD_LENGTH: p.thread_length / MILLIMETRE,
-        kernels.BLADDER: p.bladder_stiffness * MILLIMETRE,
-        kernels.BLADDER_CUBE: p.bladder_cube * MILLIMETRE**3,
-        kernels.JAM: p.jam * MILLIMETRE**2,
-    }
+    return coefficients(
+        p,
+        p.supply_sd / _BAR,
+        p.supply_time,
+        pneumatic=1.0,
+        drive_step=p.pressure_step / _BAR,
+        gain=p.pressure_gain / _BAR,
+        band=p.pressure_band / _BAR,
+        decay=math.exp(-p.step / p.time_constant),
+        fan_decay=math.exp(-p.step / p.exhaust_time_constant),
+        friction=p.friction,
+        friction_stretch=p.friction_jam,
+        friction_drive=p.friction_coefficient * p.braid_surface * _BAR,
+        slip=p.slip * _BAR / MILLIMETRE,
+        pressure_area=_BAR_NEWTON / (4.0 * math.pi * p.turns**2),
+        thread_length=p.thread_length / MILLIMETRE,
+        bladder=p.bladder_stiffness * MILLIMETRE,
+        bladder_cube=p.bladder_cube * MILLIMETRE**3,
+        jam=p.jam * MILLIMETRE**2,
+    )

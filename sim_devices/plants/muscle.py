@@ -1,10 +1,10 @@
-"""What every muscle is told: a voltage, the fan, and a load to carry or a length to be held at."""
+"""The commands of every muscle: a voltage, the fan, and a load to carry or a length to be held at."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sim_devices.plants.grid import GridPlant
+from sim_devices.plants.grid import GridPlant, P
 
 MILLIMETRE = 1e-3
 
@@ -13,7 +13,7 @@ VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
 COMMAND_SIZE = 5
 
 
-class Muscle(GridPlant):
+class Muscle(GridPlant[P]):
     """A muscle that a voltage drives, and that carries a load or is held.
 
     The muscle's lower end carries a dead load (`hang`: the force is imposed, the length follows) or is held by a
@@ -31,7 +31,7 @@ class Muscle(GridPlant):
 
     Parameters
     ----------
-    step, rng
+    parameters, rng
         See `GridPlant`.
     maximum_voltage : float
         Highest voltage, V.
@@ -45,7 +45,7 @@ class Muscle(GridPlant):
 
     def __init__(
         self,
-        step: float,
+        parameters: P,
         rng: np.random.Generator,
         *,
         maximum_voltage: float,
@@ -53,7 +53,7 @@ class Muscle(GridPlant):
         largest_load: float,
         reach: float,
     ) -> None:
-        super().__init__(step, rng)
+        super().__init__(parameters, rng)
         self._maximum_voltage = maximum_voltage
         self._resistance = resistance
         self._largest_load = largest_load

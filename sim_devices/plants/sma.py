@@ -16,13 +16,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.plants import _sma_kernels as kernels
-from sim_devices.plants.grid import check_numbers
+from sim_devices.plants.grid import NotNegative, PlantParameters, Seed, Signed, check_temperature, fluctuation
 from sim_devices.plants.muscle import MILLIMETRE, Muscle
 
 _MEGAPASCAL = 1e6
@@ -34,46 +33,9 @@ _LEAST_SLOPE = 1.0
 _LEAST_DETWIN = 5.0
 _RETWIN_GAP = 10.0
 
-_POSITIVE = (
-    "grain_count",
-    "austenite_finish",
-    "width",
-    "slope",
-    "unoriented_share",
-    "martensite_modulus",
-    "austenite_modulus",
-    "rest_length",
-    "diameter",
-    "series_stiffness",
-    "stress_limit",
-    "step",
-    "time_constant",
-    "fan_time_constant",
-    "rise",
-    "rated_voltage",
-    "maximum_voltage",
-    "resistance",
-    "ambient_time",
-    "temperature_step",
-    "stress_step",
-    "length_step",
-)
-_NOT_NEGATIVE = (
-    "austenite_finish_spread",
-    "width_spread",
-    "slope_spread",
-    "detwin_spread",
-    "orient_spread",
-    "retwin_spread",
-    "expansion",
-    "transformation_strain",
-    "pretension",
-    "ambient_sd",
-)
 
-
-@dataclass(frozen=True)
-class SMAParameters:
+@dataclass(frozen=True, kw_only=True)
+class SMAParameters(PlantParameters):
     """Every number of the plant.
 
     The values that come from the paper are the wire's length and diameter, the rated voltage, the time
@@ -84,7 +46,7 @@ class SMAParameters:
     grain_count : int
         Number of grains; at least 1.
     specimen_seed : int
-        Seed of the grains. The specimen is the same piece whatever the session's seed.
+        Seed of the grains. The specimen does not depend on the session's seed.
     austenite_finish, austenite_finish_spread : float
         Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes
         austenite.
@@ -147,47 +109,47 @@ class SMAParameters:
     """
 
     grain_count: int = 2000
-    specimen_seed: int = 2017
+    specimen_seed: Seed = 2017
     austenite_finish: float = 48.0
-    austenite_finish_spread: float = 15.0
+    austenite_finish_spread: NotNegative = 15.0
     width: float = 11.0
-    width_spread: float = 3.0
+    width_spread: NotNegative = 3.0
     slope: float = 7.0
-    slope_spread: float = 0.8
+    slope_spread: NotNegative = 0.8
     unoriented_share: float = 0.4
-    detwin: float = 110.0
-    detwin_spread: float = 60.0
-    orient: float = -5.0
-    orient_spread: float = 60.0
-    orient_correlation: float = 0.6
-    retwin: float = -40.0
-    retwin_spread: float = 35.0
+    detwin: Signed = 110.0
+    detwin_spread: NotNegative = 60.0
+    orient: Signed = -5.0
+    orient_spread: NotNegative = 60.0
+    orient_correlation: Signed = 0.6
+    retwin: Signed = -40.0
+    retwin_spread: NotNegative = 35.0
     martensite_modulus: float = 28e9
     austenite_modulus: float = 55e9
-    transformation_strain: float = 0.045
-    expansion: float = 6.6e-6
+    transformation_strain: NotNegative = 0.045
+    expansion: NotNegative = 6.6e-6
     rest_length: float = 105e-3
     diameter: float = 0.20e-3
     series_stiffness: float = 20e3
     stress_limit: float = 600e6
-    pretension: float = 0.3
+    pretension: NotNegative = 0.3
     step: float = 0.1
     temperature_step: float = 1.0
     stress_step: float = 4e6
     length_step: float = 0.03e-3
-    ambient_temperature: float = 25.0
+    ambient_temperature: Signed = 25.0
     time_constant: float = 5.0
     fan_time_constant: float = 2.0
     rise: float = 85.0
     rated_voltage: float = 3.0
     maximum_voltage: float = 5.0
     resistance: float = 3.05
-    ambient_sd: float = 0.0
+    ambient_sd: NotNegative = 0.0
     ambient_time: float = 120.0
-    ambient_gain: float = 0.004
+    ambient_gain: Signed = 0.004
 
     def __post_init__(self) -> None:
-        check_numbers(self, _POSITIVE, _NOT_NEGATIVE)
+        super().__post_init__()
         if not self.unoriented_share <= 1.0:
             raise ValueError(f"unoriented_share must lie in (0, 1], not {self.unoriented_share}")
         if not -1.0 <= self.orient_correlation <= 1.0:
@@ -200,8 +162,7 @@ class SMAParameters:
             )
         if not self.pretension <= self.largest_load:
             raise ValueError(f"pretension must not exceed {self.largest_load:.4g} N, not {self.pretension} N")
-        if not self.ambient_temperature > -273.15:
-            raise ValueError(f"ambient_temperature must be above absolute zero, not {self.ambient_temperature} °C")
+        check_temperature("ambient_temperature", self.ambient_temperature)
 
     @property
     def area(self) -> float:
@@ -212,38 +173,6 @@ class SMAParameters:
     def largest_load(self) -> float:
         """Force at the stress limit, N."""
         return self.stress_limit * self.area
-
-
-class SMASnapshot(NamedTuple):
-    """Every output of the plant at one instant.
-
-    Attributes
-    ----------
-    temperature, ambient_temperature : float
-        Temperature of the wire and of the room, °C.
-    voltage : float
-        Effective heating voltage, V.
-    current : float
-        Current through the wire, A.
-    force : float
-        Tension of the wire, N.
-    length : float
-        Elongation of the wire from its resting length, m; contraction is negative.
-    position : float
-        Position of the moving end, m: elongation of wire, frame and load cell.
-    martensite_fraction, oriented_fraction : float
-        Share of martensite and of oriented martensite in the wire, in [0, 1].
-    """
-
-    temperature: float
-    ambient_temperature: float
-    voltage: float
-    current: float
-    force: float
-    length: float
-    position: float
-    martensite_fraction: float
-    oriented_fraction: float
 
 
 def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
@@ -276,7 +205,7 @@ def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
     )
 
 
-class SMAWire(Muscle):
+class SMAWire(Muscle[SMAParameters]):
     """Length and force of a shape-memory-alloy wire, advanced in time.
 
     Each grain follows, at temperature T and tensile stress s::
@@ -303,44 +232,45 @@ class SMAWire(Muscle):
         it and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
     """
 
+    OUTPUTS = (
+        "temperature",
+        "ambient_temperature",
+        "voltage",
+        "current",
+        "force",
+        "length",
+        "position",
+        "martensite_fraction",
+        "oriented_fraction",
+    )
+
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
         super().__init__(
-            parameters.step,
+            parameters,
             rng,
             maximum_voltage=parameters.maximum_voltage,
             resistance=parameters.resistance,
             largest_load=parameters.largest_load,
             reach=parameters.rest_length,
         )
-        self._parameters = parameters
         self._coefficients = _coefficients(parameters)
-        self._grains = grain_table(parameters)
-        self._martensite = np.zeros(parameters.grain_count, dtype=np.bool_)
-        self._oriented = np.zeros(parameters.grain_count, dtype=np.bool_)
-        self._scratch = np.empty((2, parameters.grain_count))
         self._state = np.zeros(kernels.STATE_SIZE)
+        self._parts = kernels.Parts(
+            self._state,
+            self._coefficients,
+            grain_table(parameters),
+            np.zeros(parameters.grain_count, dtype=np.bool_),
+            np.zeros(parameters.grain_count, dtype=np.bool_),
+            np.empty((2, parameters.grain_count)),
+        )
         self._condition()
 
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
         self._state[kernels.AMBIENT_OFFSET] = offset
         self._heat(parameters.ambient_temperature + offset, clamped=False)
 
-    @property
-    def parameters(self) -> SMAParameters:
-        """The numbers of this plant."""
-        return self._parameters
-
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
-        kernels.advance_steps(
-            normals,
-            self._state,
-            self._command,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-            self._scratch,
-        )
+        kernels.advance_steps(normals, self._command, self._parts)
 
     @property
     def temperature(self) -> float:
@@ -390,16 +320,6 @@ class SMAWire(Muscle):
         """Share of the wire that is oriented martensite, in [0, 1]."""
         return float(self._state[kernels.ORIENTED] / self._parameters.grain_count)
 
-    def snapshot(self) -> SMASnapshot:
-        """Take all outputs at the present instant.
-
-        Returns
-        -------
-        SMASnapshot
-            The outputs.
-        """
-        return SMASnapshot._make(getattr(self, name) for name in SMASnapshot._fields)
-
     def _condition(self) -> None:
         """Erase the memory, train the wire and find its resting length, outside time."""
         p = self._parameters
@@ -416,32 +336,16 @@ class SMAWire(Muscle):
         self._load(0.0)
 
     def _load(self, newton: float) -> None:
-        kernels.load_to(
-            newton / self._coefficients[kernels.AREA],
-            self._state,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-        )
+        kernels.load_to(newton / self._coefficients[kernels.AREA], self._parts)
 
     def _heat(self, celsius: float, clamped: bool) -> None:
-        kernels.heat_to(
-            celsius,
-            clamped,
-            self._state,
-            self._coefficients,
-            self._grains,
-            self._martensite,
-            self._oriented,
-            self._scratch,
-        )
+        kernels.heat_to(celsius, clamped, self._parts)
 
 
 def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
     """Prepare the numbers that the compiled loop needs every step."""
     p = parameters
-    ambient_decay = math.exp(-p.step / p.ambient_time)
+    ambient_decay, ambient_kick = fluctuation(p.ambient_sd, p.ambient_time, p.step)
     values = {
         kernels.AMBIENT: p.ambient_temperature,
         kernels.HEATING: p.rise / p.rated_voltage**2,
@@ -449,7 +353,7 @@ def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
         kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
         kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
         kernels.AMBIENT_DECAY: ambient_decay,
-        kernels.AMBIENT_KICK: p.ambient_sd * math.sqrt(1.0 - ambient_decay**2),
+        kernels.AMBIENT_KICK: ambient_kick,
         kernels.AMBIENT_GAIN: p.ambient_gain,
         kernels.AREA: p.area / MILLIMETRE**2,
         kernels.REST_LENGTH: p.rest_length / MILLIMETRE,

@@ -16,49 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
-from sim_devices.plants.grid import GridPlant, check_numbers
-
-_POSITIVE = (
-    "relay_count",
-    "major_width",
-    "minor_width",
-    "relay_step",
-    "beam_length",
-    "step",
-    "loop_frequency",
-    "slew_limit",
-    "seebeck",
-    "resistance",
-    "conductance",
-    "plate_capacity",
-    "sink_capacity",
-    "sink_resistance",
-    "current_lag",
-    "maximum_current",
-    "wander_time",
-    "drift_time",
-)
-_NOT_NEGATIVE = (
-    "major_spread",
-    "major_width_spread",
-    "minor_spread",
-    "minor_width_spread",
-    "coupling",
-    "plate_loss",
-    "wander_sd",
-    "drift_sd",
-)
+from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
+from sim_devices.plants.grid import NotNegative, Seed, Signed, check_temperature, fluctuation
 
 
-@dataclass(frozen=True)
-class VO2Parameters:
+@dataclass(frozen=True, kw_only=True)
+class VO2Parameters(CooledParameters):
     """Every number of the plant.
 
     The values that come from the paper are the beam length and the operating range that the rest was
@@ -70,7 +39,7 @@ class VO2Parameters:
     relay_count : int
         Number of hysteresis relays; at least 1.
     specimen_seed : int
-        Seed of the relay thresholds. The specimen is the same piece whatever the session's seed.
+        Seed of the relay thresholds. The specimen does not depend on the session's seed.
     correlation : float
         Correlation of threshold and width in normal scores, in (-1, 1).
     minor_share : float
@@ -142,93 +111,56 @@ class VO2Parameters:
     """
 
     relay_count: int = 16384
-    specimen_seed: int = 2013
-    correlation: float = -0.3
-    minor_share: float = 0.05
-    major_centre: float = 63.5
-    major_spread: float = 3.0
+    specimen_seed: Seed = 2013
+    correlation: Signed = -0.3
+    minor_share: Signed = 0.05
+    major_centre: Signed = 63.5
+    major_spread: NotNegative = 3.0
     major_width: float = 4.0
-    major_width_spread: float = 2.0
-    minor_centre: float = 62.0
-    minor_spread: float = 3.0
+    major_width_spread: NotNegative = 2.0
+    minor_centre: Signed = 62.0
+    minor_spread: NotNegative = 3.0
     minor_width: float = 14.0
-    minor_width_spread: float = 6.0
-    highest_threshold: float = 69.8
-    lowest_threshold: float = 30.2
-    coupling: float = 1.0
+    minor_width_spread: NotNegative = 6.0
+    highest_threshold: Signed = 69.8
+    lowest_threshold: Signed = 30.2
+    coupling: NotNegative = 1.0
     relay_step: float = 0.05
-    curvature_offset: float = 8.0
-    transition_curvature: float = 2034.0
-    cold_expansion: float = 3.05
-    hot_expansion: float = 4.25
-    expansion_reference: float = 20.0
+    curvature_offset: Signed = 8.0
+    transition_curvature: Signed = 2034.0
+    cold_expansion: Signed = 3.05
+    hot_expansion: Signed = 4.25
+    expansion_reference: Signed = 20.0
     beam_length: float = 300e-6
-    residual_curvature: float = 0.0
+    residual_curvature: Signed = 0.0
     step: float = 0.05
     loop_frequency: float = 2.2
-    loop_damping: float = 0.9
+    loop_damping: Signed = 0.9
     slew_limit: float = 15.0
-    ambient_temperature: float = 22.0
+    ambient_temperature: Signed = 22.0
     seebeck: float = 0.051
     resistance: float = 3.1
     conductance: float = 0.35
-    plate_loss: float = 0.01
+    plate_loss: NotNegative = 0.01
     plate_capacity: float = 2.2
     sink_capacity: float = 300.0
     sink_resistance: float = 0.4
     current_lag: float = 0.1
     maximum_current: float = 5.0
-    wander_sd: float = 0.03
+    wander_sd: NotNegative = 0.03
     wander_time: float = 5.0
-    drift_sd: float = 0.04
+    drift_sd: NotNegative = 0.04
     drift_time: float = 1800.0
-    session_offset: float = 0.0
+    session_offset: Signed = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers(self, _POSITIVE, _NOT_NEGATIVE)
+        super().__post_init__()
         if not 0.0 < self.loop_damping < 1.0:
             raise ValueError(f"loop_damping must lie in (0, 1), not {self.loop_damping}")
         if not -1.0 < self.correlation < 1.0:
             raise ValueError(f"correlation must lie in (-1, 1), not {self.correlation}")
         if not 0.0 <= self.minor_share <= 1.0:
             raise ValueError(f"minor_share must lie in [0, 1], not {self.minor_share}")
-        if not self.seebeck * self.maximum_current < self.conductance:
-            raise ValueError(
-                f"maximum_current must stay below the thermal runaway at "
-                f"{self.conductance / self.seebeck:.3g} A, not {self.maximum_current}"
-            )
-
-
-class VO2Snapshot(NamedTuple):
-    """Every output of the plant at one instant.
-
-    Attributes
-    ----------
-    plate_temperature, film_temperature, sink_temperature : float
-        Temperatures, °C.
-    plate_rate : float
-        Rate of the plate temperature, K/s.
-    current : float
-        Peltier current, A.
-    voltage : float
-        Voltage across the module, V.
-    r_fraction : float
-        Share of the film in the R phase, in [0, 1].
-    curvature : float
-        Curvature change of the beam, 1/m.
-    tip_deflection : float
-        Change of the tip deflection, m.
-    """
-
-    plate_temperature: float
-    film_temperature: float
-    sink_temperature: float
-    plate_rate: float
-    current: float
-    voltage: float
-    r_fraction: float
-    curvature: float
-    tip_deflection: float
 
 
 def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -272,7 +204,7 @@ def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], ND
     return up[order], down[order]
 
 
-class VO2Cantilever(GridPlant):
+class VO2Cantilever(CooledPlant[VO2Parameters]):
     """Curvature of a VO2 microcantilever on a Peltier plate, advanced in time.
 
     The plate is either regulated (`regulate`: the closed second-order loop of a temperature
@@ -308,6 +240,18 @@ class VO2Cantilever(GridPlant):
         If `initial_temperature` is not a temperature.
     """
 
+    OUTPUTS = (
+        "plate_temperature",
+        "film_temperature",
+        "sink_temperature",
+        "plate_rate",
+        "current",
+        "voltage",
+        "r_fraction",
+        "curvature",
+        "tip_deflection",
+    )
+
     def __init__(
         self,
         parameters: VO2Parameters,
@@ -315,17 +259,16 @@ class VO2Cantilever(GridPlant):
         initial_temperature: float | None = None,
     ) -> None:
         start = parameters.ambient_temperature if initial_temperature is None else initial_temperature
-        _check_temperature("initial_temperature", start)
-        super().__init__(parameters.step, rng, (2,))
-        self._parameters = parameters
+        check_temperature("initial_temperature", start)
+        super().__init__(parameters, rng, (2,))
         self._coefficients = _coefficients(parameters)
-        self._up, down = relay_thresholds(parameters)
-        self._down_relay = np.argsort(down, kind="stable")
-        self._down = down[self._down_relay]
-        self._on = np.zeros(parameters.relay_count, dtype=np.bool_)
+        up, down = relay_thresholds(parameters)
+        order = np.argsort(down, kind="stable")
         self._counters = np.zeros(kernels.COUNTER_SIZE, dtype=np.int64)
-        self._command = np.zeros(kernels.COMMAND_SIZE)
+        on = np.zeros(parameters.relay_count, dtype=np.bool_)
+        self._command = np.zeros(COMMAND_SIZE)
         self._state = np.zeros(kernels.STATE_SIZE)
+        self._parts = kernels.Parts(self._state, self._coefficients, self._counters, up, down[order], order, on)
 
         state = self._state
         wander = float(self._noise.standard_normal())
@@ -334,84 +277,12 @@ class VO2Cantilever(GridPlant):
         state[kernels.WANDER] = parameters.wander_sd * wander
         # The session's offset is that of the moment at which the laser is aligned: drift begins there.
         state[kernels.DRIFT] = 0.0
-        state[kernels.DRIVE] = min(float(self._down[0]), start) - parameters.coupling - 1.0
+        state[kernels.DRIVE] = min(float(self._parts.down[0]), start) - parameters.coupling - 1.0
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
-        kernels.settle_film(
-            self.film_temperature,
-            parameters.coupling,
-            parameters.relay_step,
-            state,
-            self._counters,
-            self._up,
-            self._down,
-            self._down_relay,
-            self._on,
-        )
-
-    @property
-    def parameters(self) -> VO2Parameters:
-        """The numbers of this plant."""
-        return self._parameters
-
-    def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
-        """Close the temperature loop.
-
-        Parameters
-        ----------
-        target_celsius : float
-            Target of the plate temperature, °C.
-        current_limit : float, optional
-            Largest current of either sign that the amplifier may give, A. Where the loop asks for
-            more, the plate's rate saturates at what this current can do; a target out of its reach is
-            approached and not reached.
-
-        Raises
-        ------
-        ValueError
-            If the target is not a temperature or the limit is negative or not a number.
-        """
-        _check_temperature("target_celsius", target_celsius)
-        if not current_limit >= 0.0:
-            raise ValueError(f"current_limit must not be negative, not {current_limit} A")
-        self._command[kernels.CLOSED] = 1.0
-        self._command[kernels.TARGET] = target_celsius
-        self._command[kernels.LIMIT] = current_limit
-
-    def drive(self, current_ampere: float) -> None:
-        """Drive a constant current; the loop is open.
-
-        Parameters
-        ----------
-        current_ampere : float
-            Current, A; positive heats the plate. The output follows with the amplifier's lag.
-
-        Raises
-        ------
-        ValueError
-            If the magnitude exceeds the module's rating ``parameters.maximum_current``.
-        """
-        if not abs(current_ampere) <= self._parameters.maximum_current:
-            raise ValueError(f"current must lie within ±{self._parameters.maximum_current} A, not {current_ampere} A")
-        self._command[kernels.CLOSED] = 0.0
-        self._command[kernels.COMMAND] = current_ampere
-
-    def release(self) -> None:
-        """Switch the output off; the plate relaxes towards the heat sink and the room."""
-        self._command[kernels.CLOSED] = 0.0
-        self._command[kernels.COMMAND] = 0.0
+        kernels.settle_film(self.film_temperature, self._parts)
 
     def _take_steps(self, normals: NDArray[np.float64]) -> None:
-        kernels.advance_steps(
-            normals,
-            self._state,
-            self._counters,
-            self._command,
-            self._coefficients,
-            self._up,
-            self._down,
-            self._down_relay,
-            self._on,
-        )
+        kernels.advance_steps(normals, self._command, self._parts)
 
     @property
     def plate_temperature(self) -> float:
@@ -471,16 +342,6 @@ class VO2Cantilever(GridPlant):
             p.residual_curvature, p.beam_length
         )
 
-    def snapshot(self) -> VO2Snapshot:
-        """Take all outputs at the present instant.
-
-        Returns
-        -------
-        VO2Snapshot
-            The outputs.
-        """
-        return VO2Snapshot._make(getattr(self, name) for name in VO2Snapshot._fields)
-
 
 def arc_deflection(curvature: float, length: float) -> float:
     """Tip deflection of a beam bent to an arc (Zhang et al., 2013, eq. 1).
@@ -503,11 +364,6 @@ def arc_deflection(curvature: float, length: float) -> float:
     return length * half * ratio * ratio
 
 
-def _check_temperature(name: str, celsius: float) -> None:
-    if not -kernels.ZERO_CELSIUS < celsius < math.inf:
-        raise ValueError(f"{name} must be a temperature above absolute zero, not {celsius} °C")
-
-
 def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
     """Prepare the numbers that the compiled loop needs every step."""
     p = parameters
@@ -518,8 +374,8 @@ def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
     shrink = math.exp(-decay * step)
     cosine = shrink * math.cos(swing * step)
     sine = shrink * math.sin(swing * step) / swing
-    wander_decay = math.exp(-step / p.wander_time)
-    drift_decay = math.exp(-step / p.drift_time)
+    wander_decay, wander_kick = fluctuation(p.wander_sd, p.wander_time, step)
+    drift_decay, drift_kick = fluctuation(p.drift_sd, p.drift_time, step)
     values = {
         kernels.STEP: step,
         kernels.LOOP_EE: cosine + decay * sine,
@@ -538,9 +394,9 @@ def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
         kernels.SINK_LOSS: 1.0 / p.sink_resistance,
         kernels.AMBIENT: p.ambient_temperature,
         kernels.WANDER_DECAY: wander_decay,
-        kernels.WANDER_KICK: p.wander_sd * math.sqrt(1.0 - wander_decay**2),
+        kernels.WANDER_KICK: wander_kick,
         kernels.DRIFT_DECAY: drift_decay,
-        kernels.DRIFT_KICK: p.drift_sd * math.sqrt(1.0 - drift_decay**2),
+        kernels.DRIFT_KICK: drift_kick,
         kernels.OFFSET: p.session_offset,
         kernels.COUPLING: p.coupling,
         kernels.RELAY_STEP: p.relay_step,

@@ -9,4 +9,4 @@ class WireServer(Protocol):
     """The serial side of an emulated instrument."""
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in whatever pieces they come; return what the instrument sends."""
+        """Take bytes from the host, in pieces of any size; return what the instrument sends."""

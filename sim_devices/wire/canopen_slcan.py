@@ -11,7 +11,7 @@ management commands and its heartbeat. It takes the simplified command bytes of 
 V2.0, whose bits e and s are 0, as well, and answers them by the standard ones.
 
 Assumptions: a frame that is sent at another bit rate than the bus has is lost without a word; segmented and
-block downloads are refused; a remote frame is answered by nobody.
+block downloads are refused; a remote frame is not answered.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from __future__ import annotations
 import re
 import struct
 
-from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState, TransferAbortedError
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState
 
 LONGEST_LINE = 64
 """Characters after which a line without an end is dropped; the longest real one has 26."""
@@ -64,20 +65,20 @@ class CanopenSlcanServer:
         self._listening = False
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in whatever pieces they come; return what the adapter sends."""
+        """Take bytes from the host, in pieces of any size; return what the adapter sends."""
         with self._device.world.lock:
             *lines, rest = (self._received + data).split(b"\r")
             sent = self._heartbeats()
             for line in lines:
                 sent += _REFUSED if self._overrun or len(line) > LONGEST_LINE else self._obey(line)
                 self._overrun = False
-            # What is longer than any line stays refused up to its end.
+            # A line that is too long is refused up to its end.
             self._overrun = self._overrun or len(rest) > LONGEST_LINE
             self._received = b"" if self._overrun else rest
             return sent
 
     def _heartbeats(self) -> bytes:
-        """Return what the device has sent by itself since the host last spoke."""
+        """Return the heartbeats since the last request of the host."""
         states = self._device.heartbeats()
         if not self._on_the_bus():
             return b""
@@ -119,7 +120,7 @@ class CanopenSlcanServer:
         return sent
 
     def _frame(self, identifier: int, data: bytes) -> bytes:
-        """Put a frame on the bus; return the lines of what the node answers."""
+        """Put a frame on the bus; return the lines of the node's answer."""
         device = self._device
         if not device.plugged_in:
             return b""
@@ -166,10 +167,10 @@ class SdoServer:
                 return self._upload()
             if specifier == 3:
                 return self._segment(command)
-            raise TransferAbortedError(AbortCode.COMMAND)
-        except TransferAbortedError as error:
+            raise RequestRefusedError(AbortCode.COMMAND)
+        except RequestRefusedError as error:
             self._text = None
-            return b"\x80" + self._multiplexer + struct.pack("<I", error.code)
+            return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
 
     def _object(self) -> tuple[int, int]:
         return int.from_bytes(self._multiplexer[:2], "little"), self._multiplexer[2]
@@ -178,15 +179,15 @@ class SdoServer:
         index, sub = self._object()
         row = self._device.entry(index, sub)
         if not row.writable:
-            raise TransferAbortedError(AbortCode.READ_ONLY)
+            raise RequestRefusedError(AbortCode.READ_ONLY)
         expedited, sized = bool(command & 2), bool(command & 1)
         if not expedited and sized:
-            raise TransferAbortedError(AbortCode.UNSUPPORTED)
+            raise RequestRefusedError(AbortCode.UNSUPPORTED)
         form = _FORMATS[row.kind]
         size = struct.calcsize(form)
         # Without the bit s the size is not said; the simplified form of the maker says it all the same.
         if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
-            raise TransferAbortedError(AbortCode.LENGTH)
+            raise RequestRefusedError(AbortCode.LENGTH)
         value: int = struct.unpack(form, data[:size])[0]
         self._device.write_object(index, value, sub)
         return b"\x60" + self._multiplexer + bytes(4)
@@ -202,9 +203,9 @@ class SdoServer:
 
     def _segment(self, command: int) -> bytes:
         if self._text is None:
-            raise TransferAbortedError(AbortCode.COMMAND)
+            raise RequestRefusedError(AbortCode.COMMAND)
         if command >> 4 & 1 != self._toggle:
-            raise TransferAbortedError(AbortCode.TOGGLE)
+            raise RequestRefusedError(AbortCode.TOGGLE)
         part, rest = self._text[:_SEGMENT], self._text[_SEGMENT:]
         head = self._toggle << 4 | (_SEGMENT - len(part)) << 1 | (not rest)
         self._toggle ^= 1

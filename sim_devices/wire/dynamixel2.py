@@ -21,12 +21,9 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
 
-from sim_devices.instruments.dynamixel import (
-    LOWEST_FIRMWARE_THAT_CLEARS,
-    EmulatedMX28,
-    ErrorNumber,
-    RequestRefusedError,
-)
+from sim_devices.instruments.dynamixel import LOWEST_FIRMWARE_THAT_CLEARS, EmulatedMX28
+from sim_devices.instruments.dynamixel_table import ErrorNumber
+from sim_devices.instruments.emulated import RequestRefusedError
 
 LONGEST_FRAME = 1024
 """Bytes beyond which what looks like a packet is taken for noise; it is the longest of the maker's software."""
@@ -40,7 +37,7 @@ _ALERT = 0x80
 
 
 class Instruction(IntEnum):
-    """What a packet asks for."""
+    """The instructions of a packet."""
 
     PING = 0x01
     READ = 0x02
@@ -126,7 +123,7 @@ class Dynamixel2Server:
         self._received = b""
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in whatever pieces they come; return what the servos send."""
+        """Take bytes from the host, in pieces of any size; return what the servos send."""
         with self._world.lock:
             self._received += data
             return b"".join(self._serve(packet) for packet in self._packets())
@@ -252,7 +249,7 @@ def _refusable_write(servo: EmulatedMX28, address: int, data: bytes) -> None:
     try:
         servo.write_bytes(address, data)
     except RequestRefusedError:
-        # Nobody answers a write to several.
+        # A write to several servos is not answered.
         return
 
 
@@ -310,7 +307,7 @@ def _fast_answer(present: Mapping[int, EmulatedMX28], reads: list[tuple[int, int
     for number, address, length in reads:
         servo = present.get(number)
         if servo is None or servo.status_return_level < 1:
-            # Nobody goes on, and nobody begins.
+            # No servo continues the answer, and none begins it.
             return answer if number != reads[0][0] else b""
         error, content = 0, bytes(length)
         try:

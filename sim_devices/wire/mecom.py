@@ -22,7 +22,9 @@ import re
 import struct
 from binascii import crc_hqx
 
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC, Parameter, RequestRefusedError, ServerError
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.meerstetter_table import Parameter, ServerError
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 
 LONGEST_FRAME = 512
 """Characters after which a frame without an end is dropped; the longest real one is about half of it."""
@@ -52,10 +54,10 @@ class MeComServer:
         self._last_answer = b""
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in whatever pieces they come; return what the device sends."""
+        """Take bytes from the host, in pieces of any size; return what the device sends."""
         with self._device.world.lock:
             *frames, rest = (self._received + data).split(b"\r")
-            # A new start sign begins a new frame, whatever was before it.
+            # A new start sign begins a new frame.
             start = rest.rfind(b"#")
             self._received = rest[start:] if start >= 0 and len(rest) - start <= LONGEST_FRAME else b""
             return b"".join(self._serve(frame) for frame in frames)

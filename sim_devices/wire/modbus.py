@@ -1,4 +1,4 @@
-"""What Modbus asks of any emulated instrument that is a bank of registers, whatever carries the requests.
+"""Modbus for emulated instruments that are banks of registers, independent of the transport.
 
 Source: MODBUS Application Protocol Specification V1.1b3.
 """
@@ -30,7 +30,7 @@ class RegisterError(Exception):
     code : int
         Modbus exception code that the client gets, 1 to 255.
     message : str
-        Why, for whoever calls the instrument without a wire.
+        The reason, for a caller without a wire.
     """
 
     def __init__(self, code: int, message: str) -> None:

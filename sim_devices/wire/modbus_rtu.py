@@ -60,7 +60,7 @@ def crc16(data: bytes | bytearray | memoryview) -> bytes:
 class ModbusRtuServer:
     """The serial side of an emulated instrument.
 
-    Requests to other addresses have no answer. What is broadcast to address 0 is carried out and not answered.
+    Requests to other addresses have no answer. A broadcast to address 0 is carried out and not answered.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class ModbusRtuServer:
         return self._address
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the line, in whatever pieces they come; return the replies to whole requests."""
+        """Take bytes from the line, in pieces of any size; return the replies to whole requests."""
         self._received += data
         replies = bytearray()
         received = memoryview(bytes(self._received))

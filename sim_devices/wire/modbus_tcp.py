@@ -19,28 +19,7 @@ import struct
 import threading
 from types import TracebackType
 
-from sim_devices.wire.modbus import (
-    DEVICE_FAILURE,
-    ILLEGAL_ADDRESS,
-    ILLEGAL_FUNCTION,
-    ILLEGAL_VALUE,
-    RegisterBank,
-    RegisterError,
-    answer,
-)
-
-__all__ = [
-    "DEVICE_FAILURE",
-    "ILLEGAL_ADDRESS",
-    "ILLEGAL_FUNCTION",
-    "ILLEGAL_VALUE",
-    "FramingError",
-    "ModbusTcpServer",
-    "ModbusTcpStream",
-    "RegisterBank",
-    "RegisterError",
-    "answer",
-]
+from sim_devices.wire.modbus import RegisterBank, answer
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _MOST_BYTES = 254  # unit identifier and the longest PDU
@@ -64,7 +43,7 @@ class ModbusTcpStream:
         self._received = bytearray()
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes from the client, in whatever pieces they come; return the replies to whole frames.
+        """Take bytes from the client, in pieces of any size; return the replies to whole frames.
 
         Raises
         ------
@@ -82,7 +61,7 @@ class ModbusTcpStream:
                 break
             reply = answer(self._bank, bytes(self._received[_HEADER.size : end]))
             del self._received[:end]
-            # The unit is echoed whatever it is: a device on TCP is addressed by its port.
+            # Any unit is echoed: a device on TCP is addressed by its port.
             replies += _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
         return bytes(replies)
 

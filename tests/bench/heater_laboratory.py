@@ -22,7 +22,7 @@ from bench.devices import (
     TemperatureSensor,
 )
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from bench.rig import LaboratorySettings
+from bench.rig_file import LaboratorySettings
 
 RIG = """
 [rig]

@@ -14,7 +14,7 @@ def main() -> int:
     definition = find_protocol(protocol)
     run = Run(
         protocol=definition,
-        parameters=definition.parse(dict(setting.split("=") for setting in settings)),
+        settings=dict(setting.split("=") for setting in settings),
         rig=rig,
         folder=Path(folder),
         clock=clock,

@@ -1,5 +1,7 @@
 """A bluesky RunEngine drives the bench's devices as it stands: over the wire, on the virtual clock."""
 
+from contextlib import closing
+
 import pytest
 from heater_protocols import stairs
 
@@ -7,7 +9,8 @@ from bench.clock import VIRTUAL_EPOCH, VirtualClock
 from bench.engine import check_before_moving
 from bench.errors import DeviceError, LimitError
 from bench.protocol import plan
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 
 bluesky = pytest.importorskip("bluesky")
 plans = pytest.importorskip("bluesky.plans")
@@ -22,7 +25,7 @@ def engine():
 
 @pytest.fixture
 def rig():
-    with Rig(load_rig("vo2", {"emulation.disturbances": "false"}), VirtualClock(), seed=1) as rig:
+    with closing(Rig(load_rig("vo2", {"emulation.disturbances": "false"}), VirtualClock(), seed=1)) as rig:
         yield rig
 
 

@@ -133,22 +133,25 @@ class TestDerivedSignal:
             **{"kind": "cantilever-curvature", "source": "psd_position", "length": LENGTH, **keys}
         )
 
+    def compute(self, derived, values):
+        return derived.bind("curvature", {"psd_position": "m"}).compute(values)
+
     def test_computes_from_the_source(self):
-        curvature = self.make().compute("curvature", {"psd_position": 80.97e-6, "tec_temperature": 60.0})
+        curvature = self.compute(self.make(), {"psd_position": 80.97e-6, "tec_temperature": 60.0})
         assert curvature == pytest.approx(1846.0, abs=0.2)
-        assert self.make().signal("curvature").unit == "1/m"
+        assert self.make().bind("curvature", {"psd_position": "m"}).signal.unit == "1/m"
 
     def test_takes_the_residual_curvature_into_account(self):
         deflection = float(curvature_to_deflection(1846.0, LENGTH, 500.0))
-        got = self.make(residual_curvature=500.0).compute("curvature", {"psd_position": deflection})
+        got = self.compute(self.make(residual_curvature=500.0), {"psd_position": deflection})
         assert got == pytest.approx(1846.0, rel=1e-9)
 
     def test_an_impossible_deflection_is_a_fault(self):
         with pytest.raises(DeviceError, match=r"a beam of 300 µm cannot bend by 250\.0 µm"):
-            self.make().compute("curvature", {"psd_position": 250e-6})
+            self.compute(self.make(), {"psd_position": 250e-6})
 
     def test_nan_stays_nan(self):
-        assert math.isnan(self.make().compute("curvature", {"psd_position": math.nan}))
+        assert math.isnan(self.compute(self.make(), {"psd_position": math.nan}))
 
     def test_a_residual_curvature_without_inverse_is_refused(self):
         # Beyond 2.33 rad one deflection has two curvatures, and no deflection at all would not mean no change.
@@ -156,6 +159,6 @@ class TestDerivedSignal:
             self.make(residual_curvature=8000.0)
         with pytest.raises(ValidationError, match="residual_curvature"):
             self.make(residual_curvature=-8000.0)
-        assert self.make(residual_curvature=7000.0).compute("c", {"psd_position": 0.0}) == pytest.approx(
+        assert self.compute(self.make(residual_curvature=7000.0), {"psd_position": 0.0}) == pytest.approx(
             0.0, abs=1e-6
         )

@@ -33,6 +33,7 @@ from bench.hysteresis import (
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.protocol import TRACES
 from bench.results.model_file import ModelFile
+from bench.settling import Settled
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),
@@ -138,7 +139,9 @@ def make_run(steps: int, ticks: int) -> Iterator[Tick | StepRecord | Event]:
         t, temperature = started + 8.0, target + 0.01 * float(random.normal())
         values = row(target, temperature)
         memory = memory.step(values[1])
-        yield StepRecord(step, started, t, "", "", step != 3, {"tec": target}, values)
+        yield StepRecord(
+            step, started, t, "", "", Settled.DWELL if step != 3 else Settled.NOT_STEADY, {"tec": target}, values
+        )
     yield Event(t, "INFO", "safe-state", "tec: safe")
     yield Event(t, "INFO", "end", "completed")
 
@@ -157,7 +160,7 @@ def make_control_run(targets: int, ticks: int) -> Iterator[Tick | StepRecord | E
     yield Event(0.0, "INFO", "phase", "reset")
     # What a hold shows on the way to a reading is not settled, and no part of the loop.
     yield 2.0, 0, row(35.0, nothing)
-    yield StepRecord(0, 0.0, 8.0, "", "reset", True, {"tec": 21.0}, row(21.0, nothing))
+    yield StepRecord(0, 0.0, 8.0, "", "reset", Settled.DWELL, {"tec": 21.0}, row(21.0, nothing))
     yield Event(8.0, "INFO", "phase", "closed loop")
     t, step, temperature = 8.0, 1, 21.0
     for target in range(targets):
@@ -171,9 +174,9 @@ def make_control_run(targets: int, ticks: int) -> Iterator[Tick | StepRecord | E
                 values = (*values[:6], float("nan"), *values[7:])
             yield t, step, values
         # A controller ends with a tick and a reading in one instant; then it is read again where it stands.
-        yield StepRecord(step, started, t, "", "reach", True, {"tec": goal}, values)
+        yield StepRecord(step, started, t, "", "reach", Settled.DWELL, {"tec": goal}, values)
         yield t + 0.1, step + 1, row(temperature, nothing)
-        yield StepRecord(step + 1, t, t + 0.2, "", "reading", True, {}, row(temperature, nothing))
+        yield StepRecord(step + 1, t, t + 0.2, "", "reading", Settled.DWELL, {}, row(temperature, nothing))
         t, step = t + 0.2, step + 2
     yield Event(t, "INFO", "end", "completed")
 
@@ -225,7 +228,7 @@ def make_muscle_run() -> Iterator[Tick | StepRecord | Event]:
             noisy = (state.force + 0.02 * random.normal(), length + 2e-5 * random.normal())
             values = (voltage, voltage, 0.8 * voltage, *map(float, noisy))
             yield t + 15.0, step, values
-            yield StepRecord(step, t, t + 30.0, "", "", True, {"supply": voltage}, values)
+            yield StepRecord(step, t, t + 30.0, "", "", Settled.DWELL, {"supply": voltage}, values)
             t, step = t + 30.0, step + 1
     yield Event(t, "INFO", "end", "completed")
 
@@ -696,7 +699,7 @@ def test_loop_and_memory_curve_follow_the_ticks_under_control(
 def test_a_controller_that_holds_its_target_is_not_drawn_again(tmp_path: Path) -> None:
     values = (60.0, 60.0, 24.0, 1.0, 3.0, 1e-6, 900.0, 900.0, 900.0, 0.0, 1.0)
     with make_dashboard(tmp_path / "run.rrd", signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
-        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", True, {}, values))
+        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", Settled.DWELL, {}, values))
         for tick in range(1_000):
             noise = 0.01 * (-1) ** tick
             dashboard.telemetry(8.0 + tick, 1, (60.0, 60.0 + noise, *values[2:6], 900.0 + noise, *values[7:]))
@@ -717,7 +720,7 @@ def test_loops_are_drawn_independently_under_control(tmp_path: Path) -> None:
     ]
     path = tmp_path / "run.rrd"
     with make_dashboard(path, layout=layout, signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
-        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", True, {}, values))
+        dashboard.step(StepRecord(0, 0.0, 8.0, "", "", Settled.DWELL, {}, values))
         for i, (temperature, curvature, current, voltage) in enumerate(rows[1:], 1):
             row = (60.0, temperature, 24.0, current, voltage, 1e-6, curvature, *values[7:])
             dashboard.telemetry(8.0 + i, 1, row)
@@ -762,7 +765,7 @@ def test_what_is_controlled_must_be_among_the_signals(
 
 def test_readings_that_are_not_numbers_leave_a_gap(tmp_path: Path) -> None:
     values = (20.0, float("nan"), 20.0, 0.0, 0.0, 0.0, 0.0)
-    record = StepRecord(0, 0.0, 8.0, "", "", True, {}, values)
+    record = StepRecord(0, 0.0, 8.0, "", "", Settled.DWELL, {}, values)
     with make_dashboard(tmp_path / "run.rrd") as dashboard:
         dashboard.step(record)
         dashboard.step(replace(record, step=1, finished=16.0, values=(20.0, 21.0, 20.0, 0.0, 0.0, 0.0, 1.0)))
@@ -920,7 +923,7 @@ def test_what_rerun_cannot_take_is_dropped_counted_and_said(tmp_path: Path, monk
     dashboard = make_dashboard(tmp_path / "run.rrd")
     longest = feed(dashboard, 2 * QUEUED_TICKS)
     # What matters more than telemetry still has room.
-    dashboard.step(StepRecord(7, 0.0, 8.0, "", "", True, {}, (0.0,) * len(SIGNALS)))
+    dashboard.step(StepRecord(7, 0.0, 8.0, "", "", Settled.DWELL, {}, (0.0,) * len(SIGNALS)))
     assert longest < 0.5
     lost = dashboard.dropped
     assert lost > 0

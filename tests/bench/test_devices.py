@@ -22,7 +22,8 @@ from bench.devices import (
     role_of,
 )
 from bench.errors import DeviceError, LimitError
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="(bluesky|event_model|toolz|historydict).*")

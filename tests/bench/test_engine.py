@@ -32,7 +32,8 @@ from bench.protocol import (
     plan,
     protocol,
 )
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 
 
 class Nothing(ProtocolParameters):
@@ -79,7 +80,7 @@ class Bench:
             outcome = self.engine.run(definition, definition.parameters() if parameters is None else parameters)
         finally:
             self.journal.close()
-            self.rig.__exit__(None, None, None)
+            self.rig.close()
         return outcome
 
     def record(self):
@@ -402,7 +403,7 @@ class TestFaults:
         b = bench()
         outcome = b.run(define(go))
         assert isinstance(outcome.error, ConfigurationError)
-        assert "expected a Step, a Control, a FastLoop, a Prompt, a Phase or a Note" in outcome.reason
+        assert "expected a Step, a Control, a FixedRate, a Prompt, a Phase or a Note" in outcome.reason
         b.assert_safe()
 
     def test_a_protocol_that_goes_on_when_it_is_closed(self, bench):
@@ -557,10 +558,10 @@ def control(loop, **keys):
     def go(parameters):
         yield Control(
             **{
-                "loop": loop,
+                "task": loop,
                 "actuator": "tec",
-                "input": "tec_temperature",
-                "output": "probe_temperature",
+                "drive": "tec_temperature",
+                "response": "probe_temperature",
                 "limits": (15.0, 80.0),
                 "timeout": 600.0,
                 "label": "reach",
@@ -626,7 +627,7 @@ class TestControl:
         assert b.run(control(Integrator(50.0, wait=wait, tolerance=0.0))).status == "failed"
         b.assert_safe()
 
-    @pytest.mark.parametrize("key", ["actuator", "input", "output"])
+    @pytest.mark.parametrize("key", ["actuator", "drive", "response"])
     def test_what_is_not_there_is_named(self, bench, key):
         b = bench()
         outcome = b.run(control(Integrator(50.0), **{key: "absent"}))
@@ -651,8 +652,8 @@ class TestControl:
             with pytest.raises(ConfigurationError, match="absent"):
                 check_before_moving(
                     rig,
-                    control(Integrator(50.0), output="absent"),
-                    plan(control(Integrator(50.0), output="absent"), Nothing()),
+                    control(Integrator(50.0), response="absent"),
+                    plan(control(Integrator(50.0), response="absent"), Nothing()),
                 )
 
     @pytest.mark.parametrize(
@@ -676,7 +677,15 @@ class TestControl:
 def prompt(task="turn", value=33.0):
     def go(parameters):
         yield Step({"tec": 30.0}, Dwell(2.0))
-        reading = yield Prompt("Turn the plate to 33 °C", task, value, Dwell(20.0), "probe_temperature", 32.5, 33.5)
+        reading = yield Prompt(
+            text="Turn the plate to 33 °C",
+            task=task,
+            value=value,
+            settle=Dwell(20.0),
+            signal="probe_temperature",
+            low=32.5,
+            high=33.5,
+        )
         assert reading["probe_temperature"] == pytest.approx(33.0, abs=0.1)
 
     return define(go)
@@ -749,7 +758,7 @@ class TestPrompt:
 
     def test_an_unknown_signal_is_found_before_anything_moves(self, rig_file):
         def go(parameters):
-            yield Prompt("Do it", "turn", 1.0, Dwell(1.0), "no_such", 0.0, 1.0)
+            yield Prompt(text="Do it", task="turn", value=1.0, settle=Dwell(1.0), signal="no_such", low=0.0, high=1.0)
 
         definition = define(go)
         with (
@@ -760,12 +769,14 @@ class TestPrompt:
 
     def test_an_empty_range(self):
         with pytest.raises(ValueError, match="low < high"):
-            Prompt("Do it", "turn", 1.0, Dwell(1.0), "probe_temperature", 2.0, 2.0)
+            Prompt(
+                text="Do it", task="turn", value=1.0, settle=Dwell(1.0), signal="probe_temperature", low=2.0, high=2.0
+            )
 
 
 def go_and_ask(parameters):
     settle = UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=60.0, minimum=5.0)
-    yield Prompt("Do it", "turn", 1.0, settle, "probe_temperature", 0.0, 1.0)
+    yield Prompt(text="Do it", task="turn", value=1.0, settle=settle, signal="probe_temperature", low=0.0, high=1.0)
 
 
 prompt_without_reading = define(go_and_ask)

@@ -21,9 +21,10 @@ from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.identification.hybrid_model import HybridModel
 from bench.identification.thermal_network import Design
 from bench.journal import Record
-from bench.protocol import FastLoop, Phase, Reading, Step, find_protocol, plan
+from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from protocols.hybrid_control import REST, moves_of
 from sim_devices.hybrid import ENABLE_LINE, HybridLaboratory
@@ -98,7 +99,7 @@ def dry(protocol, **settings):
 
 
 def loops(protocol, **settings):
-    return [message for message in dry(protocol, **settings) if isinstance(message, FastLoop)]
+    return [message for message in dry(protocol, **settings) if isinstance(message, FixedRate)]
 
 
 def setpoints(loop, actuator=0):
@@ -390,7 +391,13 @@ def flat(text):
 def record(folder, protocol, rig, **settings):
     definition, parameters = parsed(protocol, settings)
     run = Run(
-        protocol=definition, parameters=parameters, rig=rig, folder=folder, seed=1, clock="virtual", recording=False
+        protocol=definition,
+        settings=parameters.model_dump(),
+        rig=rig,
+        folder=folder,
+        seed=1,
+        clock="virtual",
+        recording=False,
     )
     result = carry_out(run, Console(file=io.StringIO(), width=200))
     assert result.outcome.status == "completed", result.outcome.reason

@@ -17,12 +17,15 @@ from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, SCHEMA, Event, Journal, Record, StepRecord, add_model
+from bench.settling import Settled
 
 SIGNALS = (Signal("tec_temperature", "°C", "object temperature"), Signal("force", "N", "force", 4))
 
 
 def record(step, *values, setpoints=None, label="", phase="rise"):
-    return StepRecord(step, float(step), step + 0.5, phase, label, True, setpoints or {"tec": 20.0 + step}, values)
+    return StepRecord(
+        step, float(step), step + 0.5, phase, label, Settled.DWELL, setpoints or {"tec": 20.0 + step}, values
+    )
 
 
 def write(path, steps=3, signals=SIGNALS, meta=None, finish=True, ticks=2):
@@ -344,7 +347,7 @@ class TestUnusable:
         with pytest.raises(DataError, match="damaged"):
             add_model(path, "m", 0.0, {})
 
-    @pytest.mark.parametrize("version", [0, 2, "1", None])
+    @pytest.mark.parametrize("version", [0, 3, "1", None])
     def test_another_schema(self, tmp_path, version):
         path = tmp_path / FILE_NAME
         write(path)
@@ -355,7 +358,7 @@ class TestUnusable:
             db.execute("UPDATE meta SET value = ? WHERE key = 'schema'", (json.dumps(version),))
         db.commit()
         db.close()
-        with pytest.raises(DataError, match=r"schema version .*; this bench reads version 1"):
+        with pytest.raises(DataError, match=r"schema version .*; this bench reads versions 1 and 2"):
             Record(path)
 
     @pytest.mark.parametrize(

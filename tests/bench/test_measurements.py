@@ -7,6 +7,7 @@ from bench.devices import Signal
 from bench.errors import DataError
 from bench.journal import FILE_NAME, Journal, StepRecord
 from bench.results.data import Columns, check_excitation, read_columns, split_unit, write_csv
+from bench.settling import Settled
 
 
 @pytest.fixture
@@ -178,7 +179,7 @@ class TestRuns:
             signals = (Signal("tec_temperature", "°C", "t"), Signal("curvature", "1/m", "c"))
             journal = Journal(tmp_path / FILE_NAME, signals, {})
             for step, row in enumerate(rows):
-                journal.step(StepRecord(step, step * 8.0, step * 8.0 + 8.0, "", "", True, {}, row))
+                journal.step(StepRecord(step, step * 8.0, step * 8.0 + 8.0, "", "", Settled.DWELL, {}, row))
             journal.close()
             return tmp_path
 

@@ -14,7 +14,7 @@ from bench.journal import Record
 from bench.muscle_runs import FORCE, LENGTH, SAMPLE
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
-from bench.rig import load_rig
+from bench.rig_file import load_rig
 from bench.tracking_results import target_results
 from protocols.force_voltage import scaled_steps
 from protocols.muscle import LOADS, parse_numbers
@@ -134,11 +134,11 @@ class TestPlan:
         found = samples_by_phase(messages)
         assert [set(voltages) for voltages in found.values()] == [{0.0}, {0.6}, {1.2}, {1.8}, {2.4}, {3.0}]
         assert [len(voltages) for voltages in found.values()] == [23] * 6
-        asked = [message.loop.trace.reference for message in messages if isinstance(message, Control)]
+        asked = [message.task.trace.reference for message in messages if isinstance(message, Control)]
         assert max(asked) == 10.5
         assert min(asked) == 0.3
         start = messages.index(Phase("length over force at 0 V"))
-        one = [m.loop.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
+        one = [m.task.trace.reference for m in messages[start:] if isinstance(m, Control)][:23]
         np.testing.assert_allclose(np.diff(one), [*[(10.5 - 0.3) / 11] * 11, *[-(10.5 - 0.3) / 11] * 11])
 
     def test_verification_has_the_paper_s_90_samples(self):
@@ -208,8 +208,8 @@ class TestPlan:
             reach = [m for m in messages if isinstance(m, Control) and m.actuator == "supply"]
             targets = []
             for message in reach:
-                message.loop.begin(0.0, 0.0, 1.0)
-                targets.append(message.loop.trace.reference)
+                message.task.begin(0.0, 0.0, 1.0)
+                targets.append(message.task.trace.reference)
             references.append(targets)
         assert references[0] == references[1] != references[2]
         assert len(references[0]) == 30

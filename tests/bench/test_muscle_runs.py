@@ -44,7 +44,7 @@ SHORT = {
 def record_run(folder, protocol, rig="sma", overrides=None, **settings):
     definition = find_protocol(protocol)
     run = Run(
-        protocol=definition, parameters=definition.parse({**SHORT[protocol], **settings}), rig=rig, folder=folder,
+        protocol=definition, settings={**SHORT[protocol], **settings}, rig=rig, folder=folder,
         overrides=overrides or {}, seed=1, clock="virtual", recording=False,
     )  # fmt: skip
     return carry_out(run, Console(file=io.StringIO(), width=200))

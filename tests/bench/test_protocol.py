@@ -4,16 +4,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.clock import VirtualClock
 from bench.control.loops import Playback
 from bench.errors import ConfigurationError
 from bench.protocol import (
     Dwell,
-    FastLoop,
+    FixedRate,
     Messages,
     Note,
     Phase,
     ProtocolParameters,
     Reading,
+    Settled,
     Step,
     UntilSteady,
     find_protocol,
@@ -22,6 +24,9 @@ from bench.protocol import (
     plan,
     protocol,
 )
+from bench.registry import Entry
+from bench.rig import Rig
+from bench.rig_file import load_rig
 
 
 class Parameters(ProtocolParameters):
@@ -278,7 +283,7 @@ class TestPlan:
             yield Step({"tec": 20.0}, Dwell(1.0))
             yield Step({"tec": value}, Dwell(1.0))
 
-        with pytest.raises(ConfigurationError, match=r"protocol odd .*tec"):
+        with pytest.raises(ConfigurationError, match=r"protocol odd: .*tec"):
             plan(define(odd), Nothing())
 
 
@@ -375,9 +380,32 @@ def soak(parameters: Parameters) -> Messages:
             find_protocol(str(path))
 
 
+class BoundProtocols:
+    """What a rig makes of a protocol: its defaults and its slots."""
+
+    def __init__(self, rig):
+        self.rig = rig
+
+    def parse(self, definition, settings=None):
+        file = self.rig.file
+        return definition.parse(settings or {}, file.roles, file.protocols.get(definition.name), path=file.path)
+
+    def slots(self, definition):
+        return self.rig.slots(definition)
+
+    def plan(self, definition, settings=None):
+        return plan(definition, self.parse(definition, settings), self.slots(definition))
+
+
+@pytest.fixture(scope="module")
+def vo2():
+    with Rig(load_rig("vo2"), VirtualClock(), 0) as rig:
+        yield BoundProtocols(rig)
+
+
 class TestPackaged:
     def test_names(self):
-        protocols = packaged_protocols()
+        protocols = packaged_protocols().protocols
         assert list(protocols) == sorted(protocols)
         assert {"creep", "damped-oscillation", "random-validation"} <= set(protocols)
         for definition in protocols.values():
@@ -398,76 +426,92 @@ class TestPackaged:
         for module in ("one", "two"):
             (package / f"{module}.py").write_text(TestFiles.GOOD, encoding="utf-8")
         monkeypatch.syspath_prepend(str(tmp_path))
-        monkeypatch.setattr("bench.protocol.PROTOCOL_PACKAGE", "twin_protocols")
-        with pytest.raises(ConfigurationError, match="two protocols of the package are named soak"):
+        twins = Entry("protocols", "twins", "twin-package", "twin_protocols")
+        monkeypatch.setattr("bench.registry.entries", lambda _: {"twins": twins})
+        with pytest.raises(ConfigurationError, match="two protocols are named soak: one of package twin-package"):
             packaged_protocols()
 
-    def test_damped_oscillation(self):
+    def test_a_module_that_cannot_be_imported_is_named_and_skipped(self, tmp_path, monkeypatch):
+        package = tmp_path / "broken_protocols"
+        package.mkdir()
+        (package / "__init__.py").write_text("")
+        (package / "good.py").write_text(TestFiles.GOOD, encoding="utf-8")
+        (package / "bad.py").write_text("import no_such_module\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        broken = Entry("protocols", "broken", "a-package", "broken_protocols")
+        gone = Entry("protocols", "gone", "b-package", "no_such_package")
+        monkeypatch.setattr("bench.registry.entries", lambda _: {"broken": broken, "gone": gone})
+        packaged = packaged_protocols()
+        assert list(packaged.protocols) == ["soak"]
+        assert packaged.packages == {"soak": "a-package"}
+        assert any("broken_protocols.bad" in problem and "no_such_module" in problem for problem in packaged.problems)
+        assert any("b-package" in problem and "no_such_package" in problem for problem in packaged.problems)
+
+    def test_damped_oscillation(self, vo2):
         definition = find_protocol("damped-oscillation")
-        expected = plan(definition, definition.parse({}))
+        expected = vo2.plan(definition)
         assert 3300 <= expected.steps <= 3500
         assert expected.extremes["tec"] == (21.0, 84.0)
         assert expected.seconds == pytest.approx(8.0 * expected.steps)
         assert expected.at_most == pytest.approx(expected.seconds + 292.0)
 
-    def test_random_validation(self):
+    def test_random_validation(self, vo2):
         definition = find_protocol("random-validation")
-        expected = plan(definition, definition.parse({}))
+        expected = vo2.plan(definition)
         assert expected.steps == 600
         low, high = expected.extremes["tec"]
         assert 21.0 <= low < 40.0
         assert 72.0 < high <= 84.0
 
-    def test_random_validation_is_the_same_each_time(self):
+    def test_random_validation_is_the_same_each_time(self, vo2):
         definition = find_protocol("random-validation")
-        parameters = definition.parse({"count": "50"})
+        parameters = vo2.parse(definition, {"count": "50"})
 
         def setpoints():
-            messages, got = definition.generator(parameters), []
+            messages, got = definition.start(parameters, vo2.slots(definition)), []
             try:
                 message = next(messages)
                 while True:
                     got.append(message)
                     message = (
-                        messages.send(Reading(0, 0.0, True, {})) if isinstance(message, Step) else next(messages)
+                        messages.send(Reading(0, 0.0, Settled.DWELL, {}))
+                        if isinstance(message, Step)
+                        else next(messages)
                     )
             except StopIteration:
                 return got
 
         assert setpoints() == setpoints()
-        assert (
-            plan(definition, definition.parse({"sequence_seed": "2"})).extremes
-            != plan(definition, definition.parse({})).extremes
-        )
+        assert vo2.plan(definition, {"sequence_seed": "2"}).extremes != vo2.plan(definition).extremes
 
-    def test_creep(self):
+    def test_creep(self, vo2):
         definition = find_protocol("creep")
-        expected = plan(definition, definition.parse({}))
+        expected = vo2.plan(definition)
         assert expected.steps == 1 + 2 * (1 + 120)
         assert expected.extremes["tec"] == (25.0, 80.0)
 
     @pytest.mark.parametrize("settling", ["60", "3600"])
-    def test_creep_that_settles_too_long(self, settling):
+    def test_creep_that_settles_too_long(self, vo2, settling):
         definition = find_protocol("creep")
         with pytest.raises(ConfigurationError, match="settling must leave"):
-            plan(definition, definition.parse({"settling": settling}))
+            vo2.plan(definition, {"settling": settling})
 
-    def test_creep_that_settles_almost_as_long_as_it_watches(self):
+    def test_creep_that_settles_almost_as_long_as_it_watches(self, vo2):
         definition = find_protocol("creep")
-        parameters = definition.parse({"settling": "59.9"})
+        settings = {"settling": "59.9"}
         try:
-            assert plan(definition, parameters).steps == 243
+            assert vo2.plan(definition, settings).steps == 243
         except ConfigurationError as error:
             assert "settling" in str(error)  # noqa: PT017 - either way is right
 
     @pytest.mark.parametrize("name", ["creep", "damped-oscillation", "random-validation"])
     @given(data=st.data())
-    def test_whatever_is_allowed_has_a_plan_or_a_configuration_error(self, name, data):
+    def test_whatever_is_allowed_has_a_plan_or_a_configuration_error(self, vo2, name, data):
         definition = find_protocol(name)
         settings = {}
         for field, info in definition.parameters.model_fields.items():
-            low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), 0)
-            high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), 100)
+            low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), -20)
+            high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), 150)
             if field in ("count", "half_cycles"):
                 settings[field] = str(data.draw(st.integers(low, 20), label=field))
             elif field in ("increment", "interval", "dwell"):
@@ -479,7 +523,7 @@ class TestPackaged:
             else:
                 settings[field] = str(data.draw(st.floats(low, high), label=field))
         try:
-            expected = plan(definition, definition.parse(settings))
+            expected = vo2.plan(definition, settings)
         except ConfigurationError as error:
             assert str(error).startswith(f"protocol {name}")  # noqa: PT017 - either way is right
         else:
@@ -488,7 +532,7 @@ class TestPackaged:
 
 
 def fast_loop(**keys):
-    return FastLoop(
+    return FixedRate(
         **{
             "controller": Playback(lambda t: 30.0 + t),
             "rate": 100.0,
@@ -500,7 +544,7 @@ def fast_loop(**keys):
     )
 
 
-class TestFastLoop:
+class TestFixedRate:
     def test_the_dry_run_counts_its_duration_and_watches_its_signals(self):
         def go(parameters):
             yield Step({"tec": 20.0}, Dwell(3.0))
@@ -573,13 +617,13 @@ class TestFastLoop:
         ],
     )
     def test_nonsense_is_refused(self, keys):
-        with pytest.raises(ValueError, match="FastLoop: expected rate, duration > 0 and record_every ≥ 1, got rate="):
+        with pytest.raises(ValueError, match="FixedRate: expected rate, duration > 0 and record_every ≥ 1"):
             fast_loop(**keys)
 
         def go(parameters):
             yield fast_loop(**keys)
 
-        with pytest.raises(ConfigurationError, match="protocol go: FastLoop: expected rate, duration > 0"):
+        with pytest.raises(ConfigurationError, match="protocol go: FixedRate: expected rate, duration > 0"):
             plan(define(go), Nothing())
 
 

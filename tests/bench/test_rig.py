@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from bench.clock import VirtualClock
 from bench.dashboard import DashboardLayout
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from bench.rig import Rig, load_rig, packaged_rigs
+from bench.rig import Rig
+from bench.rig_file import load_rig, packaged_rigs
 
 SPOT = """
 [devices.spot]
@@ -159,7 +160,7 @@ class TestUnknownKeys:
                 "[rig]",
                 "titel = 1\n[rig]",
                 "titel",
-                "rig, devices, derived, interlocks, telemetry, dashboard, emulation",
+                "rig, devices, roles, protocols, derived, interlocks, telemetry, dashboard, emulation",
             ),
             ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
             ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title, description"),
@@ -254,7 +255,7 @@ class TestWrongValues:
             (
                 '"heater_laboratory:HeaterTEC"',
                 '"heater_laboratory:NoDriver"',
-                ("devices.tec.driver", "NoDriver plays none of the roles"),
+                ("devices.tec.driver", "is not a Device"),
             ),
             (
                 '"heater_laboratory:HeaterTEC"',
@@ -610,8 +611,8 @@ class TestQuickReader:
         with Rig(load_rig(rig_file(append=SPOT + DERIVED)), VirtualClock(), 1) as rig:
             values = rig.quick_reader(("curvature",))()
             assert set(values) == {"spot_position", "curvature"}
-            derived = rig.file.derived["curvature"]
-            assert values["curvature"] == derived.compute("curvature", {"spot_position": values["spot_position"]})
+            derived = rig.derived["curvature"]
+            assert values["curvature"] == derived.compute({"spot_position": values["spot_position"]})
             # Not unless it is wanted.
             assert set(rig.quick_reader(("spot_position",))()) == {"spot_position"}
 

@@ -5,15 +5,16 @@ import threading
 
 import pytest
 from heater_laboratory import CLOSED, HeaterLaboratory, HeaterTEC
-from heater_protocols import Settle, Stairs, settle, stairs
+from heater_protocols import Stairs, settle, stairs
 from rich.console import Console
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.journal import Event, Record, StepRecord
 from bench.protocol import Dwell, Step, find_protocol, protocol
-from bench.rig import load_rig
+from bench.rig_file import load_rig
 from bench.runs import RIG_FILE_NAME, Run, carry_out, run_card
+from bench.settling import Settled
 from bench.terminal import ProgressDisplay, ask_operator
 
 
@@ -24,11 +25,11 @@ def console():
 
 @pytest.fixture
 def make(tmp_path, rig_file):
-    def run(*replacements, protocol=stairs, parameters=None, **keys):
+    def run(*replacements, protocol=stairs, settings=None, **keys):
         return Run(
             **{
                 "protocol": protocol,
-                "parameters": protocol.parameters() if parameters is None else parameters,
+                "settings": settings or {},
                 "rig": rig_file(*replacements),
                 "folder": tmp_path / "runs" / "deep",
                 "clock": "virtual",
@@ -93,10 +94,10 @@ class TestCarryOut:
     @pytest.mark.parametrize(
         ("keys", "expected"),
         [
-            ({"parameters": Stairs(count=100)}, "rig heater allows 10 to 95 °C"),
+            ({"settings": {"count": 100}}, "rig heater allows 10 to 95 °C"),
             ({"clock": "moon"}, "clock 'moon' is unknown"),
             ({"overrides": {"devices.tec.port": "/dev/ttyUSB9"}}, "has real devices, which know only the wall clock"),
-            ({"protocol": settle, "parameters": Settle(signal="absent")}, "absent"),
+            ({"protocol": settle, "settings": {"signal": "absent"}}, "absent"),
         ],
     )
     def test_what_is_wrong_is_found_before_anything_is_made(self, make, console, keys, expected):
@@ -133,7 +134,7 @@ class TestCarryOut:
     def test_the_packaged_rig_on_a_fast_clock(self, tmp_path, console, clock):
         # Nothing slow may happen while the TEC is on, as its watchdog waits for the next word.
         creep = find_protocol("creep")
-        run = Run(creep, creep.parse({"duration": "8"}), "vo2", tmp_path, clock=clock, recording=False)
+        run = Run(creep, {"duration": "8"}, "vo2", tmp_path, clock=clock, recording=False)
         outcome = carry_out(run, console).outcome
         assert outcome.status == "completed", outcome.reason
         assert outcome.is_safe
@@ -168,7 +169,7 @@ class TestCarryOut:
         # The dry runs before press the keys as well.
         former = signal.signal(signal.SIGINT, lambda *_: None)
         try:
-            outcome = carry_out(make(protocol=definition, parameters=Stairs()), console).outcome
+            outcome = carry_out(make(protocol=definition), console).outcome
         finally:
             signal.signal(signal.SIGINT, former)
         assert seen == [False] * len(seen)
@@ -176,7 +177,7 @@ class TestCarryOut:
         assert "pausing at the next step" in capfd.readouterr().err
 
     def test_a_failure_is_told_with_its_reason(self, make, console):
-        result = carry_out(make(("high = 90.0", "high = 41.0"), parameters=Stairs(dwell=10.0)), console)
+        result = carry_out(make(("high = 90.0", "high = 41.0"), settings={"dwell": 10.0}), console)
         assert result.outcome.status == "failed"
         assert "interlock" in console.file.getvalue()
         with Record(result.folder) as record:
@@ -197,7 +198,7 @@ class TestDisplay:
             display.event(Event(7.0, "INFO", "safe-state", "tec: safe"))
             display.telemetry(1.0, 0, (20.123, float("nan")))
             for step in range(2):
-                display.step(StepRecord(step, 0.0, 8.0, "", "", True, {}, (20.123, 1.0)))
+                display.step(StepRecord(step, 0.0, 8.0, "", "", Settled.DWELL, {}, (20.123, 1.0)))
         return console.file.getvalue()
 
     def test_without_a_terminal_only_events(self):

@@ -5,12 +5,13 @@ from pathlib import Path
 
 from bench.devices import Signal
 from bench.journal import Journal, StepRecord
+from bench.settling import Settled
 
 journal = Journal(Path(sys.argv[1]), (Signal("a", "m", "a"), Signal("b", "m", "b")), {})
 step = 0
 while True:
     value = step * 0.1
     journal.telemetry(value, step, (value, -value))
-    journal.step(StepRecord(step, value, value, "", "", True, {"tec": value}, (value, -value)))
+    journal.step(StepRecord(step, value, value, "", "", Settled.DWELL, {"tec": value}, (value, -value)))
     print(step, flush=True)
     step += 1

@@ -13,8 +13,9 @@ from bench.identification.hybrid_model import HybridModel
 from bench.identification.thermal_network import Design
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
-from bench.protocol import FastLoop, ProtocolParameters, protocol
-from bench.rig import Rig, load_rig
+from bench.protocol import FixedRate, ProtocolParameters, protocol
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import trace_signals
 
 pytestmark = pytest.mark.benchmark
@@ -44,11 +45,18 @@ def through_the_engine(folder, record_every):
     @protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
     def fine(parameters: Nothing):
         """Follow a step."""
-        yield FastLoop(make_controller(), RATE, COUNT / RATE, (DEFLECTION,), ("piezo",), record_every=record_every)
+        yield FixedRate(
+            controller=make_controller(),
+            rate=RATE,
+            duration=COUNT / RATE,
+            inputs=(DEFLECTION,),
+            actuators=("piezo",),
+            record_every=record_every,
+        )
 
     folder.mkdir()
     with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
-        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig)), {})
+        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig, {})), {})
         watch = Stopwatch()
         outcome = Engine(rig, journal, (), Interrupts()).run(fine, Nothing())
         seconds = watch.seconds()

@@ -8,7 +8,8 @@ from scipy.integrate import solve_ivp
 
 from bench.clock import Stopwatch
 from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
 
 pytestmark = pytest.mark.benchmark
 

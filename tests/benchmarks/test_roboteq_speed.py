@@ -9,7 +9,8 @@ import tty
 import pytest
 
 from bench.clock import Stopwatch, VirtualClock, WallClock
-from drivers.roboteq import _VOLTS, RoboteqSupply
+from drivers.roboteq import RoboteqSupply
+from drivers.roboteq.supply import _VOLTS
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer

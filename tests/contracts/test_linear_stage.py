@@ -11,13 +11,9 @@ from bench.clock import VirtualClock
 from bench.devices import LinearStage, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.dynamixel import DynamixelDrum
-from sim_devices.instruments.dynamixel import (
-    COUNT,
-    VELOCITY_UNIT,
-    EmulatedDrum,
-    EmulatedMX28,
-    HardwareError,
-)
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.instruments.dynamixel_drum import EmulatedDrum
+from sim_devices.instruments.dynamixel_table import COUNT, VELOCITY_UNIT, HardwareError
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
@@ -317,7 +313,7 @@ def test_error_is_cleared_by_a_reboot_and_by_recover(bench):
     bench.device.set(0.01).wait()
     bench.servo.trip(HardwareError.OVERLOAD)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"stage: .*overload.*recover"):
+    with pytest.raises(DeviceError, match=r"stage: .*overload.*off and on"):
         bench.connect()
     device = bench.connect(DynamixelDrum.recover)
     device.set(-0.01).wait()

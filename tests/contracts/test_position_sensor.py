@@ -12,14 +12,11 @@ from bench.clock import VirtualClock
 from bench.devices import PositionSensor, role_of
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7PositionSensor
-from sim_devices.instruments.labjack_t7 import (
-    DisplacementSensor,
-    EmulatedPositionSensor,
-    EmulatedT7,
-    NormalisedPSD,
-    RatiometricSensor,
-    TwoCurrentPSD,
-)
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.t7_roles import EmulatedPositionSensor
+from sim_devices.transducers.displacement import DisplacementSensor
+from sim_devices.transducers.magnet import RatiometricSensor
+from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 

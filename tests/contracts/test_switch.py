@@ -12,7 +12,8 @@ from bench.clock import VirtualClock
 from bench.devices import Switch, role_of
 from bench.errors import DeviceError, LimitError
 from drivers.labjack_t7 import T7Switch
-from sim_devices.instruments.labjack_t7 import EmulatedSwitch, EmulatedT7
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.t7_roles import EmulatedSwitch
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 

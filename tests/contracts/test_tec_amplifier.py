@@ -12,7 +12,8 @@ from bench.clock import VirtualClock
 from bench.devices import TECAmplifier, TECMode, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.meerstetter import MeerstetterTEC
-from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
+from sim_devices.instruments.meerstetter_table import DeviceStatus
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.mecom import MeComServer
@@ -406,7 +407,7 @@ def test_error_of_before_is_refused_and_recovered(bench):
     bench.device.set(60.0)
     bench.instrument.trip(183)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"error 183 .*watchdog.*recover"):
+    with pytest.raises(DeviceError, match=r"error 183 .*watchdog.*off and on"):
         bench.connect()
     settings = bench.device._settings
     device = MeerstetterTEC.recover("tec", settings, bench.clock)

@@ -12,7 +12,9 @@ from bench.clock import VirtualClock
 from bench.devices import TemperatureSensor, role_of
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7Thermistor
-from sim_devices.instruments.labjack_t7 import EmulatedT7, EmulatedTemperatureSensor, Thermistor
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.instruments.t7_roles import EmulatedTemperatureSensor
+from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 

@@ -14,9 +14,11 @@ from bench.devices import VoltageSupply, role_of
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
 from drivers.labjack_t7 import T7HighVoltageSupply
 from drivers.roboteq import RoboteqSupply
-from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedHighVoltageSupply, EmulatedT7, PiezoAmplifier
+from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
 from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
+from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
@@ -550,7 +552,7 @@ def test_bluesky_finds_its_protocols(bench):
 
 
 @over_the_wire
-@pytest.mark.parametrize("fault", ["damage_next_answer", "drop_next_answer"])
+@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
 def test_spoilt_answer_is_asked_for_again(bench, output, fault):
     def set_and_wait():
         bench.device.set(5.0).wait()
@@ -608,7 +610,7 @@ def test_emergency_stop_stays_until_it_is_released(bench):
     bench.device.set(6.0)
     bench.device.emergency_stop()
     assert bench.load.voltage == 0.0
-    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+    with pytest.raises(DeviceError, match=r"emergency stop; .*off and on"):
         bench.device.set(5.0)
     with pytest.raises(DeviceError, match="emergency stop"):
         bench.device.measure()
@@ -623,7 +625,7 @@ def test_emergency_stop_of_before_is_refused_and_recovered(bench):
     bench.device.set(6.0)
     bench.instrument.write_object(0x200C, 1)
     bench.device.close()
-    with pytest.raises(DeviceError, match=r"emergency stop; .*recover"):
+    with pytest.raises(DeviceError, match=r"emergency stop; .*off and on"):
         bench.connect()
     applied = len(bench.load.applied)
     device = bench.recover()

@@ -30,7 +30,8 @@ from bench.hysteresis import DeadZones, PrandtlIshlinskii
 from bench.identification.dynamics import PUBLISHED_DYNAMICS, identify_dynamics
 from bench.identification.hybrid_model import HybridModel, identify_pi, identify_polynomial
 from bench.identification.thermal_network import Design, identify_network
-from sim_devices.plants.hybrid import HybridCantilever, HybridParameters
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9
 PERIOD, FAST = 5e-3, 5e-5

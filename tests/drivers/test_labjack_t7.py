@@ -11,18 +11,22 @@ import pytest
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
-from drivers.labjack_t7 import (
-    DigitalOutput,
+from drivers.labjack_t7 import T7HighVoltageSupply, T7PositionSensor, T7Switch, T7Thermistor
+from drivers.labjack_t7.lines import DigitalOutput
+from drivers.labjack_t7.registers import (
+    AIN,
+    AIN_NEGATIVE_CH,
+    AIN_RANGE,
+    AIN_RESOLUTION_INDEX,
+    TEST,
+    TEST_FLOAT32,
     LabJackT7,
-    T7HighVoltageSupply,
-    T7PositionSensor,
-    T7Switch,
-    T7Thermistor,
 )
-from sim_devices.instruments.labjack_t7 import EmulatedT7, PiezoAmplifier
-from sim_devices.wire.modbus_tcp import DEVICE_FAILURE, ModbusTcpServer, RegisterError
+from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
@@ -350,10 +354,10 @@ def test_byte_vectors():
     )
     with Scripted(*exchanges) as server:
         t7 = LabJackT7("psd", server.address, 2.0)
-        assert t7.read_u32(55100) == 0x00112233
-        assert t7.read_f32(55124) == [-9999.0]
-        assert t7.read_f32(0) == [2.5]
-        t7.set_f32("AIN0_RANGE", 40000, 0.1)
+        assert t7.read_integer(TEST) == 0x00112233
+        assert t7.read(TEST_FLOAT32) == [-9999.0]
+        assert t7.read(AIN) == [2.5]
+        t7.set({AIN_RANGE.of(0): 0.1})
         t7.close()
     assert len(server.received) == len(exchanges)
 
@@ -369,7 +373,7 @@ def test_byte_vectors_of_a_ratiometric_sensor():
     with Scripted(*exchanges) as server:
         settings = Settings(port=server.address, **RATIOMETRIC | {"zero_position": 0.0, "position_limits": (0, 0.02)})
         t7 = LabJackT7("slide", server.address, 2.0)
-        sensor = T7PositionSensor("slide", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        sensor = T7PositionSensor("slide", settings, VirtualClock(), t7)
         assert sensor.glance() == {"slide_position": pytest.approx(0.0175)}
         assert sensor.measure() == {"slide_position": pytest.approx(0.0175)}
         sensor.close()
@@ -434,7 +438,7 @@ def test_byte_vectors_of_a_thermistor():
     with Scripted(*exchanges) as server:
         settings = ThermistorSettings(port=server.address, channels=(2, 3))
         t7 = LabJackT7("base", server.address, 2.0)
-        sensor = T7Thermistor("base", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        sensor = T7Thermistor("base", settings, VirtualClock(), t7)
         assert sensor.glance() == {"base_temperature": pytest.approx(25.0, abs=2e-3)}  # 10 kΩ
         assert sensor.measure() == {"base_temperature": pytest.approx(25.0, abs=2e-3)}
         sensor.close()
@@ -462,7 +466,7 @@ def test_byte_vectors_of_a_high_voltage_supply():
     with Scripted(*exchanges) as server:
         settings = SupplySettings(port=server.address, line=5)
         t7 = LabJackT7("hv", server.address, 2.0)
-        supply = T7HighVoltageSupply("hv", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        supply = T7HighVoltageSupply("hv", settings, VirtualClock(), t7)
         supply.set(20.0).wait()
         supply.set(-20.0)
         assert supply.glance() == {"hv_voltage": 20.0, "hv_current": 5e-3}
@@ -476,7 +480,7 @@ def test_byte_vectors_of_dac1():
     with Scripted(*exchanges) as server:
         settings = SupplySettings(port=server.address, line=5, analog_output="dac1", offset_volts=2.5)
         t7 = LabJackT7("hv", server.address, 2.0)
-        supply = T7HighVoltageSupply("hv", VirtualClock(), settings, t7, Identity("LabJack", "T7", "1", "1"))
+        supply = T7HighVoltageSupply("hv", settings, VirtualClock(), t7)
         supply._send(20.0)
         t7.close()
     assert len(server.received) == len(exchanges)
@@ -534,11 +538,11 @@ def test_calibration_of_a_voltage(bench):
 def test_a_refused_setting_is_explained(bench):
     t7 = LabJackT7("psd", bench.server.address, 1.0)
     with pytest.raises(DeviceError, match=r"exception 4 \(device failure\).*40000.*2370 \(AIN range"):
-        t7.set_f32("AIN0_RANGE", 40000, 5.0)
+        t7.set({AIN_RANGE.of(0): 5.0})
     with pytest.raises(DeviceError, match="2373"):
-        t7.set_u16("AIN0_NEGATIVE_CH", 41000, 7)
+        t7.set({AIN_NEGATIVE_CH.of(0): 7})
     with pytest.raises(DeviceError, match="2375"):
-        t7.set_u16("AIN0_RESOLUTION_INDEX", 41500, 13)
+        t7.set({AIN_RESOLUTION_INDEX.of(0): 13})
     t7.close()
 
 
@@ -595,7 +599,7 @@ def test_a_dead_address_is_named(caplog, capfd):
         port = taken.getsockname()[1]
     with (
         caplog.at_level(logging.DEBUG),
-        pytest.raises(DeviceConnectionError, match=rf"psd: nobody .*tcp://127.0.0.1:{port}"),
+        pytest.raises(DeviceConnectionError, match=rf"psd: cannot connect to tcp://127.0.0.1:{port}"),
     ):
         T7PositionSensor.connect("psd", Settings(port=f"127.0.0.1:{port}"), VirtualClock())
     assert not caplog.records
@@ -634,14 +638,14 @@ def test_a_host_that_hangs_up_in_the_middle():
     with Scripted(("0001 0000 0006 01 03 d73c 0002", None)) as server:
         t7 = LabJackT7("psd", server.address, 1.0)
         with pytest.raises(DeviceConnectionError, match="connection broke"):
-            t7.read_u32(55100)
+            t7.read_integer(TEST)
 
 
 def test_too_few_registers_are_noticed():
     with Scripted(("0001 0000 0006 01 03 d73c 0002", "0001 0000 0005 01 03 02 0011")) as server:
         t7 = LabJackT7("psd", server.address, 1.0)
         with pytest.raises(DeviceError, match="1 registers where 2"):
-            t7.read_u32(55100)
+            t7.read_integer(TEST)
         t7.close()
 
 
@@ -1049,7 +1053,7 @@ def test_a_watchdog_that_ran_out_is_named_once(bench, call):
     with pytest.raises(
         DeviceError,
         match=WENT_OFF
-        + r"is off: the watchdog of the instrument has run out, as nobody talked to it for 3 s, or another "
+        + r"is off: the watchdog of the instrument has run out, as no host communicated with it for 3 s, or another "
         r"program switched the line" + SET_AGAIN,
     ):
         call(supply)
@@ -1267,7 +1271,7 @@ def test_the_message_of_the_watchdog_has_its_time(bench):
     bench.switch(line=6, watchdog=4)
     switch.set(1.0)
     bench.clock.sleep(4.0)
-    with pytest.raises(DeviceError, match=r"fan: DIO5 is off .* nobody talked to it for 4 s"):
+    with pytest.raises(DeviceError, match=r"fan: DIO5 is off .* no host communicated with it for 4 s"):
         switch.glance()
 
 

@@ -12,8 +12,9 @@ from pydantic import ValidationError
 from bench.clock import VirtualClock
 from bench.devices import TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
-from drivers import meerstetter
 from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
+from drivers.meerstetter import tec as driver
+from drivers.meerstetter.mecom import RefusedError, TECLine, decode, encode
 from sim_devices.protocol_emulated import register, unregister
 
 PORT = "emulated://scripted-tec"
@@ -116,7 +117,7 @@ def connect(clock, **changes):
 def line(script):
     # The maker's examples use the address that every device answers to.
     settings = make_settings().model_copy(update={"address": 0})
-    return meerstetter._Line("tec", settings)
+    return TECLine("tec", settings)
 
 
 @pytest.fixture
@@ -143,21 +144,21 @@ def test_sequences_of_the_maker(script, line, sequence, request_text, digits, se
 def test_server_error_of_the_maker(script, line):
     script.instead = [b"!0015AC+0532DA\r"]
     line._sequence = 0x15AB
-    with pytest.raises(meerstetter._RefusedError, match="parameter is not available") as caught:
+    with pytest.raises(RefusedError, match="parameter is not available") as caught:
         line.ask("?VR04D201", 8)
     assert caught.value.code == 5
     assert script.received == [b"#0015AC?VR04D2017BFE\r"]
 
 
 def test_values_of_the_maker():
-    temperature = meerstetter._decode("tec", meerstetter._OBJECT_TEMPERATURE, "41CD2F28")
+    temperature = decode("tec", driver._OBJECT_TEMPERATURE, "41CD2F28")
     assert temperature == pytest.approx(25.648, abs=5e-5)
-    assert meerstetter._encode(meerstetter._TARGET, 21.75) == "41AE0000"
+    assert encode(driver._TARGET, 21.75) == "41AE0000"
 
 
 def test_first_frame_of_a_connection_is_whole(script, clock):
     settings = make_settings()
-    line = meerstetter._Line("tec", settings)
+    line = TECLine("tec", settings)
     line.order("VS07E401BF000000")
     assert script.received == [b"#010001VS07E401BF000000E796\r"]
 
@@ -171,11 +172,11 @@ def test_sequence_number_turns_over(script, line):
 
 @given(st.floats(width=32, allow_nan=False), st.integers(-(2**31), 2**31 - 1))
 def test_values_survive_coding(real, integer):
-    for parameter, value in ((meerstetter._TARGET, real), (meerstetter._STATUS, integer)):
-        digits = meerstetter._encode(parameter, value)
+    for parameter, value in ((driver._TARGET, real), (driver._STATUS, integer)):
+        digits = encode(parameter, value)
         assert len(digits) == 8
         assert digits == digits.upper()
-        assert meerstetter._decode("tec", parameter, digits) == value
+        assert decode("tec", parameter, digits) == value
 
 
 def test_identity(tec):
@@ -406,7 +407,7 @@ def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
     script, clock = Script(), VirtualClock()
     register("fuzzed-tec", script, clock)
     try:
-        line = meerstetter._Line("tec", make_settings(port="emulated://fuzzed-tec"))
+        line = TECLine("tec", make_settings(port="emulated://fuzzed-tec"))
         script.instead = list(replies)
         with pytest.raises(DeviceConnectionError):
             line.ask("?VR03E801", 8)
@@ -457,7 +458,7 @@ def test_wrong_device(script, clock):
 
 def test_device_with_an_error_is_refused_and_recovered_on_request(script, clock):
     script.values |= {104: 3, 105: 183}
-    with pytest.raises(DeviceError, match=r"error 183 .*recover"):
+    with pytest.raises(DeviceError, match=r"error 183 .*off and on"):
         connect(clock)
     assert script.orders() == []
     script.on_order = lambda text: script.values.update({104: 5} if text == "RS" else {})

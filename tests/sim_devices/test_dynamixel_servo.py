@@ -14,22 +14,23 @@ from hypothesis import strategies as st
 from bench.clock import VirtualClock
 from bench.errors import DeviceConnectionError, DeviceError
 from sim_devices.instruments.dynamixel import (
+    FULL_LOAD_HEATING,
+    HEATING_TIME,
+    OVERLOAD_TIME,
+    REBOOT_TIME,
+    EmulatedMX28,
+)
+from sim_devices.instruments.dynamixel_motion import NO_LOAD_SPEED_PER_VOLT, Trajectory
+from sim_devices.instruments.dynamixel_table import (
     ACCELERATION_UNIT,
     COUNT,
     COUNTS_PER_TURN,
-    FULL_LOAD_HEATING,
-    HEATING_TIME,
     ITEMS,
-    NO_LOAD_SPEED_PER_VOLT,
-    OVERLOAD_TIME,
-    REBOOT_TIME,
     VELOCITY_UNIT,
-    EmulatedMX28,
     ErrorNumber,
     HardwareError,
-    RequestRefusedError,
-    Trajectory,
 )
+from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.dynamixel2 import LONGEST_FRAME, Dynamixel2Server, Instruction, crc16, frame
 from sim_devices.world import World

@@ -8,7 +8,8 @@ import serial
 
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
-from bench.rig import Rig, load_rig
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from sim_devices.hybrid import (
     ENABLE_LINE,
     GAIN,

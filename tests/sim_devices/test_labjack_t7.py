@@ -17,30 +17,15 @@ from pymodbus.client import ModbusTcpClient
 
 from bench.clock import VirtualClock
 from bench.errors import DeviceError
-from sim_devices.instruments.labjack_t7 import (
-    CONVERSIONS,
-    DAC_STEP,
-    RAIL,
-    STEINHART_HART,
-    TDAC_STEP,
-    DisplacementSensor,
-    EmulatedHighVoltageSupply,
-    EmulatedPositionSensor,
-    EmulatedSwitch,
-    EmulatedT7,
-    NormalisedPSD,
-    PiezoAmplifier,
-    RatiometricSensor,
-    Thermistor,
-    TwoCurrentPSD,
-)
-from sim_devices.wire.modbus_tcp import (
-    FramingError,
-    ModbusTcpServer,
-    ModbusTcpStream,
-    RegisterError,
-    answer,
-)
+from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, TDAC_STEP, EmulatedT7
+from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply, EmulatedPositionSensor, EmulatedSwitch
+from sim_devices.transducers.displacement import DisplacementSensor
+from sim_devices.transducers.magnet import RatiometricSensor
+from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
+from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.transducers.thermistor import STEINHART_HART, Thermistor
+from sim_devices.wire.modbus import RegisterError, answer
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpServer, ModbusTcpStream
 from sim_devices.world import World
 
 LSB = 2 * RAIL * 10 / 65536

@@ -8,7 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
-from sim_devices.instruments.meerstetter_tec import PARAMETERS, DeviceStatus, EmulatedTEC
+from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire.mecom import LONGEST_FRAME, MeComServer
 from sim_devices.world import World
 

@@ -8,13 +8,9 @@ import pytest
 from bench.clock import VirtualClock
 from bench.devices import TECMode
 from bench.errors import DeviceConnectionError, DeviceError
-from sim_devices.instruments.meerstetter_tec import (
-    PARAMETERS,
-    DeviceStatus,
-    EmulatedTEC,
-    RequestRefusedError,
-    ServerError,
-)
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus, ServerError
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.world import World
 
 AMBIENT = 22.0

@@ -8,8 +8,9 @@ import serial
 
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceError
-from bench.rig import Rig, load_rig
-from sim_devices.instruments.dynamixel import VELOCITY_UNIT
+from bench.rig import Rig
+from bench.rig_file import load_rig
+from sim_devices.instruments.dynamixel_table import VELOCITY_UNIT
 from sim_devices.muscles import (
     FAN_LINE,
     LOAD,

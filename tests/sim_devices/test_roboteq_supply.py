@@ -16,15 +16,8 @@ from hypothesis import strategies as st
 from bench.clock import VirtualClock, WallClock
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.roboteq import RoboteqSupply
-from sim_devices.instruments.roboteq import (
-    DICTIONARY,
-    AbortCode,
-    ChannelFlag,
-    EmulatedRoboteq,
-    Fault,
-    NodeState,
-    TransferAbortedError,
-)
+from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.instruments.roboteq import DICTIONARY, AbortCode, ChannelFlag, EmulatedRoboteq, Fault, NodeState
 from sim_devices.wire.canopen_slcan import BITRATES, LONGEST_LINE, CanopenSlcanServer
 from sim_devices.world import World
 
@@ -86,10 +79,10 @@ class TestInstrument:
                 value = device.read_object(index, sub)
                 assert isinstance(value, str if row.kind == "text" else int)
             else:
-                with pytest.raises(TransferAbortedError, match="WRITE_ONLY"):
+                with pytest.raises(RequestRefusedError, match="WRITE_ONLY"):
                     device.read_object(index, sub)
             if not row.writable:
-                with pytest.raises(TransferAbortedError, match="READ_ONLY"):
+                with pytest.raises(RequestRefusedError, match="READ_ONLY"):
                     device.write_object(index, 0, sub)
 
     @pytest.mark.parametrize(
@@ -98,13 +91,13 @@ class TestInstrument:
     )
     def test_object_that_is_not_there(self, device, index, sub, code):
         for call in (lambda: device.read_object(index, sub), lambda: device.write_object(index, 0, sub)):
-            with pytest.raises(TransferAbortedError) as caught:
+            with pytest.raises(RequestRefusedError) as caught:
                 call()
-            assert caught.value.code == code
+            assert caught.value.reason == code
 
     @pytest.mark.parametrize("value", [-1001, 1001, 2**31 - 1])
     def test_command_beyond_its_range(self, device, load, value):
-        with pytest.raises(TransferAbortedError, match="VALUE"):
+        with pytest.raises(RequestRefusedError, match="VALUE"):
             device.write_object(COMMAND, value, 1)
         assert load.applied == []
 
@@ -447,7 +440,7 @@ class TestAdapter:
         query = b"t6018400D210200000000\r"
         device.drop_next_answer()
         assert server.receive(query) == b"z\r"
-        device.damage_next_answer()
+        device.corrupt_next_answer()
         assert server.receive(query) == b"z\rt58184B0D21\r"
         assert server.receive(query) == b"z\rt58184B0D2102F0000000\r"
         device.unplug()

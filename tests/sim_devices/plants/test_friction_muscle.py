@@ -315,9 +315,9 @@ class NaiveMuscle:
         self.p = muscle.parameters
         stiffness, self.weight, self.share = kernels.contact_table(self.p)
         self.stiffness = stiffness * 1e3
-        self.rest = muscle._coefficients[kernels.REST] * 1e-3
+        self.rest = muscle._coefficients["rest"] * 1e-3
         self.x = muscle.length + self.rest
-        self.contacts = muscle._forces.copy()
+        self.contacts = muscle._parts.forces.copy()
         self.drive = drive
         self.arm = 0.0
         self.force = muscle.force
@@ -355,7 +355,7 @@ class NaiveMuscle:
         assert muscle.length == pytest.approx(self.x - self.rest, abs=1e-11)
         assert muscle.force == pytest.approx(self.force, abs=1e-6)
         assert muscle.position == pytest.approx(self.position, abs=1e-11)
-        assert muscle._forces == pytest.approx(self.contacts, abs=1e-7)
+        assert muscle._parts.forces == pytest.approx(self.contacts, abs=1e-7)
 
 
 class NaiveMcKibben(NaiveMuscle):

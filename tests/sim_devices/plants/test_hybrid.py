@@ -13,9 +13,9 @@ from bench.clock import VirtualClock
 from bench.devices import TECMode
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants import _hybrid_kernels as kernels
-from sim_devices.plants.hybrid import (
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.plants.hybrid_parameters import (
     Bimorph,
-    HybridCantilever,
     HybridParameters,
     piezo_dynamics,
     piezo_sensitivity,

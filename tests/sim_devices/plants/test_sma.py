@@ -238,7 +238,10 @@ class TestGrains:
         before = martensite.copy(), oriented.copy()
         scratch = np.empty((2, martensite.size))
         found = kernels.solve_stress(
-            millimetres, temperature, committed, wire._coefficients, grains, martensite, oriented, scratch
+            millimetres,
+            temperature,
+            committed,
+            kernels.Parts(wire._state, wire._coefficients, grains, martensite, oriented, scratch),
         )
         assert found == pytest.approx(expected, abs=1e-7)
         # A trial leaves the committed state alone.
@@ -263,7 +266,7 @@ class TestGrains:
         """Follow a wire under dead loads through every sub-step."""
         wire = make(SMAParameters(ambient_sd=0.3), seed=5)
         grains = grain_table(wire.parameters)
-        state = wire._martensite.copy(), wire._oriented.copy()
+        state = wire._parts.martensite.copy(), wire._parts.oriented.copy()
         temperature, stress = wire.temperature, 0.0
         script = np.random.default_rng(8)
         visited = []
@@ -284,8 +287,8 @@ class TestGrains:
                 warm = temperature + (wire.temperature - temperature) * part / parts
                 state = naive_update(warm, stress, 0.4, grains, *state)
             temperature = wire.temperature
-            assert np.array_equal(wire._martensite, state[0])
-            assert np.array_equal(wire._oriented, state[1])
+            assert np.array_equal(wire._parts.martensite, state[0])
+            assert np.array_equal(wire._parts.oriented, state[1])
             expected = naive_position(wire, temperature, stress, *state)
             assert wire.position == pytest.approx(expected, abs=1e-12)
             assert wire.length == pytest.approx(expected - load / 20e3, abs=1e-12)
@@ -300,7 +303,7 @@ class TestGrains:
         for load in np.linspace(0.0, 9.0, 73):
             bit_by_bit.hang(float(load))
             bit_by_bit.advance(0.1)
-        assert np.array_equal(once._oriented, bit_by_bit._oriented)
+        assert np.array_equal(once._parts.oriented, bit_by_bit._parts.oriented)
         assert once.length == bit_by_bit.length
 
 
@@ -331,11 +334,7 @@ class TestClamped:
                 float(wire._state[kernels.POSITION]),
                 wire.temperature,
                 stress,
-                wire._coefficients,
-                wire._grains,
-                wire._martensite,
-                wire._oriented,
-                wire._scratch,
+                wire._parts,
             )
             assert again == pytest.approx(stress, abs=1e-7)
 

@@ -200,7 +200,7 @@ class TestHysteresis:
             assert drive == pytest.approx(float(plant._state[kernels.DRIVE]), abs=1e-9)
             drive = float(plant._state[kernels.DRIVE])
             assert plant.r_fraction == fraction
-            assert np.array_equal(plant._on, on)
+            assert np.array_equal(plant._parts.on, on)
             visited.append(fraction)
         assert min(visited) < 0.05
         assert max(visited) > 0.95

@@ -14,8 +14,20 @@ from bench.engine import Engine, check_before_moving
 from bench.errors import AbortError, ConfigurationError, DeviceError, InterlockError, LimitError
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal, Record
-from bench.protocol import LATENESS, TRACES, Dwell, FastLoop, ProtocolParameters, Step, find_protocol, plan, protocol
-from bench.rig import Rig, load_rig
+from bench.protocol import (
+    LATENESS,
+    TRACES,
+    Dwell,
+    FixedRate,
+    ProtocolParameters,
+    Settled,
+    Step,
+    find_protocol,
+    plan,
+    protocol,
+)
+from bench.rig import Rig
+from bench.rig_file import load_rig
 from bench.runs import trace_signals
 
 PERIOD = 0.5
@@ -61,7 +73,7 @@ class Controller:
 
 
 def loop(controller, rate=10.0, duration=1.0, inputs=("probe_temperature",), actuators=("tec",), **keys):
-    return FastLoop(controller, rate, duration, inputs, actuators, **keys)
+    return FixedRate(controller=controller, rate=rate, duration=duration, inputs=inputs, actuators=actuators, **keys)
 
 
 def define(*messages):
@@ -71,7 +83,7 @@ def define(*messages):
         """Run them."""
         for message in messages:
             reading = yield message
-            assert reading.settled
+            assert not reading.settled.failed
 
     return protocol(needs=(), controls="probe_temperature")(go)
 
@@ -106,13 +118,13 @@ class Bench:
         parameters = definition.parameters()
         signals = (*self.rig.signals, *TRACES, LATENESS)
         if definition.controls in [signal.name for signal in self.rig.signals]:
-            signals = (*self.rig.signals, *trace_signals(definition, self.rig))
+            signals = (*self.rig.signals, *trace_signals(definition, self.rig, {}))
         journal = Journal(self.folder / FILE_NAME, signals, {})
         try:
             return Engine(self.rig, journal, (self.watcher,), self.interrupts).run(definition, parameters)
         finally:
             journal.close()
-            self.rig.__exit__(None, None, None)
+            self.rig.close()
 
     @property
     def sent(self):
@@ -222,7 +234,7 @@ class TestTiming:
         b.devices["probe"].measure = lambda: {**measured(), "probe_temperature": 12.5}
         b.run(protocol(needs=(), controls="probe_temperature")(go))
         (reading,) = seen
-        assert (reading.step, reading.time, reading.settled) == (0, 5.0, True)
+        assert (reading.step, reading.time, reading.settled) == (0, 5.0, Settled.CONTROLLED)
         assert reading["probe_temperature"] == 12.5
         assert reading["tec_setpoint"] == 40.0
         assert reading["tec_temperature"] == pytest.approx(40.0, abs=0.2)
@@ -360,8 +372,8 @@ class TestInputs:
         assert [measured[0] for _, measured in controller.seen] == samples["curvature"].tolist()
         position = samples["spot_position"]
         assert np.all(np.diff(position) > 0)
-        derived = b.rig.file.derived["curvature"]
-        expected = [derived.compute("curvature", {"spot_position": value}) for value in position]
+        derived = b.rig.derived["curvature"]
+        expected = [derived.compute({"spot_position": value}) for value in position]
         assert samples["curvature"].tolist() == expected
 
 

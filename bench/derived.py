@@ -1,0 +1,196 @@
+"""Signals that are computed from others: an expression with units, or a class of one's own.
+
+A rig file asks for them by tables::
+
+    [derived.strain]
+    expression = "gain * (bridge_a_voltage - bridge_b_voltage)"
+    constants = { gain = "2.5e-3 1/V" }
+    unit = "1"
+
+    [derived.curvature]
+    kind = "beam-curvature"             # registered in `bench.derived_signals`, or module:Class
+    source = "spot_position"
+    length = 300e-6
+
+They are computed in their order in the file; each may use those above it.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from simpleeval import SimpleEval
+
+from bench.devices import Signal
+from bench.errors import DeviceError
+
+_OPERATORS = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_FUNCTIONS: dict[str, Callable[..., float]] = {
+    "abs": abs,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "atan": math.atan,
+    "min": min,
+    "max": max,
+}
+_ON_QUANTITIES: dict[str, Callable[..., Any]] = {
+    **{name: getattr(np, name) for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tan")},
+    "atan": np.arctan,
+    "min": np.minimum,
+    "max": np.maximum,
+}
+"""The same functions on quantities with units."""
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A derived signal of one rig, ready to be computed.
+
+    Attributes
+    ----------
+    signal : Signal
+        What it gives.
+    sources : tuple of str
+        Signals that it is computed from.
+    compute : callable
+        Takes the values of all signals above it, returns its own. Raises `DeviceError` if it has none for these.
+    """
+
+    signal: Signal
+    sources: tuple[str, ...]
+    compute: Callable[[Mapping[str, float]], float]
+
+
+class DerivedSignal(BaseModel, ABC):
+    """Base of the kinds of derived signals; its fields are the keys of the table in the rig file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    kind: str = Field(default="expression", description="which class computes it")
+
+    @property
+    @abstractmethod
+    def sources(self) -> tuple[str, ...]:
+        """Signals that it is computed from."""
+
+    @abstractmethod
+    def bind(self, name: str, units: Mapping[str, str]) -> Derived:
+        """Return the signal for sources of these units.
+
+        Parameters
+        ----------
+        name : str
+            Name of the table.
+        units : mapping of str to str
+            Unit of each source.
+
+        Raises
+        ------
+        ValueError
+            If a unit does not fit; says which unit is expected.
+        """
+
+
+class Expression(DerivedSignal):
+    """An arithmetic expression over signals and constants, with its unit.
+
+    Temperatures in °C count as differences, in K without an offset.
+    """
+
+    expression: str = Field(
+        min_length=1, description=f"arithmetic over signals and constants; functions: {', '.join(_FUNCTIONS)}"
+    )
+    unit: str = Field(description="unit of the result; 1 for a plain number")
+    constants: dict[str, str | float] = Field(
+        default_factory=dict, description='numbers by name, with units as in "300e-6 m"'
+    )
+    description: str = Field(default="", description="a few words for axes and column headers")
+    precision: int = Field(default=3, ge=0, le=12, description="digits after the point that are worth showing")
+
+    @field_validator("expression")
+    @classmethod
+    def _can_be_parsed(cls, text: str) -> str:
+        # The parser passes on whatever Python's own grammar objects to.
+        try:
+            SimpleEval().parse(text)
+        except Exception as error:
+            raise ValueError(f"is not an arithmetic expression: {error}") from None
+        return text
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Signals that the expression names."""
+        names = [node.id for node in ast.walk(SimpleEval().parse(self.expression)) if isinstance(node, ast.Name)]
+        return tuple(name for name in dict.fromkeys(names) if name not in self.constants and name not in _FUNCTIONS)
+
+    def bind(self, name: str, units: Mapping[str, str]) -> Derived:
+        """Return the signal; see `DerivedSignal.bind`."""
+        constants = {key: _quantity(f"constants.{key}", str(value)) for key, value in self.constants.items()}
+        quantities = constants | {source: _quantity(source, f"1 {units[source]}") for source in self.sources}
+        wanted = _quantity("unit", f"1 {self.unit}")
+        check = SimpleEval(operators=_OPERATORS, functions=_ON_QUANTITIES, names=quantities)
+        # Only the units matter here; the library raises many kinds of errors.
+        try:
+            found = _units().Quantity(check.eval(self.expression))
+        except Exception as error:
+            raise ValueError(f"expression = {self.expression!r}: {error}") from None
+        if not found.is_compatible_with(wanted):
+            raise ValueError(f"expression = {self.expression!r} is in {found.units:~P}, not in unit = {self.unit!r}")
+        # Everything is computed in SI base units, whatever the sources are in.
+        factors = {key: float(_in_base_units(quantity)) for key, quantity in quantities.items()}
+        scale = 1.0 / float(_in_base_units(wanted))
+        evaluator = SimpleEval(operators=_OPERATORS, functions=_FUNCTIONS)
+        tree = evaluator.parse(self.expression)
+        sources = self.sources
+
+        def compute(values: Mapping[str, float]) -> float:
+            evaluator.names = factors | {source: values[source] * factors[source] for source in sources}
+            try:
+                return scale * float(evaluator.eval(self.expression, previously_parsed=tree))
+            except (ArithmeticError, ValueError) as error:
+                shown = ", ".join(f"{source} = {values[source]:g}" for source in sources)
+                raise DeviceError(name, f"{self.expression} has no value for {shown}: {error}") from None
+
+        description = self.description or name.replace("_", " ")
+        return Derived(Signal(name, self.unit, description, self.precision), sources, compute)
+
+
+@cache
+def _units() -> Any:  # noqa: ANN401 - the library's registry has no useful type
+    # It takes a second to import, which only rigs with expressions should pay for.
+    from pint import UnitRegistry
+
+    return UnitRegistry()
+
+
+def _quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the library's
+    number, _, unit = text.strip().partition(" ")
+    try:
+        return _units().Quantity(float(number), unit.replace("°C", "K") or "1")
+    except Exception as error:
+        raise ValueError(f"{key} = {text!r}: expected a number and a unit, such as '300e-6 m': {error}") from None
+
+
+def _in_base_units(quantity: Any) -> float:  # noqa: ANN401 - a quantity of the library's
+    return float(quantity.to_base_units().magnitude)

@@ -1,0 +1,61 @@
+"""Protocols: the vocabulary of operator scripts, their parameters, their dry run, and where they come from."""
+
+from bench.binding import Slot, Slots
+from bench.protocol.discovery import Packaged, find_protocol, packaged_protocols
+from bench.protocol.parameters import (
+    ParameterHelp,
+    ProtocolDefinition,
+    ProtocolParameters,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
+from bench.protocol.plan import Plan, plan
+from bench.protocol.vocabulary import (
+    LATENESS,
+    TRACES,
+    Control,
+    FixedRate,
+    Message,
+    Messages,
+    Note,
+    Phase,
+    Prompt,
+    Reading,
+    Step,
+)
+from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
+
+__all__ = [
+    "LATENESS",
+    "TRACES",
+    "Arrived",
+    "Control",
+    "Dwell",
+    "FixedRate",
+    "Message",
+    "Messages",
+    "Note",
+    "Packaged",
+    "ParameterHelp",
+    "Phase",
+    "Plan",
+    "Prompt",
+    "ProtocolDefinition",
+    "ProtocolParameters",
+    "Reading",
+    "Settle",
+    "Settled",
+    "Slot",
+    "Slots",
+    "Step",
+    "UntilSteady",
+    "find_protocol",
+    "from_slot",
+    "packaged_protocols",
+    "parameter",
+    "plan",
+    "protocol",
+    "unit_of",
+]

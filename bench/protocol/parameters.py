@@ -1,0 +1,338 @@
+"""Parameters of protocols: their declaration, their defaults from a rig, and their help."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticUndefined
+
+from bench.binding import RoleTable, Slots, rate_unit
+from bench.devices import Device, Signal
+from bench.errors import ConfigurationError
+from bench.protocol.vocabulary import Messages
+
+Needs = Mapping[str, type[Device] | type[Signal]] | Sequence[str]
+"""Slots by name with the kind of each, or names of devices and signals of one rig."""
+
+
+@dataclass(frozen=True)
+class FromSlot:
+    """A default that comes from what the rig file says of a slot; see `from_slot`."""
+
+    slot: str
+    take: Callable[[RoleTable], Any]
+    text: str
+    fallback: Any
+
+
+def from_slot(
+    slot: str,
+    what: str | Callable[[RoleTable], Any],
+    text: str = "",
+    *,
+    fallback: Any = None,  # noqa: ANN401
+) -> Any:  # noqa: ANN401 - stands for a default of any type
+    """Return a default for `parameter` that comes from the rig.
+
+    Parameters
+    ----------
+    slot : str
+        Name of the slot.
+    what : str or callable
+        Attribute of the slot's `RoleTable`, such as `low`; or a function of it.
+    text : str
+        What it is, for help texts; made from `what` if not given.
+    fallback
+        Value where the rig file does not say; without one the parameter must then be given.
+    """
+    if callable(what):
+        return FromSlot(slot, what, text, fallback)
+    return FromSlot(slot, lambda table: getattr(table, what), text or f"`{what}` of {slot}", fallback)
+
+
+def unit_of(slot: str) -> str:
+    """Return a unit for `parameter` that is that of a slot; with `/s` behind it, that of its rate of change."""
+    return f"@{slot}"
+
+
+class ProtocolParameters(BaseModel):
+    """Base of a protocol's parameters; declare each with `parameter`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def parameter(
+    default: Any,  # noqa: ANN401 - whatever type the field has
+    *,
+    unit: str,
+    help: str,  # noqa: A002 - the word that the user sees
+    low: float | None = None,
+    high: float | None = None,
+    choices: Callable[[], Sequence[str]] | None = None,
+) -> Any:  # noqa: ANN401 - stands for a field's default
+    """Declare a parameter of a protocol.
+
+    Parameters
+    ----------
+    default
+        Value when nothing is said; `...` if it must be given, `from_slot(...)` if the rig says it.
+    unit : str
+        Its unit; `1` for a count or a plain number, empty for a text, `unit_of(...)` for that of a slot.
+    help : str
+        What it does, in one sentence without a full stop.
+    low, high : float, optional
+        The allowed range, both ends included.
+    choices : callable, optional
+        Returns the texts that are allowed, where these are registered by name.
+    """
+    extra: dict[str, Any] = {"unit": unit, "choices": choices}
+    if isinstance(default, FromSlot):
+        extra["default"] = default
+        default = ...
+    return Field(default, description=help, ge=low, le=high, json_schema_extra=extra)
+
+
+@dataclass(frozen=True)
+class ParameterHelp:
+    """One parameter as help texts show it."""
+
+    name: str
+    default: str
+    unit: str
+    allowed: str
+    text: str
+
+
+@dataclass(frozen=True)
+class ProtocolDefinition:
+    """A protocol that can be run: its name, its parameters, and its generator function.
+
+    Attributes
+    ----------
+    name, summary, description : str
+        For lists and help texts.
+    needs : mapping or tuple of str
+        Slots with the kind of each; or names of devices and signals, for a script that is written for one rig.
+    may_use : mapping
+        Slots that it uses where the rig binds them.
+    controls : str
+        Slot or signal that its controllers control; empty if it has none.
+    parameters : type of ProtocolParameters
+        What can be set.
+    generator : callable
+        Takes the parameters, and the slots where it asks for some.
+    """
+
+    name: str
+    summary: str
+    description: str
+    needs: Mapping[str, type[Device] | type[Signal]] | tuple[str, ...]
+    controls: str
+    parameters: type[ProtocolParameters]
+    generator: Callable[..., Messages]
+    may_use: Mapping[str, type[Device] | type[Signal]] = field(default_factory=dict)
+
+    @property
+    def slots(self) -> Mapping[str, type[Device] | type[Signal]]:
+        """The slots that it asks for, with the kind of each."""
+        return self.needs if isinstance(self.needs, Mapping) else {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The devices and signals that it names."""
+        return () if isinstance(self.needs, Mapping) else self.needs
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether a model file has to be given."""
+        info = self.parameters.model_fields.get("model")
+        return info is not None and info.is_required()
+
+    def controlled(self, slots: Slots) -> str:
+        """Return the signal that its controllers control; empty if it has none."""
+        return slots[self.controls].signal if self.controls in self.slots else self.controls
+
+    def start(self, parameters: ProtocolParameters, slots: Slots) -> Messages:
+        """Return its messages from the first."""
+        return self.generator(parameters, slots) if self.slots else self.generator(parameters)
+
+    def parse(
+        self,
+        settings: Mapping[str, Any],
+        roles: Mapping[str, RoleTable] | None = None,
+        defaults: Mapping[str, Any] | None = None,
+        *,
+        path: str = "",
+    ) -> ProtocolParameters:
+        """Make parameters from texts such as those of `--set`, and from what a rig file says.
+
+        Parameters
+        ----------
+        settings : mapping
+            What was set, as text or as values.
+        roles : mapping of str to RoleTable, optional
+            The roles that the rig file binds.
+        defaults : mapping, optional
+            The rig file's own table of this protocol; settings come before it, it comes before the roles.
+        path : str
+            The rig file, for messages.
+
+        Raises
+        ------
+        ConfigurationError
+            If a name is unknown or a value is missing or not allowed; it names all that is wrong.
+        """
+        for name in defaults or {}:
+            if name not in self.parameters.model_fields:
+                known = ", ".join(self.parameters.model_fields) or "none"
+                raise ConfigurationError(
+                    f"{path}: protocols.{self.name}.{name}: there is no such parameter; there are: {known}"
+                )
+        merged = self._from_roles(roles or {}) | dict(defaults or {}) | dict(settings)
+        try:
+            parameters = self.parameters.model_validate(merged)
+        except ValidationError as error:
+            raise ConfigurationError("\n".join(self._explain(error))) from None
+        for name in self.parameters.model_fields:
+            choices = self._extra(name).get("choices")
+            if choices is not None and getattr(parameters, name) not in choices():
+                raise ConfigurationError(
+                    f"protocol {self.name}: parameter {name} = {getattr(parameters, name)!r} is not allowed; "
+                    f"allowed: {', '.join(choices())}"
+                )
+        return parameters
+
+    def help(
+        self, roles: Mapping[str, RoleTable] | None = None, defaults: Mapping[str, Any] | None = None
+    ) -> tuple[ParameterHelp, ...]:
+        """Return what there is to set; with a rig's roles and table, its defaults and units."""
+        given = self._from_roles(roles or {}) | dict(defaults or {})
+        return tuple(self._parameter_help(name, roles or {}, given) for name in self.parameters.model_fields)
+
+    def _extra(self, name: str) -> dict[str, Any]:
+        extra = self.parameters.model_fields[name].json_schema_extra
+        return cast("dict[str, Any]", extra) if isinstance(extra, dict) else {}
+
+    def _from_roles(self, roles: Mapping[str, RoleTable]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name in self.parameters.model_fields:
+            default = self._extra(name).get("default")
+            if isinstance(default, FromSlot):
+                value = default.take(roles[default.slot]) if default.slot in roles else None
+                value = default.fallback if value is None else value
+                if value is not None:
+                    found[name] = value
+        return found
+
+    def _parameter_help(self, name: str, roles: Mapping[str, RoleTable], given: Mapping[str, Any]) -> ParameterHelp:
+        info = self.parameters.model_fields[name]
+        extra = self._extra(name)
+        unit = str(extra.get("unit", ""))
+        if unit.startswith("@"):
+            slot, slash, _ = unit[1:].partition("/")
+            unit = (roles[slot].unit if slot in roles else None) or f"unit of {slot}"
+            unit = rate_unit(unit) if slash else unit
+        low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), None)
+        high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), None)
+        if extra.get("choices") is not None:
+            allowed = ", ".join(extra["choices"]())
+        elif low is not None and high is not None:
+            allowed = f"{low:g} to {high:g}"
+        elif low is not None:
+            allowed = f"≥ {low:g}"
+        elif high is not None:
+            allowed = f"≤ {high:g}"
+        elif get_origin(info.annotation) is Literal:
+            allowed = ", ".join(map(str, get_args(info.annotation)))
+        elif info.annotation is bool:
+            allowed = "true, false"
+        else:
+            allowed = "any text" if info.annotation is str else "any number"
+        source = extra.get("default")
+        if name in given:
+            default = str(given[name])
+        elif isinstance(source, FromSlot):
+            default = f"the rig's: {source.text}"
+        else:
+            default = "must be given" if info.default is PydanticUndefined else str(info.default)
+        return ParameterHelp(name, default, unit, allowed, info.description or "")
+
+    def _explain(self, error: ValidationError) -> Iterator[str]:
+        for problem in error.errors():
+            name = ".".join(str(part) for part in problem["loc"]) or "parameters"
+            if problem["type"] == "extra_forbidden":
+                known = ", ".join(self.parameters.model_fields) or "none"
+                yield f"protocol {self.name}: there is no parameter {name!r}; there are: {known}"
+            elif name in self.parameters.model_fields:
+                entry = self._parameter_help(name, {}, {})
+                unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
+                given = "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
+                if problem["type"] == "missing" and isinstance(source := self._extra(name).get("default"), FromSlot):
+                    given += f" (the rig file does not say {source.text})"
+                yield (
+                    f"protocol {self.name}: parameter {name} {given}; "
+                    f"allowed: {entry.allowed}{unit} ({problem['msg']})"
+                )
+            else:
+                yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
+
+
+def protocol(
+    *, needs: Needs, may_use: Mapping[str, type[Device] | type[Signal]] | None = None, controls: str = ""
+) -> Callable[[Callable[..., Messages]], ProtocolDefinition]:
+    """Make a generator function a protocol.
+
+    Its name is the function's, with dashes; its first argument is annotated with its parameters' class; its second,
+    if it asks for slots, is `slots: Slots`; its docstring is its help.
+
+    Parameters
+    ----------
+    needs : mapping of str to type, or sequence of str
+        Slots by name: the role that the device of the slot has to play (a `Device` class), or `Signal` where
+        something is only measured. A sequence names devices and signals of one rig instead.
+    may_use : mapping of str to type, optional
+        Slots that it uses where the rig binds them.
+    controls : str
+        Slot (or signal) that the protocol's controllers control, if it has any: what they think of it (`TRACES`) is
+        then recorded beside the rig's signals.
+
+    Raises
+    ------
+    TypeError
+        If the function is not of this form.
+    """
+    if isinstance(needs, str):
+        raise TypeError(f"needs: expected a sequence of names, such as ({needs!r},), got the text {needs!r}")
+
+    def define(function: Callable[..., Messages]) -> ProtocolDefinition:
+        name = function.__qualname__
+        if not inspect.isgeneratorfunction(function):
+            raise TypeError(f"{name}: a protocol is a generator, and this function yields nothing")
+        hints = [hint for key, hint in get_type_hints(function).items() if key != "return"]
+        takes_slots = isinstance(needs, Mapping)
+        if (
+            len(inspect.signature(function).parameters) != 1 + takes_slots
+            or len(hints) != 1 + takes_slots
+            or not (isinstance(hints[0], type) and issubclass(hints[0], ProtocolParameters))
+        ):
+            second = " and `slots: Slots`" if takes_slots else ""
+            raise TypeError(f"{name}: a protocol takes one argument, annotated with a ProtocolParameters{second}")
+        description = inspect.getdoc(function)
+        if not description:
+            raise TypeError(f"{name}: a protocol has a docstring, which is its help")
+        return ProtocolDefinition(
+            name=function.__name__.replace("_", "-"),
+            summary=description.splitlines()[0].rstrip("."),
+            description=description,
+            needs=dict(needs) if isinstance(needs, Mapping) else tuple(needs),
+            controls=controls,
+            parameters=hints[0],
+            generator=function,
+            may_use=dict(may_use or {}),
+        )
+
+    return define

@@ -1,0 +1,433 @@
+"""A rig file: what is connected, how it is bound to roles, and within which limits.
+
+A rig file is TOML::
+
+    extends = "bench-rig"                          # optional: another rig, or a file beside this one
+    without = ["emulation"]                        # optional: keys of the other that this one leaves out
+
+    [rig]
+    title = "a heated plate"
+
+    [devices.tec]                                  # any name; its signals are named after it
+    driver = "drivers.meerstetter:MeerstetterTEC"  # module:Class, or a name registered in `bench.devices`
+    port = "/dev/ttyUSB0"                          # all other keys are the driver's own
+    ...
+
+    [roles.drive]                                  # what protocols ask for; see `bench.binding`
+    device = "tec"
+    ...
+
+    [protocols.creep]                              # parameters of a protocol on this rig, in place of its defaults
+    start = 25.0
+
+    [derived.bending]                              # signals computed from others; see `bench.derived`
+    expression = "2 * spot_position / length ** 2"
+    ...
+
+    [[interlocks]]                                 # the run ends in the safe state outside of these
+    signal = "tec_sink_temperature"
+    high = 60.0
+
+    [telemetry]
+    period = 1.0                                   # s between two quick readings during holds
+
+    [dashboard]                                    # what the live view draws against what
+    input = "tec_temperature"
+    output = "bending"
+    ...
+
+    [[dashboard.loops]]                            # further loops beside the first
+    ...
+
+    [emulation]                                    # only in the rig file of an emulated rig
+    laboratory = "heated_plate:PlateLaboratory"    # module:Class, or a name registered in `bench.laboratories`
+    ...
+
+Unknown keys are errors. A port `emulated://NAME` is wired to the instrument of that name in the emulated
+laboratory; any other port is the real one. Python modules in the folder of the rig file can be named in it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bench import registry
+from bench.binding import Range, RoleTable
+from bench.clock import Clock
+from bench.derived import DerivedSignal
+from bench.devices import Device, DriverSettings
+from bench.errors import ConfigurationError
+from bench.safety import Interlock
+from bench.validation import problems
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RigTable(_Table):
+    """The table `[rig]`."""
+
+    title: str = Field(min_length=1, description="what the rig is, in one line")
+    description: str = Field(default="", description="more about it, shown on the run card")
+
+
+class TelemetryTable(_Table):
+    """The table `[telemetry]`."""
+
+    period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
+
+
+class LoopTable(_Table):
+    """A table `[[dashboard.loops]]`: one more loop of the live view."""
+
+    input: str = Field(description="signal on the horizontal axis of the loop")
+    output: str = Field(description="signal on the vertical axis of the loop")
+    input_range: Range = Field(description="ends of the horizontal axis")
+    output_range: Range = Field(description="ends of the vertical axis")
+
+
+class DashboardTable(LoopTable):
+    """The table `[dashboard]`: the hysteresis loops and the Preisach plane of the live view."""
+
+    input: str = Field(description="signal on the horizontal axis of the loop, and input of the plane")
+    plane: Range = Field(description="ends of both axes of the Preisach plane")
+    levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
+    loops: tuple[LoopTable, ...] = Field(default=(), description="further loops")
+
+
+class _RigFileContent(_Table):
+    rig: RigTable
+    devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
+    roles: dict[str, RoleTable] = Field(default_factory=dict, description="one table a role")
+    protocols: dict[str, dict[str, Any]] = Field(default_factory=dict, description="parameters by protocol")
+    derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
+    interlocks: tuple[Interlock, ...] = ()
+    telemetry: TelemetryTable = TelemetryTable()
+    dashboard: DashboardTable | None = None
+    emulation: dict[str, Any] | None = None
+
+
+class LaboratorySettings(BaseModel):
+    """Base of what the table `[emulation]` may say; a laboratory extends it with its own keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Laboratory(Protocol):
+    """An emulated laboratory: a plant and the instruments around it."""
+
+    Settings: ClassVar[type[LaboratorySettings]]
+
+    def __init__(self, settings: Any, clock: Clock, seed: int) -> None:  # noqa: ANN401 - its own Settings
+        """Set it up; all that is random comes from `seed`."""
+
+    def open(self) -> Mapping[str, str]:
+        """Switch the instruments on; return the port of each by its name in `emulated://NAME`."""
+
+    def operate(self, task: str, value: float) -> None:
+        """Do by hand what a protocol's prompt asks for; raise ConfigurationError for a task that it cannot do."""
+
+    def close(self) -> None:
+        """Switch everything off."""
+
+
+class Driver(Protocol):
+    """What a rig file names as a `driver`."""
+
+    Settings: ClassVar[type[DriverSettings]]
+
+    @classmethod
+    def connect(cls, name: str, settings: Any, clock: Clock) -> Device:  # noqa: ANN401 - its own Settings
+        """Open the instrument, check that it is the right one, and configure it; nothing moves."""
+
+
+@dataclass(frozen=True)
+class DeviceEntry:
+    """One device of a rig file: its driver class and that driver's validated settings."""
+
+    name: str
+    driver: type[Driver]
+    settings: DriverSettings
+
+
+@dataclass(frozen=True)
+class RigFile:
+    """A rig file that was read and found right; nothing is connected.
+
+    Attributes
+    ----------
+    name : str
+        Name of the packaged rig, or the file's name without its ending.
+    path : str
+        Where it was read from, for messages.
+    text : str
+        The file as it is, kept with every run.
+    bases : mapping of str to str
+        The rigs that it extends, nearest first: text by path.
+    content : mapping
+        Everything in it, bases and overrides included.
+    """
+
+    name: str
+    path: str
+    text: str
+    bases: Mapping[str, str]
+    content: Mapping[str, Any]
+    rig: RigTable
+    devices: tuple[DeviceEntry, ...]
+    roles: Mapping[str, RoleTable]
+    protocols: Mapping[str, Mapping[str, Any]]
+    derived: Mapping[str, DerivedSignal]
+    interlocks: tuple[Interlock, ...]
+    telemetry: TelemetryTable
+    dashboard: DashboardTable | None
+    laboratory: Any | None
+    laboratory_settings: LaboratorySettings | None
+
+    @property
+    def emulated(self) -> bool:
+        """Whether the rig brings its own emulated laboratory."""
+        return self.laboratory is not None
+
+
+def packaged_rigs() -> dict[str, registry.Entry]:
+    """Return the rigs of all installed packages by name, each with the entry that brings it.
+
+    An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is
+    left out.
+
+    Raises
+    ------
+    ConfigurationError
+        If two packages bring a rig of the same name.
+    """
+    found: dict[str, registry.Entry] = {}
+    for entry in registry.entries("rigs").values():
+        try:
+            folder = resources.files(entry.load())
+        except ConfigurationError:
+            continue
+        for file in folder.iterdir():
+            name = file.name.removesuffix(".toml")
+            if name == file.name:
+                continue
+            if name in found:
+                raise ConfigurationError(
+                    f"packages {found[name].package} and {entry.package} both bring a rig {name!r}; uninstall one"
+                )
+            found[name] = entry
+    return dict(sorted(found.items()))
+
+
+def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
+    """Read a rig file.
+
+    Parameters
+    ----------
+    name : str
+        Name of a packaged rig, or path of a file that ends in `.toml`.
+    overrides : mapping of str to str, optional
+        Values by dotted key, such as `{"devices.tec.port": "/dev/ttyUSB1"}`, that replace the file's.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such rig, or the file is wrong: names file, key, value and what is allowed.
+    """
+    path, text = _read(name)
+    bases: dict[str, str] = {}
+    content = _merged(path, text, bases)
+    for key, value in (overrides or {}).items():
+        _override(content, key, value, path)
+    return _validate(path, text, bases, content)
+
+
+def _read(name: str) -> tuple[str, str]:
+    if name.endswith(".toml"):
+        try:
+            text = Path(name).read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigurationError(f"rig file {name} cannot be read: {error}") from None
+        folder = str(Path(name).resolve().parent)
+        if folder not in sys.path:
+            # Last, so that nothing there hides an installed module.
+            sys.path.append(folder)
+        return name, text
+    packaged = packaged_rigs()
+    if name not in packaged:
+        raise ConfigurationError(
+            f"there is no rig {name!r}; there are: {', '.join(packaged)} (or a file of your own, path/to/rig.toml)"
+        )
+    return f"{name}.toml", (resources.files(packaged[name].load()) / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def _merged(path: str, text: str, bases: dict[str, str]) -> dict[str, Any]:
+    """Return the content of a file over those that it extends, which join `bases`."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+    base, without = content.pop("extends", None), content.pop("without", [])
+    if base is None and not without:
+        return content
+    if not isinstance(base, str) or not isinstance(without, list):
+        raise ConfigurationError(
+            f"{path}: extends = {base!r}, without = {without!r}: expected the name of a rig (or a file beside this "
+            'one, such as "other.toml") and a list of its keys to leave out'
+        )
+    # A file beside the one that names it; a packaged rig by its name.
+    beside = str(Path(path).parent / base) if base.endswith(".toml") else base
+    base_path, base_text = _read(beside)
+    if base_path == path or base_path in bases:
+        raise ConfigurationError(f"{path}: extends = {base!r}: the rigs extend each other in a circle")
+    bases[base_path] = base_text
+    merged = _merged(base_path, base_text, bases)
+    for key in without:
+        *parents, last = str(key).split(".")
+        table = _table(merged, parents)
+        if table is None or last not in table:
+            raise ConfigurationError(f"{path}: without = {key!r}: {base_path} has no such key")
+        del table[last]
+    return _over(merged, content)
+
+
+def _over(base: dict[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with the values of `content` in place of its own, table by table."""
+    merged = dict(base)
+    for key, value in content.items():
+        below = merged.get(key)
+        merged[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # noqa: ANN401 - any TOML
+    for part in parents:
+        content = content.get(part) if isinstance(content, dict) else None
+    return content if isinstance(content, dict) else None
+
+
+def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
+    *parents, last = key.split(".")
+    table = _table(content, parents)
+    if table is None:
+        raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
+    try:
+        table[last] = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        table[last] = value
+
+
+def _validate(path: str, text: str, bases: Mapping[str, str], content: Mapping[str, Any]) -> RigFile:
+    try:
+        tables = _RigFileContent.model_validate(content)
+    except ValidationError as error:
+        raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, _RigFileContent))) from None
+    found: list[str] = []
+    entries: list[DeviceEntry] = []
+    for device, table in tables.devices.items():
+        loaded = _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
+        if loaded is not None:
+            entries.append(DeviceEntry(device, *loaded))
+    derived: dict[str, DerivedSignal] = {}
+    for name, table in tables.derived.items():
+        key = f"derived.{name}."
+        kind: type[DerivedSignal] | None = None
+        try:
+            kind = _load("derived_signals", table.get("kind", "expression"), f"{key}kind")
+            if not (isinstance(kind, type) and issubclass(kind, DerivedSignal)):
+                raise ConfigurationError(f"{key}kind = {table['kind']!r}: is no DerivedSignal")
+            derived[name] = kind.model_validate(table)
+        except ValidationError as error:
+            found.extend(problems(error, kind or DerivedSignal, key))
+        except ConfigurationError as error:
+            found.append(str(error))
+    laboratory, settings = None, None
+    if tables.emulation is not None:
+        loaded = _load_part(
+            "laboratories", tables.emulation, "emulation.", "laboratory", LaboratorySettings, "open", found
+        )
+        laboratory, settings = loaded or (None, None)
+    if found:
+        raise ConfigurationError("\n".join(f"{path}: {line}" for line in found))
+    return RigFile(
+        name=Path(path).name.removesuffix(".toml"),
+        path=path,
+        text=text,
+        bases=bases,
+        content=content,
+        rig=tables.rig,
+        devices=tuple(entries),
+        roles=tables.roles,
+        protocols=tables.protocols,
+        derived=derived,
+        interlocks=tables.interlocks,
+        telemetry=tables.telemetry,
+        dashboard=tables.dashboard,
+        laboratory=laboratory,
+        laboratory_settings=settings,
+    )
+
+
+def _load_part(
+    group: registry.Group,
+    table: Mapping[str, Any],
+    prefix: str,
+    key: str,
+    base: type[BaseModel],
+    method: str,
+    found: list[str],
+) -> tuple[Any, Any] | None:
+    """Return the class that `key` of a table names, and its settings from the other keys; problems go to `found`."""
+    options = dict(table)
+    reference = options.pop(key, None)
+    where = f"{prefix}{key} = {reference!r}"
+    try:
+        loaded = _load(group, reference, f"{prefix}{key}")
+        settings = getattr(loaded, "Settings", None)
+        if not (isinstance(loaded, type) and isinstance(settings, type) and issubclass(settings, base)):
+            raise ConfigurationError(
+                f"{where}: is not a class with Settings that extend {base.__name__}, so a rig file cannot use it"
+            )
+        if group == "devices" and not issubclass(loaded, Device):
+            raise ConfigurationError(f"{where}: class {loaded.__name__} is not a Device")
+        if not callable(getattr(loaded, method, None)):
+            raise ConfigurationError(f"{where}: class {loaded.__name__} has no method {method}")
+    except ConfigurationError as error:
+        found.append(str(error))
+        return None
+    try:
+        return loaded, settings.model_validate(options)
+    except ValidationError as error:
+        found.extend(problems(error, settings, prefix))
+        return None
+
+
+def _load(group: registry.Group, reference: object, key: str) -> Any:  # noqa: ANN401 - any object
+    """Return what `module:Class`, or a name of a registered part, stands for."""
+    if isinstance(reference, str) and reference in registry.entries(group):
+        return registry.load(group, reference)
+    if not isinstance(reference, str) or reference.count(":") != 1:
+        names = ", ".join(registry.entries(group)) or "none"
+        raise ConfigurationError(f"{key} = {reference!r}: expected module:class, or a registered name: {names}")
+    module, _, name = reference.partition(":")
+    try:
+        imported = importlib.import_module(module)
+    # A module of the user's own may fail in any way.
+    except Exception as error:
+        raise ConfigurationError(
+            f"{key} = {reference!r}: the module cannot be loaded: {type(error).__name__}: {error}"
+        ) from error
+    loaded = getattr(imported, name, None)
+    if loaded is None:
+        raise ConfigurationError(f"{key} = {reference!r}: module {module} has no {name}")
+    return loaded

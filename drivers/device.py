@@ -1,0 +1,184 @@
+"""Devices that own their line: opening it, checking which instrument answers, and releasing it."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Annotated, Any, Generic, Protocol, Self, TypeVar
+
+from pydantic import AfterValidator, Field
+
+from bench.clock import Clock
+from bench.devices import Actuator, Device, DriverSettings, Identity
+from bench.errors import DeviceConnectionError, DeviceError
+
+_START_POLL = 0.1  # s
+
+
+def _check_slope(value: float) -> float:
+    if value == 0:
+        raise ValueError("must be a number other than 0")
+    return value
+
+
+Slope = Annotated[float, AfterValidator(_check_slope)]
+"""A setting by which a driver divides: any number but 0."""
+
+
+def watchdog_field(default: float, longest: float, effect: str) -> Any:  # noqa: ANN401 - as pydantic's Field
+    """Return the setting of an instrument's watchdog for its host, s; `effect` says what it does."""
+    return Field(
+        default=default,
+        ge=0.0,
+        le=longest,
+        description=f"silence of the host after which {effect}; must exceed the longest pause between two readings, "
+        "which is 2 s in a long hold",
+    )
+
+
+class Line(Protocol):
+    """A connection to an instrument."""
+
+    def close(self) -> None:
+        """Release the line."""
+
+
+SettingsT = TypeVar("SettingsT", bound=DriverSettings)
+LineT = TypeVar("LineT", bound=Line)
+
+
+class LineDevice(Device, Generic[SettingsT, LineT]):
+    """A device at the end of a line of its own.
+
+    Made by `connect`. A driver implements how its line is opened (`_open_line`), which instrument is there
+    (`_identify`), and how it is checked and configured (`_start`).
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    settings : DriverSettings
+        The device's part of the rig file; each driver has its own, as `Settings`.
+    clock : Clock
+        The clock of the run.
+    line : Line
+        The open line to the instrument.
+    """
+
+    _identity: Identity
+
+    def __init__(self, name: str, settings: SettingsT, clock: Clock, line: LineT) -> None:
+        super().__init__(name, clock)
+        self._settings = settings
+        self._line = line
+
+    @classmethod
+    def connect(cls, name: str, settings: SettingsT, clock: Clock) -> Self:
+        """Open the line, check that the right instrument answers and is healthy, and configure it; nothing moves.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened, nothing answers, or another instrument does.
+        DeviceError
+            If the instrument reports an error, or does not take a setting.
+        ConfigurationError
+            If the instrument does not allow a value of the settings; nothing was saved in it then.
+        """
+        return cls._open(name, settings, clock, cls._start)
+
+    @classmethod
+    def _open(cls, name: str, settings: SettingsT, clock: Clock, start: Callable[[Self], None]) -> Self:
+        line = cls._open_line(name, settings, clock)
+        try:
+            device = cls(name, settings, clock, line)
+            device._identity = device._identify()
+            start(device)
+        except BaseException:
+            line.close()
+            raise
+        return device
+
+    @classmethod
+    @abstractmethod
+    def _open_line(cls, name: str, settings: SettingsT, clock: Clock) -> LineT: ...
+
+    @abstractmethod
+    def _identify(self) -> Identity: ...
+
+    @abstractmethod
+    def _start(self) -> None: ...
+
+    @property
+    def identity(self) -> Identity:
+        """Maker, model, serial number and firmware, as the instrument reported on connecting."""
+        return self._identity
+
+    def _check_range(self, text: str, value: float, limits: tuple[float, float], unit: str, advice: str) -> None:
+        """Raise `DeviceError` if a value is outside of its limits; `text` and `advice` begin and end the message."""
+        low, high = limits
+        if not low <= value <= high:
+            raise DeviceError(self.name, f"{text} {low:g} to {high:g} {unit}; {advice}")
+
+    def close(self) -> None:
+        """Release the line; an output that is on stays on until the instrument's watchdog acts."""
+        self._line.close()
+
+
+class LineActuator(LineDevice[SettingsT, LineT], Actuator):
+    """An actuator at the end of a line of its own."""
+
+    def __init__(self, name: str, settings: SettingsT, clock: Clock, line: LineT) -> None:
+        super().__init__(name, settings, clock, line)
+        self._setpoint = math.nan
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent, in the unit of `limits`; nan before the first."""
+        return self._setpoint
+
+    def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:
+        """Return the error for a part that may still be on, after everything was tried."""
+        reason = f" ({failures[0]})" if failures else ""
+        return DeviceError(self.name, f"does not confirm that its {part} is off{reason}; disconnect its power supply")
+
+
+class RecoverableDevice(LineActuator[SettingsT, LineT]):
+    """An actuator whose instrument keeps an error until it is restarted or released."""
+
+    @classmethod
+    def recover(cls, name: str, settings: SettingsT, clock: Clock) -> Self:
+        """Connect to an instrument in its error state: restart or release it, and configure it.
+
+        Use it once the cause of the error is found. Parameters and errors are those of `connect`.
+        """
+        return cls._open(name, settings, clock, cls._restart)
+
+    @abstractmethod
+    def _restart(self) -> None: ...
+
+    def _wait_until(self, ready: Callable[[], bool], patience: float) -> None:
+        """Wait until the instrument answers that it is ready, for so many seconds at most."""
+        end = self._clock.now() + patience
+        while True:
+            problem: DeviceError | None = None
+            try:
+                if ready():
+                    return
+            except DeviceConnectionError as error:
+                problem = error
+            if self._clock.now() >= end:
+                raise problem or DeviceError(self.name, f"did not start within {patience:g} s")
+            self._clock.sleep(_START_POLL)
+
+
+def attempt(*steps: Callable[[], object]) -> list[DeviceError]:
+    """Take every step, also after one that fails; return the failures."""
+    failures = []
+    for step in steps:
+        try:
+            step()
+        except DeviceError as error:
+            failures.append(error)
+    return failures

@@ -1,0 +1,525 @@
+"""The Dynamixel MX-28 with Protocol 2.0 firmware (39 and newer): what its uses as a servo and with a drum share.
+
+Source: ROBOTIS e-Manual, MX-28(2.0) (control table, units, hardware errors, bus watchdog).
+
+The servo works in its extended position mode: 4096 counts a turn over ±256 turns. It measures its angle only
+within one turn when it is switched on: the number of turns is lost in a power cycle and in a reboot, so the
+setting `zero_counts` holds until the next power cycle.
+
+The EEPROM wears: the driver writes an item there only if its value differs, with the torque off. Those items
+are operating mode, drive mode, return delay time, and the shutdown mask, to which overload, electrical shock
+and overheating are added if they are missing. Set-points, profile and bus watchdog live in RAM. Limits of
+velocity, acceleration, PWM, temperature and voltage, and the homing offset, are left as the bench builder set them.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from abc import abstractmethod
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, Literal, Self, TypeVar
+
+from pydantic import Field, field_validator, model_validator
+
+from bench.clock import Clock
+from bench.devices import Actuator, Identity, Limits, Status
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from drivers.device import RecoverableDevice, attempt, watchdog_field
+from drivers.dynamixel.protocol2 import (
+    FEEDBACK,
+    PING,
+    RANGE_ERROR,
+    READ,
+    REBOOT,
+    WRITE,
+    RefusedError,
+    ServoLine,
+    ServoLineSettings,
+)
+
+MODEL_NUMBER = 30
+OLDEST_FIRMWARE = 39
+COUNTS_PER_TURN = 4096
+HIGHEST_GOAL = 1_048_575
+"""Largest goal position of either sign, counts."""
+
+_COUNT = 2.0 * math.pi / COUNTS_PER_TURN  # rad
+_VELOCITY_UNIT = 0.229 * 2.0 * math.pi / 60.0  # 0.229 rev/min in rad/s
+_ACCELERATION_UNIT = 214.577 * 2.0 * math.pi / 3600.0  # 214.577 rev/min² in rad/s²
+_WATCHDOG_UNIT = 0.02  # s
+_DELAY_UNIT = 2e-6  # s
+_WATCHDOG_EXPIRED = 255  # −1 in one byte
+_EXTENDED_POSITION_MODE = 4
+_REQUIRED_SHUTDOWN = 0b110100  # overload, electrical shock, overheating
+_ANSWER_EVERYTHING = 2  # value of the status return level
+
+_START_TIMEOUT = 5.0
+_REBOOT_DELAY = 0.2
+_EMERGENCY_PATIENCE = 1.0  # s for a reboot on the way to the safe state
+_STANDSTILL = 1.0  # s beside the goal without a motion that count as blocked
+_SUSPICIOUS_SILENCE = 0.8  # share of the watchdog's time
+_ARRIVAL = struct.Struct("<B3xhii")  # moving, moving status and PWM, load, velocity, position
+_ARRIVAL_ADDRESS = 122
+
+
+@dataclass
+class _Standstill:
+    """Since when a servo has stood beside its goal, s; infinity while it moves."""
+
+    since: float = math.inf
+
+
+@dataclass(frozen=True)
+class _Item:
+    """An item of the control table."""
+
+    address: int
+    size: int
+    title: str
+
+
+_DELAY = _Item(9, 1, "return delay time")
+_DRIVE_MODE = _Item(10, 1, "drive mode")
+_MODE = _Item(11, 1, "operating mode")
+_ACCELERATION_LIMIT = _Item(40, 4, "acceleration limit")
+_VELOCITY_LIMIT = _Item(44, 4, "velocity limit")
+_SHUTDOWN = _Item(63, 1, "shutdown mask")
+_TORQUE = _Item(64, 1, "torque enable")
+_RETURN_LEVEL = _Item(68, 1, "status return level")
+_HARDWARE_ERROR = _Item(70, 1, "hardware error status")
+_WATCHDOG = _Item(98, 1, "bus watchdog")
+_GOAL_PWM = _Item(100, 2, "goal PWM")
+_PROFILE_ACCELERATION = _Item(108, 4, "profile acceleration")
+_PROFILE_VELOCITY = _Item(112, 4, "profile velocity")
+_GOAL = _Item(116, 4, "goal position")
+_POSITION = _Item(132, 4, "position")
+_VOLTAGE = _Item(144, 2, "input voltage")
+_TEMPERATURE = _Item(146, 1, "temperature")
+
+HARDWARE_ERRORS: Mapping[int, tuple[str, str]] = {
+    0: ("input voltage", "check the power supply and its cable; allowed are the voltage limits set in the servo"),
+    2: ("overheating", "let it cool down for 20 minutes, and lower the load"),
+    3: ("motor encoder", "ask ROBOTIS if it comes again"),
+    4: ("electrical shock", "check wiring and earth, and that the supply gives current enough"),
+    5: ("overload", "take away what blocks the shaft, or lower the load"),
+}
+"""What the bits of the hardware error status mean (ROBOTIS e-Manual, MX-28(2.0), shutdown) and what to do."""
+
+_UNKNOWN_ERROR = ("unknown to this driver", "look it up in the manual of the servo")
+
+
+class MX28Settings(ServoLineSettings):
+    """Rig-file settings of any Dynamixel MX-28."""
+
+    return_delay: float = Field(
+        default=0.0, ge=0.0, le=508e-6, description="pause before an answer, s: 0 to 508e-6, in steps of 2e-6"
+    )
+    zero_counts: int = Field(
+        default=0, ge=-HIGHEST_GOAL, le=HIGHEST_GOAL, description="where the set-point zero is, counts of 2π/4096"
+    )
+    direction: Literal[1, -1] = Field(
+        default=1, description="1 if set-points grow with the counts (counter-clockwise at the horn), otherwise -1"
+    )
+    profile_velocity: float = Field(
+        default=1.0,
+        ge=_VELOCITY_UNIT,
+        le=1023 * _VELOCITY_UNIT,
+        description="highest velocity of a motion, rad/s: 0.024 to 24.5, rounded down to steps of 0.024; at most "
+        "the velocity limit that is set in the servo",
+    )
+    profile_acceleration: float = Field(
+        default=2.0,
+        ge=_ACCELERATION_UNIT,
+        le=32767 * _ACCELERATION_UNIT,
+        description="acceleration of a motion, rad/s²: 0.3746 to 12271, rounded down to steps of 0.3746; at most "
+        "the acceleration limit that is set in the servo",
+    )
+    watchdog: float = watchdog_field(
+        2.5, 127 * _WATCHDOG_UNIT, "the servo stops and holds, s: 0.02 to 2.54 in steps of 0.02, 0 for never"
+    )
+    tolerance: float = Field(
+        default=0.01,
+        ge=0.5 * _COUNT,
+        le=math.pi,
+        description="deviation that counts as having arrived, rad: 0.0008 to π; a load holds the shaft off its "
+        "goal, by 0.2 rad at full load with the gains as delivered",
+    )
+    arrival_timeout: float = Field(
+        default=5.0, gt=0.0, description="time beyond that of the motion after which it has failed, s"
+    )
+
+    @field_validator("watchdog")
+    @classmethod
+    def _check_watchdog(cls, value: float) -> float:
+        if 0.0 < value < _WATCHDOG_UNIT:
+            raise ValueError("expected 0.02 to 2.54 s, or 0 for no watchdog")
+        return value
+
+    _LIMITS: ClassVar[tuple[str, str]]  # key and unit of the limits of the set-point
+
+    @property
+    @abstractmethod
+    def per_radian(self) -> float:
+        """Change of the set-point with the angle of the shaft, in the unit of `limits` per rad."""
+
+    @property
+    def limits(self) -> Limits:
+        """The set-points that are allowed."""
+        key, unit = self._LIMITS
+        low, high = getattr(self, key)
+        return Limits(low, high, unit)
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        key, unit = self._LIMITS
+        low, high = (limit / self.per_radian for limit in getattr(self, key))
+        if not low < high:
+            raise ValueError(f"{key}: expected the lower limit first")
+        ends = sorted(self.direction * (goal - self.zero_counts) * _COUNT for goal in (-HIGHEST_GOAL, HIGHEST_GOAL))
+        if low < ends[0] or high > ends[1]:
+            raise ValueError(
+                f"{key}: {self.limits} is beyond the range of the servo, which with these zero_counts and "
+                f"direction is {Limits(ends[0] * self.per_radian, ends[1] * self.per_radian, unit)}"
+            )
+        return self
+
+
+MX28SettingsT = TypeVar("MX28SettingsT", bound=MX28Settings)
+
+
+class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
+    """A Dynamixel MX-28 in its extended position mode, in the unit of what it moves.
+
+    `connect` leaves the torque off, and clears a bus watchdog that has expired, as after a host that died. A servo
+    with a hardware error is refused; `recover` reboots it, which loses the number of turns. A value that the servo
+    does not allow is refused before anything is written to its EEPROM.
+
+    While the torque is on, the servo watches its host (`watchdog` of the settings, 2.5 s by default): if no packet
+    comes for that long, it stops where it is, holds, and takes no more goals. The watchdog takes 2.54 s at most, and
+    the longest pause between two ticks of the bench is 2 s, hence the default. It is armed just before the torque is
+    switched on. Once it has expired, every reading, every set-point and the status of the motion raise; `safe`,
+    `reboot` and `connect` clear it by writing 0 to it.
+
+    A hardware error of the servo (overload, overheating, ...) comes with every answer as its alert bit, and
+    is raised with its meaning, voltage and temperature. After a shutdown only `reboot` or a power cycle brings
+    the torque back, and both lose the number of turns.
+
+    The first set-point after the torque was off takes the present position as the goal before it switches the
+    torque on, so that the shaft does not jump to a previous goal.
+
+    Several servos of one bus may each have a driver on one port, if they are called in turn.
+    """
+
+    _DIGITS: ClassVar[int]  # of a position in messages
+
+    def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
+        super().__init__(name, settings, clock, line)
+        self._goal = 0
+        self._armed = False
+        self._expired = False
+
+    @classmethod
+    def _open_line(cls, name: str, settings: MX28SettingsT, clock: Clock) -> ServoLine:
+        return ServoLine(name, settings, clock)
+
+    @property
+    def limits(self) -> Limits:
+        """The allowed set-points: the limits of the settings."""
+        return self._settings.limits
+
+    def set(self, value: float) -> Status:
+        """Move to a set-point, with a resolution of 0.00153 rad; switches the torque on if it is off.
+
+        The status completes when the shaft stands within `tolerance` of the goal. It fails if the shaft stands
+        elsewhere for 1 s, if a later set-point or `stop` replaces this one, or if the torque goes off.
+        """
+        self.check(value)
+        goal = self._counts(value / self._settings.per_radian)
+        _, _, position, _, _ = self._feedback()
+        if not self._read(_TORQUE):
+            self._switch_on(position)
+        self._write_goal(goal)
+        self._setpoint = value
+        timeout = self._duration(abs(goal - position) * _COUNT) + self._settings.arrival_timeout
+        standstill = _Standstill()
+        return Status(self.name, self._clock, lambda: self._arrived(goal, standstill), timeout=timeout)
+
+    def measure(self) -> dict[str, float]:
+        """Measure position, velocity and inferred load (1), in one round trip."""
+        load, velocity, position, _, _ = self._feedback()
+        direction = self._settings.direction
+        velocity_in_unit = direction * velocity * _VELOCITY_UNIT * self._settings.per_radian
+        values = (self._position(position), velocity_in_unit, direction * load * 1e-3)
+        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+
+    def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
+        """Take the present position as the goal and hold it; does nothing while the torque is off."""
+        if not self._read(_TORQUE) or self._read(_WATCHDOG) == _WATCHDOG_EXPIRED:
+            return
+        position = self._read(_POSITION, signed=True)
+        self._write_goal(position)
+        self._setpoint = self._position(position)
+
+    def safe(self) -> None:
+        """Switch the torque off and see that it is off; an expired watchdog is cleared.
+
+        If the servo refuses or still reports its torque on, its output is set to zero and it is rebooted,
+        which loses the number of turns.
+        """
+        failures = attempt(partial(self._write, _TORQUE, 0))
+        if not self._is_off():
+            attempt(partial(self._write, _GOAL_PWM, 0), partial(self._reboot, _EMERGENCY_PATIENCE))
+            if not self._is_off():
+                raise self._unconfirmed("torque", failures)
+        self._armed = False
+        # The torque is off, so whether the watchdog could be disarmed does not matter for safety.
+        with suppress(DeviceError):
+            self._write(_WATCHDOG, 0)
+            self._expired = False
+
+    def reboot(self) -> None:
+        """Restart the servo and configure it again: clears a hardware error whose cause is gone.
+
+        The torque is off then and the number of turns is lost: the angle is that within one turn, and a drum is off
+        by whole circumferences.
+
+        Raises
+        ------
+        DeviceError
+            If the servo does not come back within 5 s, or comes back with an error.
+        """
+        self._reboot(_START_TIMEOUT)
+        self._start()
+
+    def _restart(self) -> None:
+        self.reboot()
+
+    def _identify(self) -> Identity:
+        model, firmware = self._ping()
+        place = f"{self._settings.port}, id {self._settings.id}"
+        if model != MODEL_NUMBER:
+            raise DeviceConnectionError(
+                self.name,
+                f"expected a Dynamixel MX-28 (model {MODEL_NUMBER}) at {place}, found model {model}; "
+                "check port and id",
+            )
+        if firmware < OLDEST_FIRMWARE:
+            raise DeviceConnectionError(
+                self.name,
+                f"the MX-28 at {place} has firmware {firmware}, expected {OLDEST_FIRMWARE} or newer; "
+                "update it with the maker's software",
+            )
+        return Identity("ROBOTIS", "MX-28", f"id {self._settings.id}", str(firmware))
+
+    def _start(self) -> None:
+        settings = self._settings
+        self._ensure_answers()
+        if self._line.alert:
+            raise self._fault()
+        self._check_limit("profile_velocity", self._velocity_units, _VELOCITY_LIMIT, _VELOCITY_UNIT, "rad/s")
+        self._check_limit(
+            "profile_acceleration", self._acceleration_units, _ACCELERATION_LIMIT, _ACCELERATION_UNIT, "rad/s²"
+        )
+        self._write(_TORQUE, 0)
+        if self._read(_TORQUE):
+            raise DeviceError(self.name, "does not switch its torque off; power-cycle it")
+        self._write(_WATCHDOG, 0)
+        self._armed = self._expired = False
+        self._set_up(_MODE, _EXTENDED_POSITION_MODE)
+        self._set_up(_DRIVE_MODE, 0)
+        self._set_up(_DELAY, round(settings.return_delay / _DELAY_UNIT))
+        self._set_up(_SHUTDOWN, self._read(_SHUTDOWN) | _REQUIRED_SHUTDOWN)
+        self._setpoint = math.nan
+
+    def _ensure_answers(self) -> None:
+        """Raise the status return level if need be: below 2 the servo does not answer writes, at 0 no reads."""
+        level = None
+        with suppress(DeviceConnectionError):
+            level = self._read(_RETURN_LEVEL)
+        if level != _ANSWER_EVERYTHING:
+            self._line.tell(WRITE, struct.pack("<HB", _RETURN_LEVEL.address, _ANSWER_EVERYTHING))
+            self._read(_RETURN_LEVEL)
+
+    def _check_limit(self, key: str, units: int, item: _Item, unit: float, dimension: str) -> None:
+        limit = self._read(item)
+        if units > limit:
+            raise ConfigurationError(
+                f"{self.name}: {key}: {units * unit:.4g} {dimension} is beyond the {item.title} that is set in the "
+                f"servo, {limit * unit:.4g} {dimension}"
+            )
+
+    def _set_up(self, item: _Item, value: int) -> None:
+        """Set an item of the EEPROM, but write only a value that differs, as the EEPROM wears."""
+        if self._read(item) == value:
+            return
+        self._write(item, value)
+        found = self._read(item)
+        if found != value:
+            raise DeviceError(self.name, f"keeps its {item.title} at {found} instead of {value}; power-cycle it")
+
+    def _switch_on(self, position: int) -> None:
+        """Switch the torque on at the present position, under the watchdog."""
+        settings = self._settings
+        self._write(_WATCHDOG, 0)
+        self._write(_PROFILE_ACCELERATION, self._acceleration_units)
+        self._write(_PROFILE_VELOCITY, self._velocity_units)
+        self._write_goal(position)
+        self._write(_WATCHDOG, round(settings.watchdog / _WATCHDOG_UNIT))
+        self._write(_TORQUE, 1)
+        self._armed, self._expired = settings.watchdog > 0.0, False
+        self._line.longest_silence = 0.0
+        if self._line.alert:
+            raise self._fault()
+
+    def _write_goal(self, counts: int) -> None:
+        try:
+            self._line.order(WRITE, struct.pack("<Hi", _GOAL.address, counts))
+        except RefusedError as error:
+            if error.code == RANGE_ERROR and self._read(_WATCHDOG) == _WATCHDOG_EXPIRED:
+                self._expired = True
+                raise self._watchdog_error() from None
+            raise self._refusal(f"{self._text(counts)} ({counts} counts) as its {_GOAL.title}", error) from None
+        self._goal = counts
+        if self._line.alert:
+            raise self._fault()
+
+    @property
+    def _velocity_units(self) -> int:
+        # Rounded down, but not from a hair's breadth below; 0 would be without a limit.
+        return max(math.floor(self._settings.profile_velocity / _VELOCITY_UNIT + 1e-9), 1)
+
+    @property
+    def _acceleration_units(self) -> int:
+        return max(math.floor(self._settings.profile_acceleration / _ACCELERATION_UNIT + 1e-9), 1)
+
+    def _duration(self, distance: float) -> float:
+        """Return how long a motion over a distance (rad) takes at most, s."""
+        velocity = self._velocity_units * _VELOCITY_UNIT
+        acceleration = self._acceleration_units * _ACCELERATION_UNIT
+        # Twice the ramp more, for a motion that has to turn round first.
+        return distance / velocity + 4.0 * velocity / acceleration
+
+    def _counts(self, radians: float) -> int:
+        settings = self._settings
+        counts = settings.zero_counts + settings.direction * round(radians / _COUNT)
+        return min(max(counts, -HIGHEST_GOAL), HIGHEST_GOAL)
+
+    def _position(self, counts: int) -> float:
+        settings = self._settings
+        return settings.direction * (counts - settings.zero_counts) * _COUNT * settings.per_radian
+
+    def _text(self, counts: int) -> str:
+        return f"{self._position(counts):.{self._DIGITS}g} {self.limits.unit}"
+
+    def _feedback(self) -> tuple[int, int, int, int, int]:
+        """Return load, velocity, position, voltage and temperature in the servo's units; raise what is wrong."""
+        try:
+            data = self._line.feedback()
+        except RefusedError as error:
+            raise self._refusal("to report its feedback", error) from None
+        self._check()
+        load, velocity, position, voltage, temperature = FEEDBACK.unpack(data)
+        return load, velocity, position, voltage, temperature
+
+    def _check(self) -> None:
+        """Raise a hardware error that the last answer reported, and a watchdog that has expired."""
+        if self._line.alert:
+            raise self._fault()
+        silence, self._line.longest_silence = self._line.longest_silence, 0.0
+        if not self._armed:
+            return
+        # The feedback does not include the watchdog: it is read when there was time for it to expire.
+        if self._expired or silence > _SUSPICIOUS_SILENCE * self._settings.watchdog:
+            self._expired = self._read(_WATCHDOG) == _WATCHDOG_EXPIRED
+            if self._expired:
+                raise self._watchdog_error()
+
+    def _arrived(self, goal: int, standstill: _Standstill) -> bool:
+        try:
+            data = self._line.ask(READ, struct.pack("<HH", _ARRIVAL_ADDRESS, _ARRIVAL.size), _ARRIVAL.size)
+        except RefusedError as error:
+            raise self._refusal("to report whether it moves", error) from None
+        self._check()
+        moving, load, _, position = _ARRIVAL.unpack(data)
+        if goal != self._goal:
+            raise DeviceError(self.name, f"{self._text(goal)} was replaced by another goal on the way")
+        if moving:
+            standstill.since = math.inf
+            return False
+        if abs(position - goal) * _COUNT <= self._settings.tolerance:
+            return True
+        if not self._read(_TORQUE):
+            raise DeviceError(self.name, f"the torque was switched off before it reached {self._text(goal)}")
+        now = self._clock.now()
+        standstill.since = min(standstill.since, now)
+        if now - standstill.since >= _STANDSTILL:
+            raise DeviceError(
+                self.name,
+                f"stands at {self._text(position)} instead of {self._text(goal)}, under a load of "
+                f"{abs(load) / 10:.0f} %: take away what blocks it, lower the load, or allow a larger tolerance",
+            )
+        return False
+
+    def _fault(self) -> DeviceError:
+        bits = self._read(_HARDWARE_ERROR)
+        volts, celsius = self._read(_VOLTAGE) * 0.1, self._read(_TEMPERATURE)
+        found = [HARDWARE_ERRORS.get(bit, _UNKNOWN_ERROR) for bit in range(8) if bits >> bit & 1]
+        texts = ", ".join(text for text, _ in found) or "none any more"
+        advice = "; ".join(dict.fromkeys(advice for _, advice in found)) or "find out what it was"
+        return DeviceError(
+            self.name,
+            f"hardware error 0x{bits:02X} ({texts}; {volts:.1f} V, {celsius} °C): {advice}; "
+            "then switch the servo off and on, which loses the number of turns: check zero_counts",
+        )
+
+    def _watchdog_error(self) -> DeviceError:
+        return DeviceError(
+            self.name,
+            f"the bus watchdog stopped the servo, as the host was silent for {self._settings.watchdog:g} s: find "
+            "out why, or allow more time with the key watchdog; the safe state clears it",
+        )
+
+    def _holds(self) -> bool:
+        return bool(self._read(_TORQUE))
+
+    def _is_off(self) -> bool:
+        with suppress(DeviceError):
+            return not self._holds()
+        return False
+
+    def _reboot(self, patience: float) -> None:
+        """Send a reboot and wait until the servo answers again, for so many seconds at most."""
+        # The answer may be lost in the restart; whether the servo comes back is what counts.
+        with suppress(DeviceConnectionError, RefusedError):
+            self._line.order(REBOOT, b"")
+        self._clock.sleep(_REBOOT_DELAY)
+        self._wait_until(lambda: bool(self._ping()), patience - _REBOOT_DELAY)
+
+    def _ping(self) -> tuple[int, int]:
+        """Return model number and firmware."""
+        try:
+            model, firmware = struct.unpack("<HB", self._line.ask(PING, b"", 3))
+        except RefusedError as error:
+            raise self._refusal("a ping", error) from None
+        return model, firmware
+
+    def _read(self, item: _Item, *, signed: bool = False) -> int:
+        request = struct.pack("<HH", item.address, item.size)
+        try:
+            data = self._line.ask(READ, request, item.size)
+        except RefusedError as error:
+            raise self._refusal(f"to report its {item.title}", error) from None
+        return int.from_bytes(data, "little", signed=signed)
+
+    def _write(self, item: _Item, value: int) -> None:
+        try:
+            self._line.order(WRITE, struct.pack("<H", item.address) + value.to_bytes(item.size, "little"))
+        except RefusedError as error:
+            raise self._refusal(f"{value} as its {item.title}", error) from None
+
+    def _refusal(self, what: str, error: RefusedError) -> DeviceError:
+        return DeviceError(self.name, f"refused {what}: {error}")

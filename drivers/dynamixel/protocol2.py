@@ -1,0 +1,235 @@
+"""Dynamixel Protocol 2.0 on a serial line: packets, their CRC, and requests that are sent again.
+
+Source: ROBOTIS e-Manual, Protocol 2.0 (packets, CRC, error numbers).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+
+import serial
+from pydantic import Field
+
+from bench.clock import Clock
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+
+PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
+RANGE_ERROR = 4
+FEEDBACK = struct.Struct("<hii8xHB")
+"""Block of the control table: load, velocity, position, two trajectories, voltage, temperature."""
+FEEDBACK_ADDRESS = 126
+
+_HEADER = b"\xff\xff\xfd\x00"
+_HEAD = 7  # header, id, length
+_SHORTEST_ANSWER = 11  # the head, instruction, error, CRC
+_SHORTEST_LENGTH, _LONGEST_LENGTH = 3, 256  # bytes after the head; the longest answer has 26
+_MOST_NOISE = 1024  # bytes without a packet
+_MOST_STRAY_PACKETS = 8
+_STATUS = 0x55
+_ALERT = 0x80
+_CRC_ERROR = 3
+
+STATUS_ERRORS: Mapping[int, str] = {
+    1: "it could not process the instruction",
+    2: "it does not know the instruction",
+    3: "the instruction arrived damaged",
+    4: "the value is out of range",
+    5: "the length of the data is wrong",
+    6: "the value is beyond the limit that is set in the servo",
+    7: "the address cannot be accessed: it is read-only, not defined, or locked while the torque is on",
+}
+"""Why the servo refuses an instruction (ROBOTIS e-Manual, Protocol 2.0, status packet)."""
+
+
+class ServoLineSettings(SerialSettings):
+    """Rig-file settings of the line to a Dynamixel."""
+
+    id: int = Field(default=1, ge=0, le=252, description="id on the bus, 0 to 252")
+    baudrate: int = Field(
+        default=57600, ge=9600, le=4_500_000, description="speed of the line, Bd, as set in the servo (register 8)"
+    )
+
+
+class RefusedError(Exception):
+    """The servo answered with an error number."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(STATUS_ERRORS.get(code, f"error number {code}"))
+        self.code = code
+
+
+class ServoLine:
+    """The serial line to one servo: packets, their CRC and stuffing, and sending again.
+
+    A request that brings no answer, or a damaged one, is sent again, twice at most; all requests of the driver may
+    be carried out twice. As answers carry no number, late answers to a request that was sent twice are waited for
+    before the next request. Packets of other servos are skipped, and so is the echo of the request that adapters of
+    two-wire lines give.
+
+    Attributes
+    ----------
+    alert : bool
+        Whether the last answer reported a hardware error.
+    longest_silence : float
+        Longest time between two answers since the attribute was last set to zero, s.
+    """
+
+    def __init__(self, device: str, settings: ServoLineSettings, clock: Clock) -> None:
+        self._device = device
+        self._settings = settings
+        self._clock = clock
+        self._received = bytearray()
+        self._unsettled = False
+        self._silence = f"no answer within {settings.timeout:g} s"
+        self._answered_at = clock.now()
+        self.alert = False
+        self.longest_silence = 0.0
+        self._feedback_request = frame(settings.id, READ, struct.pack("<HH", FEEDBACK_ADDRESS, FEEDBACK.size))
+        self._port = open_port(device, settings)
+
+    def close(self) -> None:
+        """Release the line."""
+        self._port.close()
+
+    def feedback(self) -> bytes:
+        """Return the feedback block, 21 bytes from address 126; errors are those of `ask`."""
+        return self._exchange(self._feedback_request, FEEDBACK.size)
+
+    def ask(self, instruction: int, parameters: bytes, length: int) -> bytes:
+        """Send an instruction; return the `length` bytes of its answer.
+
+        Raises
+        ------
+        RefusedError
+            If the servo answers with an error number.
+        DeviceConnectionError
+            If no good answer comes.
+        """
+        return self._exchange(frame(self._settings.id, instruction, parameters), length)
+
+    def order(self, instruction: int, parameters: bytes) -> None:
+        """Send an instruction that is answered without content; errors are those of `ask`."""
+        self._exchange(frame(self._settings.id, instruction, parameters), 0)
+
+    def tell(self, instruction: int, parameters: bytes) -> None:
+        """Send an instruction that may or may not be answered."""
+        try:
+            self._port.write(frame(self._settings.id, instruction, parameters))
+            self._settle()
+        except (serial.SerialException, OSError) as error:
+            raise lost_line(self._device, self._settings, error) from None
+
+    def _exchange(self, request: bytes, length: int) -> bytes:
+        problem = self._silence
+        try:
+            if self._unsettled:
+                self._settle()
+            for _ in range(1 + RESENDS):
+                self._port.write(request)
+                problem, error, content = self._answer(length)
+                if problem == "":
+                    self._note_answer(error)
+                    if self._unsettled:
+                        self._settle()
+                    if error & ~_ALERT:
+                        raise RefusedError(error & ~_ALERT)
+                    return content
+                self._unsettled = True
+                self._received.clear()
+                if problem != self._silence:
+                    self._port.reset_input_buffer()
+        except (serial.SerialException, OSError) as error:
+            raise lost_line(self._device, self._settings, error) from None
+        raise no_answer(self._device, self._settings, problem, "id", self._settings.id)
+
+    def _note_answer(self, error: int) -> None:
+        now = self._clock.now()
+        self.longest_silence = max(self.longest_silence, now - self._answered_at)
+        self._answered_at = now
+        self.alert = bool(error & _ALERT)
+
+    def _answer(self, length: int) -> tuple[str, int, bytes]:
+        """Return what is wrong with the answer, if anything, its error byte and its content."""
+        for _ in range(_MOST_STRAY_PACKETS):
+            packet = self._read_packet(_SHORTEST_ANSWER + length)
+            if packet is None:
+                return self._silence, 0, b""
+            if packet == b"":
+                return "damaged answer", 0, b""
+            if packet[4] != self._settings.id or packet[_HEAD] != _STATUS:
+                continue
+            body = packet[_HEAD:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+            error, content = body[1] if len(body) > 1 else 0, body[2:]
+            if error & ~_ALERT == _CRC_ERROR:
+                return STATUS_ERRORS[_CRC_ERROR], 0, b""
+            if not error & ~_ALERT and len(content) != length:
+                return f"answer of {len(content)} instead of {length} bytes", 0, b""
+            return "", error, content
+        return "only packets of others", 0, b""
+
+    def _read_packet(self, expected: int) -> bytes | None:
+        """Return the next packet, None after silence, nothing for a damaged one.
+
+        All the bytes that are expected are waited for at once, which is faster than to begin with the head. A
+        refusal of a read is shorter, so it is noticed after the timeout only.
+        """
+        received = self._received
+        read, ended = 0, False
+        while read < _MOST_NOISE:
+            start = received.find(_HEADER)
+            # Without a header, the last bytes may be the beginning of one.
+            del received[: start if start >= 0 else max(len(received) - len(_HEADER) + 1, 0)]
+            missing = expected - len(received)
+            if start >= 0 and len(received) >= _HEAD:
+                length = int.from_bytes(received[5:_HEAD], "little")
+                if not _SHORTEST_LENGTH <= length <= _LONGEST_LENGTH:
+                    del received[:1]
+                    continue
+                end = _HEAD + length
+                if len(received) >= end:
+                    packet = bytes(received[:end])
+                    del received[:end]
+                    return packet if crc(packet[:-2]) == int.from_bytes(packet[-2:], "little") else b""
+                missing = end - len(received)
+            if ended:
+                return b"" if received else None
+            chunk = self._port.read(missing)
+            received += chunk
+            read += len(chunk)
+            ended = len(chunk) < missing
+        return b""
+
+    def _settle(self) -> None:
+        """Wait until nothing more comes, and forget it."""
+        for _ in range(_MOST_STRAY_PACKETS):
+            if len(self._port.read(_LONGEST_LENGTH)) < _LONGEST_LENGTH:
+                break
+        self._received.clear()
+        self._unsettled = False
+
+
+def _crc_row(index: int) -> int:
+    crc = index << 8
+    for _ in range(8):
+        crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+    return crc & 0xFFFF
+
+
+_CRC_TABLE = tuple(_crc_row(index) for index in range(256))
+
+
+def crc(data: bytes) -> int:
+    """Return the CRC-16 of a packet: polynomial 0x8005, initial value 0, highest bit first."""
+    value = 0
+    for byte in data:
+        value = ((value & 0xFF) << 8) ^ _CRC_TABLE[(value >> 8) ^ byte]
+    return value
+
+
+def frame(servo_id: int, instruction: int, parameters: bytes) -> bytes:
+    """Return a packet; an FD is put in after each FF FF FD of its body."""
+    body = bytes((instruction,)) + parameters
+    body = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+    packet = _HEADER + struct.pack("<BH", servo_id, len(body) + 2) + body
+    return packet + struct.pack("<H", crc(packet))

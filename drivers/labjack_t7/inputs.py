@@ -1,0 +1,180 @@
+"""Analog inputs of a LabJack T7: their settings, bursts that the instrument averages, and single conversions.
+
+Sources: LabJack T-series datasheet 14.1.7 for averaging in the instrument, 14.3.0 for the analog inputs. The
+datasheet gives the highest scan rate of each resolution index in appendix A-1: the instrument refuses a burst at a
+higher rate, and the error says so.
+
+Assumption: one request that spans the averages of two inputs carries out both bursts, one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple, Self, TypeVar
+
+from pydantic import Field, field_validator, model_validator
+
+from bench.errors import DeviceError
+from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
+from drivers.labjack_t7.registers import (
+    AIN,
+    AIN_EF_INDEX,
+    AIN_EF_READ_AVERAGE,
+    AIN_EF_READ_MAXIMUM,
+    AIN_EF_READ_MINIMUM,
+    AIN_EF_SAMPLES,
+    AIN_EF_SCAN_RATE,
+    AIN_NEGATIVE_CH,
+    AIN_RANGE,
+    AIN_RESOLUTION_INDEX,
+    AIN_SETTLING_US,
+    STREAM_RESOLUTION_INDEX,
+    STREAM_SETTLING_US,
+    Register,
+)
+
+CHANNELS = 14
+RAIL = 0.999
+"""Share of the nominal range from which on a reading counts as over-range."""
+
+_SINGLE_ENDED = 199
+_AVERAGE_MIN_MAX = 3  # AIN_EF_INDEX, datasheet 14.1.7
+_LONGEST_BURST = 0.18  # s, datasheet 14.1.7
+_MOST_SAMPLES = 16384
+_MISSED_SAMPLE = -9999.0  # what a stream puts in place of a sample that it had to leave out
+_LARGEST_RANGE = 10.0  # V
+
+
+Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
+
+
+class T7InputSettings(T7ConnectionSettings):
+    """How analog inputs are read; every sensor on a T7 extends it."""
+
+    channels: tuple[Channel, ...] = Field(
+        default=(0,), description="analog inputs, 0 to 13; neighbours in ascending order are read at once"
+    )
+    range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
+    resolution_index: int = Field(
+        default=4, ge=0, le=8, description="resolution index, 0 (instrument's default) to 8 (least noise, slowest)"
+    )
+    settling_us: float = Field(
+        default=0.0, ge=0.0, le=4400.0, description="settling time of an input in µs, 0 (automatic) to 4400"
+    )
+    samples: int = Field(
+        default=10, ge=1, le=_MOST_SAMPLES, description="conversions averaged in one measurement, 1 to 16384"
+    )
+    sample_rate: float = Field(
+        default=1000.0, gt=0.0, le=100_000.0, description="conversions in a second in Hz, above 0 to 100000"
+    )
+
+    @field_validator("range")
+    @classmethod
+    def _check_range(cls, value: float) -> float:
+        if value not in (10.0, 1.0, 0.1, 0.01):
+            raise ValueError(f"allowed are 10, 1, 0.1 and 0.01 V, got {value:g}")
+        return value
+
+    @model_validator(mode="after")
+    def _check_burst(self) -> Self:
+        if len(set(self.channels)) != len(self.channels):
+            raise ValueError(f"channels: expected different ones, got {list(self.channels)}")
+        duration = self.samples / self.sample_rate
+        if self.samples > 1 and duration > _LONGEST_BURST:
+            raise ValueError(
+                f"samples / sample_rate: a T7 averages over at most {_LONGEST_BURST:g} s, got {duration:g} s"
+            )
+        if len(self.channels) * duration >= self.timeout:
+            raise ValueError(f"timeout: a measurement alone takes {len(self.channels) * duration:g} s")
+        return self
+
+
+class _Voltage(NamedTuple):
+    """One input over a burst, in V."""
+
+    mean: float
+    maximum: float
+    minimum: float
+
+
+InputSettingsT = TypeVar("InputSettingsT", bound=T7InputSettings)
+
+
+class T7InputDevice(T7Device[InputSettingsT]):
+    """A device on a LabJack T7 that is read by analog inputs.
+
+    `measure` has the instrument average a burst of `samples` conversions of each input, `glance` takes one
+    conversion: three requests and one, with inputs that are neighbours in ascending order, otherwise as many for
+    each input. Both raise `DeviceError` if a conversion is not valid or over the range, as clipped conversions would
+    shift the mean.
+
+    The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one instrument:
+    give sensors on the same one the same `resolution_index` and `settling_us`.
+    """
+
+    def _start(self) -> None:
+        settings, instrument = self._settings, self._line
+        instrument.set({STREAM_RESOLUTION_INDEX: settings.resolution_index})
+        instrument.set({STREAM_SETTLING_US: settings.settling_us})
+        for channel in settings.channels:
+            instrument.set({AIN_RANGE.of(channel): settings.range})
+            instrument.set({AIN_NEGATIVE_CH.of(channel): _SINGLE_ENDED})
+            instrument.set({AIN_RESOLUTION_INDEX.of(channel): settings.resolution_index})
+            instrument.set({AIN_SETTLING_US.of(channel): settings.settling_us})
+            # Off first, so that nothing of an earlier set-up remains.
+            instrument.set({AIN_EF_INDEX.of(channel): 0})
+            if settings.samples > 1:
+                instrument.set({AIN_EF_INDEX.of(channel): _AVERAGE_MIN_MAX})
+                instrument.set({AIN_EF_SAMPLES.of(channel): settings.samples})
+                instrument.set({AIN_EF_SCAN_RATE.of(channel): settings.sample_rate})
+
+    def measure(self) -> dict[str, float]:
+        """Measure every signal, by the means of `samples` conversions."""
+        return self._values(*self._average())
+
+    def glance(self) -> dict[str, float]:
+        """Measure every signal by one conversion of each input; raises what `measure` does."""
+        return self._values(*self._convert())
+
+    @abstractmethod
+    def _values(self, *volts: float) -> dict[str, float]: ...
+
+    def _average(self) -> list[float]:
+        """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
+        if self._settings.samples == 1:
+            return self._convert()
+        means = self._read(AIN_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
+        maxima = self._read(AIN_EF_READ_MAXIMUM)
+        minima = self._read(AIN_EF_READ_MINIMUM)
+        return self._checked([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
+
+    def _convert(self) -> list[float]:
+        """Get one conversion of each input in V."""
+        return self._checked([_Voltage(volts, volts, volts) for volts in self._read(AIN)])
+
+    def _read(self, register: Register) -> list[float]:
+        """Get the value of a register for every input, in one request where they are neighbours."""
+        channels = self._settings.channels
+        if channels == tuple(range(channels[0], channels[0] + len(channels))):
+            return self._line.read(register.of(channels[0]), len(channels))
+        return [self._line.read(register.of(channel))[0] for channel in channels]
+
+    def _checked(self, voltages: Sequence[_Voltage]) -> list[float]:
+        for channel, voltage in zip(self._settings.channels, voltages, strict=True):
+            if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
+                raise DeviceError(
+                    self.name,
+                    f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
+                )
+            limit = self._settings.range
+            extreme = max(voltage, key=abs)
+            if abs(extreme) >= RAIL * limit:
+                larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
+                raise DeviceError(
+                    self.name,
+                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
+                    "what is measured back into it",
+                )
+        return [voltage.mean for voltage in voltages]

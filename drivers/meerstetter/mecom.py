@@ -1,0 +1,187 @@
+"""The MeCom protocol on a serial line: frames, their CRC and sequence numbers, and parameters.
+
+Source: Meerstetter 5117 (MeCom protocol specification: frames, CRC, server errors).
+"""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc_hqx
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import serial
+from pydantic import Field
+
+from bench.errors import DeviceError
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+
+_MOST_STALE_ANSWERS = 8
+_ACKNOWLEDGE_LENGTH = 12  # !, address, sequence, CRC, carriage return
+_ERROR_LENGTH = 15  # the same and + with two digits
+_LONGEST_NONSENSE = 64  # characters without an end; the longest answer has 32
+
+SERVER_ERRORS: Mapping[int, str] = {
+    1: "the command is not available",
+    2: "the device is busy",
+    3: "general communication error",
+    4: "format error",
+    5: "the parameter is not available",
+    6: "the parameter is read-only",
+    7: "the value is out of range",
+    8: "the instance is not available; check the channel",
+    9: "general error of the parameter",
+}
+"""Why the device refuses a request (Meerstetter 5117, server error codes)."""
+
+
+class TECLineSettings(SerialSettings):
+    """Rig-file settings of the line to a Meerstetter TEC controller."""
+
+    address: int = Field(default=1, ge=1, le=254, description="device address (parameter 2051), 1 to 254")
+    baudrate: int = Field(default=57600, ge=4800, le=1_000_000, description="speed of the line, Bd")
+    timeout: float = Field(
+        default=0.2, gt=0.0, le=10.0, description="wait for an answer, s; a request is sent three times at most"
+    )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A device parameter: INT32 or FLOAT32, of a channel or of the whole device."""
+
+    number: int
+    title: str
+    real: bool = False
+    of_channel: bool = True
+
+
+class RefusedError(Exception):
+    """The device answered a request with a server error."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(SERVER_ERRORS.get(code, f"server error {code}"))
+        self.code = code
+
+
+class TECLine:
+    """The serial line to one device: frames, their CRC and sequence numbers, and sending again.
+
+    A request that brings no answer, or a damaged one, is sent again with its own sequence number, twice at
+    most. An answer with another sequence number is a late one to an earlier request, and is skipped.
+    """
+
+    def __init__(self, device: str, settings: TECLineSettings) -> None:
+        self._device = device
+        self._settings = settings
+        self._sequence = 0
+        self._received = bytearray()
+        self._silence = f"no answer within {settings.timeout:g} s"
+        self._port = open_port(device, settings)
+
+    def close(self) -> None:
+        """Release the line."""
+        self._port.close()
+
+    def ask(self, request: str, digits: int) -> str:
+        """Send a query; return the `digits` characters of its answer.
+
+        Raises
+        ------
+        RefusedError
+            If the device answers with a server error.
+        DeviceConnectionError
+            If no good answer comes.
+        """
+        return self._exchange(request, digits).decode("ascii", "replace")
+
+    def order(self, request: str) -> None:
+        """Send a command that the device only acknowledges; errors are those of `ask`."""
+        self._exchange(request, 0)
+
+    def _exchange(self, request: str, digits: int) -> bytes:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        head = b"%02X%04X" % (self._settings.address, self._sequence)
+        body = b"#" + head + request.encode("ascii")
+        crc = b"%04X" % crc_hqx(body, 0)
+        frame = body + crc + b"\r"
+        try:
+            for _ in range(1 + RESENDS):
+                self._port.write(frame)
+                problem, content = self._answer(b"!" + head, crc, digits)
+                if problem == "":
+                    return content
+                if content[:1] == b"+":
+                    raise RefusedError(int(content[1:3], 16))
+                if problem != self._silence:
+                    # All else that has come belongs to the damage; after silence, a late answer may come.
+                    self._received.clear()
+                    self._port.reset_input_buffer()
+        except (serial.SerialException, OSError) as error:
+            raise lost_line(self._device, self._settings, error) from None
+        raise no_answer(self._device, self._settings, problem, "address", self._settings.address)
+
+    def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
+        """Return what is wrong with the answer, if anything, and its payload."""
+        for _ in range(_MOST_STALE_ANSWERS):
+            answer = self._read_answer(_ACKNOWLEDGE_LENGTH + digits)
+            if answer is None:
+                return self._silence, b""
+            answer = answer[max(answer.rfind(b"!"), 0) :]
+            if answer[:7] != head:
+                continue
+            content, received_crc = answer[7:-4], answer[-4:]
+            # An acknowledge carries the CRC of the request.
+            expected_crc = b"%04X" % crc_hqx(answer[:-4], 0) if content else crc
+            if received_crc != expected_crc:
+                return "damaged answer", b""
+            if content[:1] == b"+" and len(content) == 3 and content[1:].isdigit():
+                return "refused", content
+            if len(content) != digits:
+                return f"answer of {len(content)} instead of {digits} characters", b""
+            return "", content
+        return "only late or damaged answers", b""
+
+    def _read_answer(self, length: int) -> bytes | None:
+        """Read up to the next carriage return, without waiting for more than the shortest answer has."""
+        received = self._received
+        while (end := received.find(b"\r")) < 0:
+            if len(received) < _ACKNOWLEDGE_LENGTH:
+                missing = _ACKNOWLEDGE_LENGTH - len(received)
+            elif received[7:8] == b"+" and len(received) < _ERROR_LENGTH:
+                missing = _ERROR_LENGTH - len(received)
+            else:
+                missing = max(length - len(received), 1)
+            chunk = self._port.read(missing)
+            received += chunk
+            if len(chunk) < missing and b"\r" not in chunk:
+                # What came is kept: the rest of a slow answer may still follow.
+                return None
+            if len(received) > _LONGEST_NONSENSE:
+                received.clear()
+                return b""
+        answer = bytes(received[:end])
+        del received[: end + 1]
+        return answer
+
+
+def encode(parameter: Parameter, value: float) -> str:
+    """Return a value as 8 hex digits: IEEE 754 single precision, or two's complement."""
+    if parameter.real:
+        return struct.pack(">f", value).hex().upper()
+    return f"{int(value) & 0xFFFFFFFF:08X}"
+
+
+def decode(device: str, parameter: Parameter, digits: str) -> float:
+    """Return the value of 8 hex digits; the inverse of `encode`."""
+    try:
+        value: float = struct.unpack(">f" if parameter.real else ">i", bytes.fromhex(digits))[0]
+    except (ValueError, struct.error):
+        raise DeviceError(
+            device, f"answered {digits!r} for its {parameter.title} (parameter {parameter.number})"
+        ) from None
+    return value
+
+
+def single(value: float) -> float:
+    """Return a value rounded to single precision."""
+    return float(struct.unpack(">f", struct.pack(">f", value))[0])

@@ -1,0 +1,404 @@
+"""The Meerstetter TEC controllers (TEC-1089, TEC-1091 and their family).
+
+Source: Meerstetter 5136 (TEC controller communication protocol: parameters and commands).
+
+The driver writes to the device's RAM only: saving to the flash is switched off first (parameter 108), as the
+flash endures about 100 000 writes, and set-points go to the live parameters (50000 and up), which are zero again
+after each reset. The error thresholds of object and sink temperature (4010 to 4012, 5010 to 5012), the sensor and
+the PID set-up are left as the bench builder set them.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from enum import IntEnum
+from functools import partial
+from typing import ClassVar
+
+from pydantic import Field, field_validator
+
+from bench.clock import Clock
+from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from drivers.device import RecoverableDevice, attempt, watchdog_field
+from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
+from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, TECLineSettings, decode, encode, single
+
+_START_TIMEOUT = 5.0
+_RESET_DELAY = 0.3  # the device restarts 0.2 s after the command
+_OUT_OF_RANGE = 7
+
+_OFF, _LIVE_ENABLE = 0, 2  # values of the output stage enable
+_LIVE_INPUT, _CONTROLLER_INPUT = 1, 2  # values of the output stage input selection
+_STABLE = 2  # value of "temperature is stable"
+
+FAMILY = frozenset({1089, 1090, 1091, 1092, 1122, 1123, 1161, 1162, 1163, 1166, 1167})
+"""Device types (parameter 100) that count as TEC controllers. Meerstetter 5136 covers 1089 to 1123; that
+the 116x obey the same parameters is an assumption."""
+
+
+class _State(IntEnum):
+    """Values of the device status, parameter 104."""
+
+    INIT = 0
+    READY = 1
+    RUN = 2
+    ERROR = 3
+    BOOTLOADER = 4
+    RESET_PENDING = 5
+
+
+_DEVICE_TYPE = Parameter(100, "device type", of_channel=False)
+_SERIAL_NUMBER = Parameter(102, "serial number", of_channel=False)
+_FIRMWARE = Parameter(103, "firmware version", of_channel=False)
+_STATUS = Parameter(104, "device status", of_channel=False)
+_ERROR_NUMBER = Parameter(105, "error number", of_channel=False)
+_ERROR_INSTANCE = Parameter(106, "error instance", of_channel=False)
+_ERROR_PARAMETER = Parameter(107, "error parameter", of_channel=False)
+_SAVING_OFF = Parameter(108, "saving to flash off", of_channel=False)
+_OBJECT_TEMPERATURE = Parameter(1000, "object temperature", real=True)
+_SINK_TEMPERATURE = Parameter(1001, "sink temperature", real=True)
+_CURRENT = Parameter(1020, "output current", real=True)
+_VOLTAGE = Parameter(1021, "output voltage", real=True)
+_STABILITY = Parameter(1200, "temperature is stable")
+_INPUT = Parameter(2000, "output stage input selection")
+_ENABLE = Parameter(2010, "output stage enable")
+_CURRENT_LIMIT = Parameter(2030, "current limitation", real=True)
+_VOLTAGE_LIMIT = Parameter(2031, "voltage limitation", real=True)
+_WATCHDOG = Parameter(2060, "communication watchdog", real=True, of_channel=False)
+_TARGET = Parameter(3000, "target object temperature", real=True)
+_POLARITY = Parameter(3034, "positive current heats")
+_STABLE_WINDOW = Parameter(4040, "temperature window of stability", real=True)
+_STABLE_TIME = Parameter(4041, "minimum time in the window of stability", real=True)
+_RESTART_DELAY = Parameter(6310, "delay till restart", real=True, of_channel=False)
+_LIVE_ENABLED = Parameter(50000, "live enable")
+_LIVE_CURRENT = Parameter(50001, "live current", real=True)
+_LIVE_VOLTAGE = Parameter(50002, "live voltage", real=True)
+_LIVE_TARGET_SELECTED = Parameter(50011, "live target selected")
+_LIVE_TARGET = Parameter(50012, "live target object temperature", real=True)
+
+
+class TECSettings(TECLineSettings):
+    """Rig-file settings of a Meerstetter TEC controller."""
+
+    channel: int = Field(default=1, ge=1, le=4, description="output channel, 1 to 4")
+    mode: TECMode = Field(default=TECMode.TEMPERATURE, description="what is held constant: temperature or current")
+    temperature_limits: tuple[float, float] = Field(
+        description="lowest and highest temperature set-point, °C, within -100 to 200"
+    )
+    current_limit: float = Field(
+        gt=0.0, le=10.0, description="highest current of either sign, A; a TEC-1091 gives 4, a TEC-1089 10"
+    )
+    voltage_limit: float = Field(gt=0.0, le=21.0, description="highest voltage of either sign, V")
+    watchdog: float = watchdog_field(5.0, 600.0, "the device switches its output off, s: 0.1 to 600, 0 for never")
+    stable_window: float = Field(
+        default=0.1, gt=0.0, le=50.0, description="deviation that counts as having arrived, K"
+    )
+    stable_time: float = Field(
+        default=1.0, ge=0.0, le=86400.0, description="time within the deviation that counts as arrived, s"
+    )
+    stable_timeout: float = Field(
+        default=300.0, gt=0.0, description="time after which a temperature that is not stable has failed, s"
+    )
+
+    @field_validator("temperature_limits")
+    @classmethod
+    def _check_temperature_limits(cls, value: tuple[float, float]) -> tuple[float, float]:
+        low, high = value
+        if not -100.0 <= low < high <= 200.0:
+            raise ValueError("expected the lower limit first, both within -100 to 200 °C")
+        return value
+
+    @field_validator("watchdog")
+    @classmethod
+    def _check_watchdog(cls, value: float) -> float:
+        if 0.0 < value < 0.1:
+            raise ValueError("expected 0.1 to 600 s, or 0 for no watchdog")
+        return value
+
+
+class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
+    """A Meerstetter TEC controller as a current source or as a temperature controller.
+
+    `connect` leaves the output off. A device in its error state is refused; `recover` resets it. A value of the
+    settings that the device does not allow is refused before anything is written.
+
+    While the output is on, the device watches its host (`watchdog` of the settings, 5 s by default): if the host is
+    silent for that long, the device switches its output off by itself and stays in error 183. That any exchange
+    feeds the watchdog, a reading as well as a write, is an assumption; the manual does not say. So ask for a reading
+    (`glance`) more often than that while a set-point is held: the longest pause between two ticks of the bench is
+    2 s, hence the default. The watchdog is armed just before the output is switched on and disarmed once it is
+    confirmed to be off, so that a device at rest does not end in an error.
+
+    The device reports current and voltage by its own sign; whether a positive current heats is parameter
+    3034, which the driver reads once and takes into account, as the role counts heating as positive. That
+    it applies to the live current in the same way is an assumption.
+    """
+
+    Settings: ClassVar[type[TECSettings]] = TECSettings
+
+    def __init__(self, name: str, settings: TECSettings, clock: Clock, line: TECLine) -> None:
+        super().__init__(name, settings, clock, line)
+        self._mode = settings.mode
+        self._polarity = 1
+
+    @classmethod
+    def _open_line(cls, name: str, settings: TECSettings, clock: Clock) -> TECLine:  # noqa: ARG003
+        return TECLine(name, settings)
+
+    @property
+    def mode(self) -> TECMode:
+        """What is held constant."""
+        return self._mode
+
+    def select_mode(self, mode: TECMode) -> None:
+        """Choose what is held constant; a change switches the output off first.
+
+        Raises
+        ------
+        DeviceError
+            If the output does not go off, or the device refuses.
+        """
+        if mode is self._mode:
+            return
+        self.safe()
+        self._write(_LIVE_CURRENT, 0.0)
+        self._write(_INPUT, _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT)
+        self._mode = mode
+        self._setpoint = math.nan
+
+    @property
+    def limits(self) -> Limits:
+        """The allowed set-points: the settings' `temperature_limits` in °C, or ± `current_limit` in A."""
+        if self._mode is TECMode.TEMPERATURE:
+            return Limits(*self._settings.temperature_limits, "°C")
+        return Limits(-self._settings.current_limit, self._settings.current_limit, "A")
+
+    def set(self, value: float) -> Status:
+        """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
+
+        The status completes when the device reports the temperature stable; at once in current mode.
+        """
+        self.check(value)
+        state = self._check()
+        if self._mode is TECMode.TEMPERATURE:
+            self._write(_LIVE_TARGET, value)
+        else:
+            self._write(_LIVE_CURRENT, self._polarity * value)
+        self._setpoint = value
+        if state is not _State.RUN:
+            self._switch_on()
+        if self._mode is TECMode.CURRENT:
+            return Status.completed(self.name, self._clock)
+        timeout = self._settings.stable_timeout
+        return Status(self.name, self._clock, lambda: self._arrived(value), timeout=timeout)
+
+    @property
+    def output_enabled(self) -> bool:
+        """Whether the output stage is on, as the device reports now."""
+        return self._state() is _State.RUN
+
+    def measure(self) -> dict[str, float]:
+        """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V)."""
+        values = (
+            self._read(_OBJECT_TEMPERATURE),
+            self._read(_SINK_TEMPERATURE),
+            self._polarity * self._read(_CURRENT),
+            self._polarity * self._read(_VOLTAGE),
+        )
+        # Read last: an error that comes up while the values are read invalidates them, too.
+        self._check()
+        if not all(map(math.isfinite, values)):
+            raise DeviceError(self.name, "reports a value that is not a number; check the sensors")
+        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+
+    def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
+        """Hold the present temperature as the set-point; in current mode the current stays as it is."""
+        if self._mode is TECMode.CURRENT or self._state() is not _State.RUN:
+            return
+        limits = self.limits
+        present = min(max(self._read(_OBJECT_TEMPERATURE), limits.low), limits.high)
+        self._write(_LIVE_TARGET, present)
+        self._setpoint = present
+
+    def safe(self) -> None:
+        """Switch the output stage off in every possible way, and see that it is off.
+
+        Live enable and output stage enable are both switched off; if either fails, or the device still
+        reports a running output, the emergency stop (`ES`, error 11 on the device) follows.
+        """
+        failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
+        if failures or not self._is_off():
+            try:
+                self._line.order("ES")
+            except (DeviceError, RefusedError) as error:
+                failures.append(DeviceError(self.name, f"emergency stop: {error}"))
+            if not self._is_off():
+                raise self._unconfirmed("output", failures)
+        # The output is off, so whether the watchdog could be disarmed does not matter for safety.
+        with suppress(DeviceError):
+            self._write(_WATCHDOG, 0.0)
+
+    def reset(self) -> None:
+        """Restart the device and configure it again: clears an error whose cause is gone. The output is off.
+
+        Raises
+        ------
+        DeviceError
+            If the device does not come back within 5 s, or comes back with an error.
+        """
+        # The acknowledge may be lost in the restart; whether the device comes back is what counts.
+        with suppress(DeviceConnectionError, RefusedError):
+            self._line.order("RS")
+        self._clock.sleep(_RESET_DELAY)
+        self._start()
+
+    def _identify(self) -> Identity:
+        device_type = int(self._read(_DEVICE_TYPE))
+        if device_type not in FAMILY:
+            try:
+                described = f"device type {device_type}, {self._line.ask('?IF', 20).strip()}"
+            except RefusedError:
+                described = f"device type {device_type}"
+            raise DeviceConnectionError(
+                self.name,
+                f"expected a Meerstetter TEC controller at {self._settings.port}, address "
+                f"{self._settings.address}, found {described}; check port and address",
+            )
+        return Identity(
+            "Meerstetter Engineering",
+            f"TEC-{device_type}",
+            str(int(self._read(_SERIAL_NUMBER))),
+            f"{self._read(_FIRMWARE) / 100:.2f}",
+        )
+
+    def _start(self) -> None:
+        self._wait_until(lambda: self._state() not in (_State.INIT, _State.RESET_PENDING), _START_TIMEOUT)
+        self._check()
+        self._configure()
+
+    def _restart(self) -> None:
+        self.reset()
+
+    def _configure(self) -> None:
+        settings = self._settings
+        low, high = settings.temperature_limits
+        # The watchdog is left out: real firmware reports a wrong range for it.
+        for key, parameter, value in (
+            ("current_limit", _CURRENT_LIMIT, settings.current_limit),
+            ("voltage_limit", _VOLTAGE_LIMIT, settings.voltage_limit),
+            ("temperature_limits", _TARGET, low),
+            ("temperature_limits", _TARGET, high),
+            ("stable_window", _STABLE_WINDOW, settings.stable_window),
+            ("stable_time", _STABLE_TIME, settings.stable_time),
+        ):
+            self._check_allowed(key, parameter, value)
+        self._polarity = 1 if self._read(_POLARITY) else -1
+        self._write(_SAVING_OFF, 1)
+        self._write(_LIVE_ENABLED, _OFF)
+        self._write(_ENABLE, _OFF)
+        self._write(_LIVE_CURRENT, 0.0)
+        self._write(_INPUT, _CONTROLLER_INPUT if self._mode is TECMode.TEMPERATURE else _LIVE_INPUT)
+        self._write(_CURRENT_LIMIT, settings.current_limit)
+        self._write(_VOLTAGE_LIMIT, settings.voltage_limit)
+        self._write(_STABLE_WINDOW, settings.stable_window)
+        self._write(_STABLE_TIME, settings.stable_time)
+        # No automatic restart after an error: what tripped stays off until the operator has looked.
+        self._write(_RESTART_DELAY, 0.0)
+        self._write(_WATCHDOG, 0.0)
+        self._setpoint = math.nan
+
+    def _check_allowed(self, key: str, parameter: Parameter, value: float) -> None:
+        lowest, highest = self._range(parameter)
+        if not lowest <= single(value) <= highest:
+            raise ConfigurationError(
+                f"{self.name}: {key}: {value:g} is outside of what the {self._identity.model} allows, "
+                f"{lowest:g} to {highest:g}"
+            )
+
+    def _switch_on(self) -> None:
+        if self._mode is TECMode.TEMPERATURE:
+            self._write(_LIVE_TARGET_SELECTED, 1)
+        else:
+            self._write(_LIVE_VOLTAGE, self._settings.voltage_limit)
+        self._write(_WATCHDOG, self._settings.watchdog)
+        self._write(_ENABLE, _LIVE_ENABLE)
+        self._write(_LIVE_ENABLED, 1)
+        self._check()
+
+    def _arrived(self, target: float) -> bool:
+        if self._read(_STABILITY) != _STABLE:
+            if self._check() is not _State.RUN:
+                raise DeviceError(self.name, f"the output was switched off before it reached {target:g} °C")
+            return False
+        # The device may still report the previous target as stable; three windows leave room for noise.
+        return abs(self._read(_OBJECT_TEMPERATURE) - target) <= 3.0 * self._settings.stable_window
+
+    def _is_off(self) -> bool:
+        # In its error state, too, the device keeps the output off.
+        with suppress(DeviceError):
+            return self._state() is not _State.RUN
+        return False
+
+    def _state(self) -> _State:
+        value = int(self._read(_STATUS))
+        try:
+            return _State(value)
+        except ValueError:
+            raise DeviceError(self.name, f"reports a device status {value} that the protocol lacks") from None
+
+    def _check(self) -> _State:
+        """Return the state if it is ready or run; raise what is wrong otherwise."""
+        state = self._state()
+        if state is _State.ERROR:
+            raise self._fault()
+        if state not in (_State.READY, _State.RUN):
+            title = state.name.lower().replace("_", " ")
+            raise DeviceError(
+                self.name, f"is not ready (device status {state.value}, {title}); try again or power-cycle it"
+            )
+        return state
+
+    def _fault(self) -> DeviceError:
+        number = int(self._read(_ERROR_NUMBER))
+        instance, parameter = int(self._read(_ERROR_INSTANCE)), int(self._read(_ERROR_PARAMETER))
+        text, advice = DEVICE_ERRORS.get(number, UNKNOWN_ERROR)
+        return DeviceError(
+            self.name,
+            f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
+            "then switch the device off and on to clear the error",
+        )
+
+    def _read(self, parameter: Parameter) -> float:
+        answer = self._ask("?VR", parameter, 8)
+        return decode(self.name, parameter, answer)
+
+    def _range(self, parameter: Parameter) -> tuple[float, float]:
+        answer = self._ask("?VL", parameter, 18)
+        return decode(self.name, parameter, answer[2:10]), decode(self.name, parameter, answer[10:])
+
+    def _ask(self, command: str, parameter: Parameter, digits: int) -> str:
+        try:
+            return self._line.ask(f"{command}{self._selector(parameter)}", digits)
+        except RefusedError as error:
+            raise DeviceError(
+                self.name, f"refused to report its {parameter.title} (parameter {parameter.number}): {error}"
+            ) from None
+
+    def _write(self, parameter: Parameter, value: float) -> None:
+        try:
+            self._line.order(f"VS{self._selector(parameter)}{encode(parameter, value)}")
+        except RefusedError as error:
+            allowed = ""
+            if error.code == _OUT_OF_RANGE:
+                lowest, highest = self._range(parameter)
+                allowed = f"; allowed are {lowest:g} to {highest:g}"
+            raise DeviceError(
+                self.name,
+                f"refused {value:g} as its {parameter.title} (parameter {parameter.number}): {error}{allowed}",
+            ) from None
+
+    def _selector(self, parameter: Parameter) -> str:
+        instance = self._settings.channel if parameter.of_channel else 1
+        return f"{parameter.number:04X}{instance:02X}"

@@ -1,0 +1,130 @@
+"""The common base of the emulated instruments: a role without a wire, and the faults of a line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+
+import numpy as np
+
+from bench.devices import Device
+from bench.errors import DeviceConnectionError
+from sim_devices.world import World
+
+
+class RequestRefusedError(Exception):
+    """An instrument refuses a request.
+
+    Parameters
+    ----------
+    reason : IntEnum
+        The error number of the instrument's protocol.
+    """
+
+    def __init__(self, reason: IntEnum) -> None:
+        super().__init__(reason.name)
+        self.reason = reason
+
+
+class EmulatedDevice(Device):
+    """A role that an emulated instrument plays when it is called directly, without a wire.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig.
+    world : World
+        The emulated laboratory.
+    rng : numpy.random.Generator, optional
+        Noise of the readings; without it they are free of noise.
+    """
+
+    def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
+        super().__init__(name, world.clock)
+        self._world = world
+        self._rng = rng
+        self._setpoint = math.nan
+
+    @property
+    def world(self) -> World:
+        """The emulated laboratory."""
+        return self._world
+
+    @property
+    def setpoint(self) -> float:
+        """The set-point that was last sent, in the unit of the role's limits; nan before the first."""
+        return self._setpoint
+
+    def close(self) -> None:
+        """Do nothing: there is no line."""
+
+    def _draw(self, deviation: float) -> float:
+        """Draw from a normal distribution of a standard deviation."""
+        return 0.0 if self._rng is None else deviation * float(self._rng.standard_normal())
+
+
+class EmulatedInstrument(EmulatedDevice):
+    """An emulated instrument with a line of its own, which can be unplugged and disturbed."""
+
+    def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
+        super().__init__(name, world, rng)
+        self._plugged_in = True
+        self._corrupt_next = self._drop_next = False
+
+    @property
+    def plugged_in(self) -> bool:
+        """Whether requests reach the instrument."""
+        return self._plugged_in
+
+    @property
+    def answering(self) -> bool:
+        """Whether the instrument answers requests at the clock's present time."""
+        return self._plugged_in
+
+    def attend(self) -> None:
+        """Bring the instrument to the clock's present time: a request has arrived."""
+        self._world.advance()
+
+    def unplug(self) -> None:
+        """Block requests and answers; the instrument keeps working, and its watchdog expires."""
+        with self._world.at_present():
+            self._plugged_in = False
+
+    def plug_in(self) -> None:
+        """Undo `unplug`."""
+        with self._world.at_present():
+            self._plugged_in = True
+
+    def corrupt_next_answer(self) -> None:
+        """Damage the next answer on the line; the instrument has acted all the same."""
+        self._corrupt_next = True
+
+    def drop_next_answer(self) -> None:
+        """Lose the next answer on the line; the instrument has acted all the same."""
+        self._drop_next = True
+
+    def transmit(self, answer: bytes) -> bytes:
+        """Return what the host receives of an answer, after the faults of the line."""
+        if answer and self._drop_next:
+            self._drop_next = False
+            return b""
+        if answer and self._corrupt_next:
+            self._corrupt_next = False
+            return self._corrupted(answer)
+        return answer
+
+    def _corrupted(self, answer: bytes) -> bytes:
+        """Flip one bit."""
+        middle = len(answer) // 2
+        return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
+
+    @contextmanager
+    def _request(self) -> Iterator[None]:
+        """Serve a request of the role: hold the lock, at the clock's present time."""
+        with self._world.lock:
+            if not self.answering:
+                raise DeviceConnectionError(self.name, "does not answer: it is unplugged or restarting")
+            self.attend()
+            yield

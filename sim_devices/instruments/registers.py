@@ -1,0 +1,156 @@
+"""Emulated instruments that are banks of named Modbus registers."""
+
+from __future__ import annotations
+
+import math
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+from sim_devices.wire.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
+
+Kind = Literal["F32", "I32", "U32", "U16"]
+
+_FORMATS = {"F32": ">f", "I32": ">i", "U32": ">I", "U16": ">H"}
+
+
+@dataclass(frozen=True)
+class Register:
+    """One row of a register map, or several numbered registers of one meaning.
+
+    Attributes
+    ----------
+    name : str
+        Name in the manual; a `#` stands for the number, as in `AIN#_RANGE`.
+    address : int
+        Address of the first 16-bit word, 0 to 65535; the highest word comes first.
+    kind : {"F32", "I32", "U32", "U16"}
+        Type of the value.
+    read : callable, optional
+        Returns the value; without it the register can only be written. Takes the number if there are several.
+    write : callable, optional
+        Takes the value, after the number if there are several; without it the register can only be read.
+    count : int
+        How many registers there are, one behind the other.
+    """
+
+    name: str
+    address: int
+    kind: Kind
+    read: Callable[..., float] | None = None
+    write: Callable[..., None] | None = None
+    count: int = 1
+
+    @property
+    def words(self) -> int:
+        """Number of 16-bit words."""
+        return 1 if self.kind == "U16" else 2
+
+    def encode(self, value: float) -> tuple[int, ...]:
+        """Return the words of a value."""
+        raw = struct.pack(_FORMATS[self.kind], value if self.kind == "F32" else int(value))
+        return struct.unpack(f">{self.words}H", raw)
+
+    def decode(self, words: Sequence[int]) -> float:
+        """Return the value of words: an int, except for `F32`."""
+        value: float = struct.unpack(_FORMATS[self.kind], struct.pack(f">{self.words}H", *words))[0]
+        return value
+
+    def each(self) -> Iterable[Register]:
+        """Return the registers that the row stands for."""
+        if "#" not in self.name:
+            return (self,)
+        return (
+            Register(
+                self.name.replace("#", str(number)),
+                self.address + number * self.words,
+                self.kind,
+                self.read and partial(self.read, number),
+                self.write and partial(self.write, number),
+            )
+            for number in range(self.count)
+        )
+
+
+class RegisterInstrument(ABC):
+    """A bank of registers with names; a `sim_devices.wire.modbus.RegisterBank`."""
+
+    def _set_map_up(self, rows: Iterable[Register]) -> None:
+        registers = [register for row in rows for register in row.each()]
+        self._named = {register.name: register for register in registers}
+        self._words = {register.address + word: register for register in registers for word in range(register.words)}
+
+    @abstractmethod
+    def _request(self) -> AbstractContextManager[None]:
+        """Serve a request: hold the lock, at the clock's present time."""
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        """Return `count` registers from `address` on, of one instant; reading half a value is allowed.
+
+        Raises
+        ------
+        RegisterError
+            If one of them does not exist or cannot be read.
+        """
+        with self._request():
+            values: dict[int, tuple[int, ...]] = {}
+            words = []
+            for each in range(address, address + count):
+                register = self._at(each)
+                if register.read is None:
+                    raise RegisterError(ILLEGAL_ADDRESS, f"{register.name} can only be written")
+                if register.address not in values:
+                    values[register.address] = register.encode(register.read())
+                words.append(values[register.address][each - register.address])
+            return words
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        """Write registers from `address` on, in whole values.
+
+        Raises
+        ------
+        RegisterError
+            If one of them does not exist or cannot be written, or if a value is not allowed; the values
+            before it have been written then.
+        """
+        with self._request():
+            position = 0
+            while position < len(values):
+                register = self._at(address + position)
+                words = values[position : position + register.words]
+                self._check_write(register, register.address == address + position and len(words) == register.words)
+                value = register.decode(words)
+                if not math.isfinite(value):
+                    raise RegisterError(ILLEGAL_VALUE, f"{register.name}: allowed are finite numbers, got {value}")
+                if register.write is not None:
+                    register.write(value)
+                position += register.words
+
+    def _check_write(self, register: Register, whole: bool) -> None:
+        if not whole:
+            raise RegisterError(ILLEGAL_VALUE, f"{register.name} must be written as a whole")
+        if register.write is None:
+            raise RegisterError(ILLEGAL_ADDRESS, f"{register.name} can only be read")
+
+    def read_value(self, register: int | str) -> float:
+        """Return the value of a register, by address or by name, as one request would."""
+        row = self._row(register)
+        return float(row.decode(self.read_registers(row.address, row.words)))
+
+    def write_value(self, register: int | str, value: float) -> None:
+        """Write the value of a register, by address or by name, as one request would."""
+        row = self._row(register)
+        self.write_registers(row.address, list(row.encode(value)))
+
+    def _row(self, register: int | str) -> Register:
+        return self._named[register] if isinstance(register, str) else self._at(register)
+
+    def _at(self, address: int) -> Register:
+        try:
+            return self._words[address]
+        except KeyError:
+            raise RegisterError(ILLEGAL_ADDRESS, f"register {address} (0x{address:04X}) is not emulated") from None

@@ -1,0 +1,43 @@
+"""An optical displacement sensor with a voltage output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+
+import numpy as np
+
+
+@dataclass(eq=False)
+class DisplacementSensor:
+    """An optical displacement sensor with a voltage in proportion to the displacement.
+
+    Parameters
+    ----------
+    displacement : callable
+        The displacement in m, from the plant.
+    volts_per_metre : float
+        Sensitivity in V/m.
+    reach : float
+        Displacement of either sign in m beyond which the output stays where it is.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the displacement, in m.
+    rng : numpy.random.Generator
+        Source of the noise.
+    """
+
+    displacement: Callable[[], float]
+    volts_per_metre: float = 5e4
+    reach: float = 200e-6
+    noise: float = 10e-9
+    resolution: float = 10e-9
+    _: KW_ONLY
+    rng: np.random.Generator
+
+    def __call__(self) -> float:
+        """Return the voltage in V at this instant."""
+        noisy = self.displacement() + self.noise * self.rng.standard_normal()
+        shown = round(noisy / self.resolution) * self.resolution
+        return self.volts_per_metre * min(max(shown, -self.reach), self.reach)

@@ -1,0 +1,60 @@
+"""A linear magnet sensor with a ratiometric output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
+
+import numpy as np
+
+
+@dataclass(eq=False)
+class RatiometricSensor:
+    """A linear magnet sensor, of the kind of the SPS-L035-LATS, whose output is a share of its supply.
+
+    Assumption: the output goes from 10 to 90 % of a supply of 5 V over the stroke, and stays at its end for a
+    magnet that is beyond it.
+
+    Parameters
+    ----------
+    position : callable
+        The position of the magnet in m, counted from the start of the stroke, from the plant.
+    stroke : float
+        Stroke in m.
+    noise : float
+        White noise in m rms, drawn anew for every conversion; zero or positive.
+    resolution : float
+        Steps in which the sensor gives the position, in m.
+    supply_error : float
+        Deviation of the supply of one instance from 5 V, V rms; drawn once.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the supply.
+
+    Attributes
+    ----------
+    supply_volts : float
+        Voltage of the supply in V; for faults and drift.
+    """
+
+    position: Callable[[], float]
+    stroke: float = 0.035
+    noise: float = 0.01e-3
+    resolution: float = 0.04e-3
+    supply_error: float = 20e-3
+    _: KW_ONLY
+    rng: np.random.Generator
+    supply_volts: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.supply_volts = 5.0 + self.supply_error * self.rng.standard_normal()
+
+    def output(self) -> float:
+        """Return the output voltage in V at this instant."""
+        noisy = self.position() + self.noise * self.rng.standard_normal()
+        step = round(noisy / self.resolution) * self.resolution
+        share = min(max(step / self.stroke, 0.0), 1.0)
+        return self.supply_volts * (0.1 + 0.8 * share)
+
+    def supply(self) -> float:
+        """Return the voltage in V of the supply at this instant."""
+        return self.supply_volts

@@ -1,0 +1,80 @@
+"""An NTC thermistor in a voltage divider (Steinhart and Hart 1968, Deep-Sea Research 15)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
+
+import numpy as np
+
+_KELVIN = 273.15
+
+STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
+"""A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
+
+
+@dataclass(eq=False)
+class Thermistor:
+    """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
+
+    Assumptions: no self-heating, an exact reference resistor.
+
+    Parameters
+    ----------
+    temperature : callable
+        The temperature in °C, from the plant.
+    reference_ohms : float
+        Reference resistor in Ω.
+    steinhart_hart : tuple of float
+        A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive.
+    excitation_volts : float
+        Excitation in V.
+    excitation_error : float
+        Deviation of the excitation of one instance, V rms; drawn once.
+    noise : float
+        White noise in K rms, drawn anew for every conversion; zero or positive.
+    rng : numpy.random.Generator
+        Source of the noise and of the error of the excitation.
+
+    Attributes
+    ----------
+    excitation_volts : float
+        Voltage of the excitation in V; for faults and drift.
+    open, shorted : bool
+        Whether a wire of the thermistor is broken, or its wires are shorted; for faults.
+    """
+
+    temperature: Callable[[], float]
+    reference_ohms: float = 10e3
+    steinhart_hart: tuple[float, float, float] = STEINHART_HART
+    excitation_volts: float = 2.5
+    excitation_error: float = 10e-3
+    noise: float = 0.02
+    _: KW_ONLY
+    rng: np.random.Generator
+    open: bool = field(default=False, init=False)
+    shorted: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self.excitation_volts += self.excitation_error * self.rng.standard_normal()
+
+    def divider(self) -> float:
+        """Return the voltage in V at the input of the divider at this instant."""
+        if self.shorted:
+            return 0.0
+        if self.open:
+            return self.excitation_volts
+        ohms = self._ohms(self.temperature() + self.noise * self.rng.standard_normal())
+        return self.excitation_volts * ohms / (ohms + self.reference_ohms)
+
+    def excitation(self) -> float:
+        """Return the voltage in V of the excitation at this instant."""
+        return self.excitation_volts
+
+    def _ohms(self, celsius: float) -> float:
+        """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
+        a, b, c = self.steinhart_hart
+        half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
+        root = math.sqrt((b / (3 * c)) ** 3 + half**2)
+        return math.exp(math.cbrt(root - half) - math.cbrt(root + half))
