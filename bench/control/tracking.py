@@ -76,19 +76,8 @@ class Trace:
     uncertainty: float = math.nan
 
 
-class TargetController(Protocol):
-    """Brings the output to one target after another.
-
-    `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
-    """
-
-    def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
-        """Start towards a new target and return the first command."""
-        ...
-
-    def update(self, t: float, measured_input: float, output: float) -> Command:
-        """Take in a reading, `Command.wait` after the last or later, and return the next command."""
-        ...
+class Controller(Protocol):
+    """What the record asks of every controller."""
 
     @property
     def trace(self) -> Trace:
@@ -102,11 +91,26 @@ class TargetController(Protocol):
 
     @property
     def reach(self) -> Reach:
-        """Whether the present target can be met."""
+        """Whether the present target or reference can be met."""
         ...
 
 
-class Follower(Protocol):
+class TargetController(Controller, Protocol):
+    """Brings the output to one target after another.
+
+    `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
+    """
+
+    def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
+        """Start towards a new target and return the first command."""
+        ...
+
+    def update(self, t: float, measured_input: float, output: float) -> Command:
+        """Take in a reading, `Command.wait` after the last or later, and return the next command."""
+        ...
+
+
+class Follower(Controller, Protocol):
     """Makes the output follow a reference that moves; called at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
@@ -123,21 +127,6 @@ class Follower(Protocol):
         reference : float
             Wanted output at the end of the coming period.
         """
-        ...
-
-    @property
-    def trace(self) -> Trace:
-        """Internal values at present."""
-        ...
-
-    @property
-    def state(self) -> Any:  # noqa: ANN401 - each operator has its own
-        """Memory of the actuator as the controller knows it; None if it keeps none."""
-        ...
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present reference can be met."""
         ...
 
 

@@ -164,7 +164,13 @@ class TestCommands:
         assert "bouc-wen" in bench("list")
         for model in ("bouc-wen", "polynomial"):
             path = tmp_path / f"{model}.json"
-            bench("identify", data, *columns, "--model", model, "--out", path, "--figures", tmp_path / "figures")
+            fitted = tmp_path / f"{model}-fit.json"
+            bench(
+                "identify", data, *columns, "--model", model, "--out", path, "--figures", tmp_path / "figures",
+                "--json", fitted,
+            )  # fmt: skip
+        assert json.loads((tmp_path / "bouc-wen-fit.json").read_text())["shape"] == pytest.approx(TRUE, rel=1e-3)
+        assert "shape" not in json.loads((tmp_path / "polynomial-fit.json").read_text())
         drawn = {path.name for path in (tmp_path / "figures").iterdir()}
         assert {"bouc-wen-loops.png", "bouc-wen-errors.png"} <= drawn
 
