@@ -308,7 +308,7 @@ def identify_(
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, soft_wrap=True)
     if figures is not None:
-        from bench.report import draw_identification
+        from bench.results.report import draw_identification
 
         for path in draw_identification(found, figures):
             console.print(f"figure: {path}", highlight=False, soft_wrap=True)
@@ -504,7 +504,7 @@ def compare_(
         )  # fmt: skip
     console.print(table)
     if figures is not None:
-        from bench.report import draw_comparison
+        from bench.results.report import draw_comparison
 
         console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, soft_wrap=True)
     write_json(json_file, result.to_json())
@@ -637,7 +637,7 @@ def report(
 
     Models that were identified from this run are compared without being named. Works while the run goes on.
     """
-    from bench.report import report_run
+    from bench.results.report import report_run
 
     result = report_run(run, models or [], out, console)
     write_json(json_file, result)
@@ -666,7 +666,7 @@ def export(
     csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers. rrd: the
     recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
     """
-    from bench.report import export_run
+    from bench.results.report import export_run
 
     paths = export_run(run, format_.value, out)
     for path in paths:

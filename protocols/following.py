@@ -11,7 +11,7 @@ from bench.control.references import fastest_slope, modulated_sine
 from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
-from bench.tracking_results import FOLLOW
+from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
 _DRIVE = unit_of("drive")

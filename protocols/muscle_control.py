@@ -11,7 +11,7 @@ from bench.controllers import MuscleControllerName, load_two_stage_model, make_m
 from bench.hysteresis import TwoStage, TwoStageState
 from bench.muscle_runs import FORCE, LENGTH
 from bench.protocol import Control, Dwell, Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
-from bench.tracking_results import REACH, READING
+from bench.results.tracking import REACH, READING
 from protocols.force_voltage import condition
 from protocols.muscle import (
     ON_STAGE,

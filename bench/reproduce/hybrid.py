@@ -17,7 +17,6 @@ import numpy.typing as npt
 from rich.console import Console
 
 from bench.clock import Stopwatch
-from bench.figures import Curve, plot_panels, plot_tracking
 from bench.hybrid_runs import (
     BASE,
     CURRENT,
@@ -38,9 +37,10 @@ from bench.identification import measure_errors
 from bench.identification.dynamics import PUBLISHED_DYNAMICS
 from bench.identification.thermal_network import Design
 from bench.journal import Record
-from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.figures import Curve, plot_panels, plot_tracking
 from bench.results.model_file import ModelFile
+from bench.results.report import export_run
 from bench.runs import RunResult
 
 Floats = npt.NDArray[np.float64]

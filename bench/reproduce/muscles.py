@@ -13,10 +13,10 @@ from typing import Any
 from rich.console import Console
 
 from bench.clock import Stopwatch
-from bench.figures import Curve, plot_panels
-from bench.report import export_run
 from bench.reproduce.campaign import Campaign, print_end
 from bench.reproduce.sma import Characterization, characterize, errors_table
+from bench.results.figures import Curve, plot_panels
+from bench.results.report import export_run
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,6 @@ from rich.table import Table
 
 from bench.clock import Stopwatch
 from bench.errors import DataError
-from bench.figures import (
-    Curve,
-    plot_densities,
-    plot_errors,
-    plot_panels,
-    plot_sequence_and_errors,
-    plot_tracking,
-)
 from bench.identification import Errors
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series, predict_series
 from bench.journal import Record, add_model
@@ -41,11 +33,19 @@ from bench.muscle_runs import (
     read_resting,
     read_series,
 )
-from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.figures import (
+    Curve,
+    plot_densities,
+    plot_errors,
+    plot_panels,
+    plot_sequence_and_errors,
+    plot_tracking,
+)
 from bench.results.model_file import ModelFile
+from bench.results.report import export_run
+from bench.results.tracking import TargetResults, target_results
 from bench.runs import RunResult
-from bench.tracking_results import TargetResults, target_results
 
 Floats = npt.NDArray[np.float64]
 
@@ -353,7 +353,7 @@ def _draw(measured: Characterization, folder: Path) -> list[Path]:
             vertical_label="length / mm",
         )
     two_stage = measured.models["two-stage"].model
-    plot_densities(path("figure-09-densities"), {"H1": two_stage.first, "H2": two_stage.second})
+    plot_densities(path("figure-09-densities"), two_stage.densities())
     for name, kind in (
         ("figure-10a-errors-length-voltage", "length-voltage"),
         ("figure-10b-errors-length-force", "length-force"),

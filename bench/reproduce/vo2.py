@@ -17,15 +17,15 @@ from rich.console import Console
 
 from bench.clock import Stopwatch
 from bench.errors import DataError
-from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.report import export_run
 from bench.reproduce.campaign import Campaign, make_table, print_end
+from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.report import export_run
+from bench.results.tracking import FollowingResult, TargetResults, following_result, target_results
 from bench.runs import RunResult
-from bench.tracking_results import FollowingResult, TargetResults, following_result, target_results
 
 Floats = npt.NDArray[np.float64]
 
@@ -309,7 +309,7 @@ def _draw(
     ):
         plot_errors(paths[name], {titles[key]: residuals[key]}, error_label=error)
     for name, key in (("figure-06-density-proposed", "nonmonotonic"), ("figure-08-density-signed", "signed")):
-        plot_density(paths[name], models[key].file.model)
+        plot_densities(paths[name], models[key].file.operator.densities())
     plot_sequence_and_errors(
         paths["figure-10-validation"],
         inputs,

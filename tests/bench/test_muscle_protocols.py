@@ -14,8 +14,8 @@ from bench.journal import Record
 from bench.muscle_runs import FORCE, LENGTH, SAMPLE
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
+from bench.results.tracking import target_results
 from bench.rig_file import load_rig
-from bench.tracking_results import target_results
 from protocols.force_voltage import scaled_steps
 from protocols.muscle import LOADS, parse_numbers
 

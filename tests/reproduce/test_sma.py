@@ -11,7 +11,7 @@ from bench.identification.two_stage import measure_series
 from bench.journal import Record
 from bench.muscle_runs import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 from bench.results.model_file import load_model
-from bench.tracking_results import target_results
+from bench.results.tracking import target_results
 
 CONTROLLERS = ("open_loop_inverse", "proportional_integral", "closed_loop_inverse")
 LENGTHS = ("length_4.9N", "length_8.82N", "length_changing_load")
