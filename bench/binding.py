@@ -25,22 +25,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bench.devices import Actuator, Device, Signal
 from bench.errors import ConfigurationError
+from bench.layout import Range
 from bench.settling import Dwell, Settle, UntilSteady
-
-
-def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
-    if not ends[0] < ends[1]:
-        raise ValueError("expected two numbers, the lower one first")
-    return ends
-
-
-Range = Annotated[tuple[float, float], AfterValidator(_check_range)]
 
 
 class _Table(BaseModel):

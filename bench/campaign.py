@@ -18,9 +18,9 @@ from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.journal import Record
 from bench.protocol import find_protocol
-from bench.report import export_run
+from bench.results.report import export_run
+from bench.results.tracking import TargetResults, target_results
 from bench.runs import Run, RunResult, carry_out
-from bench.tracking_results import TargetResults, target_results
 
 
 @dataclass

@@ -333,6 +333,12 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="KEY=VALUE", help="Another option of the model, a number; may come several times."
+        ),
+    ] = None,
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
@@ -343,8 +349,8 @@ def identify_(
     """Identify a hysteresis model from measurements, and say how good it is.
 
     Columns are named as in the header; a unit in brackets at the end, as in `force [N]`, may be left out and
-    goes into the model. Of a run, the readings are taken: `bench identify RUN --input tec_temperature
-    --output curvature --model preisach-nonmonotonic --out model.json`.
+    goes into the model. Of a run, the readings are taken: `bench identify RUN --input voltage
+    --output displacement --model preisach --out model.json`.
     """
     from bench.results.models import certificate_lines, identify_file
 
@@ -360,6 +366,7 @@ def identify_(
         smoothing=smoothing,
         skip=skip,
         initial=initial,
+        **parse_numbers("--option", options or ()),
         cross_validated=cross_validate,
     )
     if found.trials is not None:
@@ -372,7 +379,7 @@ def identify_(
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, soft_wrap=True)
     if figures is not None:
-        from bench.report import draw_identification
+        from bench.results.report import draw_identification
 
         for path in draw_identification(found, figures):
             console.print(f"figure: {path}", highlight=False, soft_wrap=True)
@@ -467,7 +474,7 @@ def compare_(
         )  # fmt: skip
     console.print(table)
     if figures is not None:
-        from bench.report import draw_comparison
+        from bench.results.report import draw_comparison
 
         console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, soft_wrap=True)
     write_json(json_file, result.to_json())
@@ -600,7 +607,7 @@ def report(
 
     Models that were identified from this run are compared without being named. Works while the run goes on.
     """
-    from bench.report import report_run
+    from bench.results.report import report_run
 
     result = report_run(run, models or [], out, console)
     write_json(json_file, result)
@@ -629,7 +636,7 @@ def export(
     csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers. rrd: the
     recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
     """
-    from bench.report import export_run
+    from bench.results.report import export_run
 
     paths = export_run(run, format_.value, out)
     for path in paths:
@@ -672,6 +679,17 @@ def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"{option}: {key} is given twice")
         pairs[key] = value
     return pairs
+
+
+def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
+    """Split texts of the form `key=number`; errors as `parse_assignments`, or if a value is not a number."""
+    numbers: dict[str, int | float] = {}
+    for key, text in parse_assignments(option, texts).items():
+        try:
+            numbers[key] = int(text) if text.lstrip("-").isdigit() else float(text)
+        except ValueError:
+            raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
+    return numbers
 
 
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold

@@ -1,7 +1,7 @@
 """The durable record of a run: one SQLite file, written before any observer is notified.
 
 The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
-it is handed over; what `Journal` has returned from survives the death of the process and of the machine.
+it is handed over; what `Journal` has returned from survives a crash of the process and of the machine.
 Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
 becomes one self-contained file, which can be read where nothing can be written.
 
@@ -119,7 +119,7 @@ class Event:
 
 
 _LONGEST_UNWRITTEN = 0.1
-"""Time of the room after which a tick is written for good, s."""
+"""Wall-clock time after which a tick is committed, s."""
 
 
 class Journal:
@@ -177,8 +177,8 @@ class Journal:
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Record one tick of a hold: laboratory time in s, step number, one value a signal.
 
-        A tick that comes less than 0.1 s of the room after the last write, as they do on the virtual clock, waits
-        for the next tick, step or event to be written with it.
+        A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
+        the next tick, step or event.
         """
         self._waiting.append((t, step, *map(float, values)))
         if self._since_write.seconds() >= _LONGEST_UNWRITTEN:
@@ -224,7 +224,7 @@ class Journal:
         self._db.close()
 
     def _write(self, statement: str, values: Sequence[object]) -> None:
-        """Write one row for good, after whatever waits."""
+        """Commit one row, after the ticks that wait."""
         if not self._waiting:
             self._db.execute(statement, values)
         else:
@@ -243,12 +243,12 @@ class Journal:
 
     def _put_meta(self, key: str, value: object) -> None:
         text = json.dumps(value, ensure_ascii=False, default=str)
-        # What no encoding holds, such as a file name of another system, becomes an escape, as JSON has it.
+        # Characters that no encoding holds, as in a file name of another system, become JSON escapes.
         text = text.encode("utf-8", "backslashreplace").decode("utf-8")
         self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
 
     def _transaction(self) -> AbstractContextManager[None]:
-        # Whoever has begun one already, writes all in it.
+        # Reuse an open transaction.
         return nullcontext() if self._db.in_transaction else _Transaction(self._db)
 
 
@@ -421,6 +421,30 @@ def add_model(path: Path, name: str, t: float, model: Mapping[str, Any]) -> None
         raise DataError(f"{file} is damaged: {error}") from error
     finally:
         db.close()
+
+
+def run_card(meta: Mapping[str, Any]) -> str:
+    """Return a run's metadata as a Markdown page, for the dashboard and the report."""
+    lines = [
+        f"# {meta['rig_title']}",
+        "",
+        f"**{meta['protocol']}** on **{meta['rig']}**: {meta['protocol_summary']}",
+        "",
+    ]
+    lines += ["| | |", "|---|---|"]
+    planned = meta["plan"]
+    rows = {
+        "run": meta["run"],
+        "operator": meta["operator"],
+        "started": f"{meta['epoch']} ({meta['clock']} clock)",
+        "planned": f"{planned['steps']} steps, {planned['seconds'] / 3600:.2f} h",
+        "seed": meta["seed"],
+        **{f"device {name}": identity for name, identity in meta["devices"].items()},
+        **{f"parameter {name}": value for name, value in meta["parameters"].items()},
+        "git": meta["git"],
+    }
+    lines += [f"| {key} | {value} |" for key, value in rows.items()]
+    return "\n".join(lines)
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from bench.devices import Actuator, Device, DriverSettings, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
 from bench.protocol.parameters import ProtocolDefinition
-from bench.rig_file import DeviceEntry, Laboratory, LoopTable, RigFile
+from bench.rig_file import DeviceEntry, Laboratory, RigFile
 from bench.safety import SAFE, make_safe
 
 
@@ -212,10 +212,8 @@ class Rig:
             raise ConfigurationError(f"{path}: {error}") from None
         used = [(f"interlocks.{i}.signal", lock.signal) for i, lock in enumerate(self.file.interlocks)]
         if self.file.dashboard is not None:
-            loops: dict[str, LoopTable] = {"dashboard": self.file.dashboard}
-            loops |= {f"dashboard.loops.{i}": loop for i, loop in enumerate(self.file.dashboard.loops)}
-            for key, loop in loops.items():
-                used += [(f"{key}.input", loop.input), (f"{key}.output", loop.output)]
+            for prefix, plot in self.file.dashboard.plots.items():
+                used += [(f"dashboard.{prefix}input", plot.input), (f"dashboard.{prefix}output", plot.output)]
         for key, signal in used:
             if signal not in self._by_name:
                 raise ConfigurationError(

@@ -61,11 +61,12 @@ from typing import Any, ClassVar, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bench import registry
-from bench.binding import Range, RoleTable
+from bench.binding import RoleTable
 from bench.clock import Clock
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
+from bench.layout import DashboardLayout
 from bench.safety import Interlock
 from bench.validation import problems
 
@@ -87,24 +88,6 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
-class LoopTable(_Table):
-    """A table `[[dashboard.loops]]`: one more loop of the live view."""
-
-    input: str = Field(description="signal on the horizontal axis of the loop")
-    output: str = Field(description="signal on the vertical axis of the loop")
-    input_range: Range = Field(description="ends of the horizontal axis")
-    output_range: Range = Field(description="ends of the vertical axis")
-
-
-class DashboardTable(LoopTable):
-    """The table `[dashboard]`: the hysteresis loops and the Preisach plane of the live view."""
-
-    input: str = Field(description="signal on the horizontal axis of the loop, and input of the plane")
-    plane: Range = Field(description="ends of both axes of the Preisach plane")
-    levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
-    loops: tuple[LoopTable, ...] = Field(default=(), description="further loops")
-
-
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
@@ -113,7 +96,7 @@ class _RigFileContent(_Table):
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
-    dashboard: DashboardTable | None = None
+    dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
 
@@ -190,7 +173,7 @@ class RigFile:
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
-    dashboard: DashboardTable | None
+    dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
 

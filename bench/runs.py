@@ -9,7 +9,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -134,10 +134,13 @@ def carry_out(run: Run, console: Console) -> RunResult:
         journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
         observers: list[Any] = []
-        dashboard = (
-            stack.enter_context(_dashboard(run, rig, signals, meta, folder)) if run.live or run.recording else None
-        )
-        if dashboard is not None:
+        dashboard = None
+        if run.live or run.recording:
+            # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
+            from bench.dashboard import Dashboard
+
+            path = folder / RECORDING_NAME if run.recording else None
+            dashboard = stack.enter_context(Dashboard(signals, meta, path=path, live=run.live))
             observers.append(dashboard)
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
@@ -153,56 +156,15 @@ def carry_out(run: Run, console: Console) -> RunResult:
     return RunResult(folder, outcome, stopwatch.seconds())
 
 
-def run_card(meta: Mapping[str, Any]) -> str:
-    """Return a run's metadata as a Markdown page, for the dashboard and the report."""
-    lines = [
-        f"# {meta['rig_title']}",
-        "",
-        f"**{meta['protocol']}** on **{meta['rig']}**: {meta['protocol_summary']}",
-        "",
-    ]
-    lines += ["| | |", "|---|---|"]
-    planned = meta["plan"]
-    rows = {
-        "run": meta["run"],
-        "operator": meta["operator"],
-        "started": f"{meta['epoch']} ({meta['clock']} clock)",
-        "planned": f"{planned['steps']} steps, {planned['seconds'] / 3600:.2f} h",
-        "seed": meta["seed"],
-        **{f"device {name}": identity for name, identity in meta["devices"].items()},
-        **{f"parameter {name}": value for name, value in meta["parameters"].items()},
-        "git": meta["git"],
-    }
-    lines += [f"| {key} | {value} |" for key, value in rows.items()]
-    return "\n".join(lines)
-
-
-def _dashboard(run: Run, rig: Rig, signals: Sequence[Signal], meta: Mapping[str, Any], folder: Path) -> Any:  # noqa: ANN401 - see below
-    # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
-    from bench.dashboard import Dashboard, DashboardLayout
-
-    layout = DashboardLayout(title=rig.file.rig.title, **meta["dashboard"]) if meta["dashboard"] else None
-    return Dashboard(
-        signals,
-        layout,
-        run_id=str(meta["run"]),
-        title=f"{rig.file.rig.title}: {run.protocol.name}",
-        path=folder / RECORDING_NAME if run.recording else None,
-        live=run.live,
-        card=run_card(meta),
-        properties={"rig": rig.file.name, "protocol": run.protocol.name, "seed": run.seed},
-        controls=str(meta["controls"]),
-    )
-
-
 def trace_signals(protocol: ProtocolDefinition, rig: Rig, slots: Slots) -> tuple[Signal, ...]:
     """Return the signals that a protocol's controllers add to the rig's."""
     controlled = protocol.controlled(slots)
     if not controlled:
         return ()
     rig.check_needs(protocol.name, [controlled])
-    unit = next(signal.unit for signal in rig.signals if signal.name == controlled)
-    return (*(replace(signal, unit=unit) for signal in TRACES), LATENESS)
+    signal = next(signal for signal in rig.signals if signal.name == controlled)
+    traces = (replace(trace, unit=signal.unit, precision=signal.precision) for trace in TRACES)
+    return (*traces, LATENESS)
 
 
 def _metadata(

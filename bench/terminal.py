@@ -1,4 +1,4 @@
-"""What the terminal shows of a run: progress with ETA and readings, and the question at a pause."""
+"""The terminal during a run: progress with ETA and readings, and the question at a pause."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bench.engine import ABORT, RESUME
 from bench.journal import Event, StepRecord
 
 _REFRESH = 0.1
-"""Seconds of the room between two redraws of the readings."""
+"""Wall-clock seconds between two redraws of the readings."""
 
 
 class ProgressDisplay:
@@ -35,11 +35,11 @@ class ProgressDisplay:
     Parameters
     ----------
     console : Console
-        Where to draw; when it is no terminal, only events are printed.
+        Console to draw on; if it is no terminal, only events are printed.
     title : str
-        What runs.
+        Name of the protocol.
     signals : sequence of Signal
-        What the engine's values are.
+        Signals of the engine's values, in their order.
     shown : sequence of str
         Signals whose readings are shown beside the bar.
     steps : int
@@ -85,14 +85,14 @@ class ProgressDisplay:
             self._progress.update(self._task, completed=step, readings=self._readings(t, values))
 
     def step(self, record: StepRecord) -> None:
-        """Move the bar on."""
+        """Advance the bar."""
         if self._since_redraw.seconds() > _REFRESH or record.step + 1 == self._progress.tasks[0].total:
             self._since_redraw = Stopwatch()
             readings = self._readings(record.finished, record.values)
             self._progress.update(self._task, completed=record.step + 1, readings=readings)
 
     def event(self, event: Event) -> None:
-        """Show the phase beside the bar, and print what the operator should know."""
+        """Show the phase beside the bar, and print warnings, errors and notes."""
         if event.kind == "phase":
             self._progress.update(self._task, phase=event.text)
         elif event.level != "INFO" or event.kind in ("note", "resume"):

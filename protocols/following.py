@@ -11,7 +11,7 @@ from bench.control.references import fastest_slope, modulated_sine
 from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
-from bench.tracking_results import FOLLOW
+from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
 _DRIVE = unit_of("drive")
@@ -65,9 +65,8 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
         slots, parameters.reset, _RESET_SECONDS, load=parameters.load, why=unknown_memory(drive, parameters.reset)
     )
     state = model.operator.saturated_state(-1, reading[drive.signal])
-    follower = make_controller(
-        "follow", parameters.controller, ControllerSetup(model=model, limits=limits, state=state)
-    )
+    setup = ControllerSetup(model=model, limits=limits, state=state)
+    follower = make_controller("follow", parameters.controller, setup)
     yield Phase(f"approach, {parameters.controller}")
     # The way to the first value is no part of the reference.
     yield Control(

@@ -8,11 +8,16 @@ import numpy as np
 
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
-from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller
+from bench.controllers import (
+    ControllerSetup,
+    controller_names,
+    load_model_for,
+    make_controller,
+)
 from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
-from bench.tracking_results import REACH, READING
+from bench.results.tracking import REACH, READING
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
 _DRIVE = unit_of("drive")

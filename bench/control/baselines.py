@@ -1,4 +1,4 @@
-"""Controllers without hysteresis model: the comparisons that show what an inverse is worth."""
+"""Controllers without a hysteresis model, for comparison with those that invert one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class LookUp(Scripted):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """Internal values at present."""
         low, high = self._table.operator.input_range
         # Outside its range the model says nothing of the actuator.
         known = low <= self._measured <= high
@@ -94,7 +94,7 @@ class IntegralParameters:
 
 
 class IntegralControl(Scripted):
-    """Integral action without a model: the comparison for what the inverse is worth.
+    """Integral action without a model, for comparison with the inverse.
 
     The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
     error turns: it cannot wind up.

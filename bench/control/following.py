@@ -41,7 +41,7 @@ class FollowingParameters:
 
 
 class _Follower(ControllerBase, ABC):
-    """What the followers share: the reference and what was made of it."""
+    """What the followers share: one step at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
         """Take in a reading and return the set-point for the coming period.
@@ -74,17 +74,15 @@ class _Follower(ControllerBase, ABC):
 
 
 class OpenLoopFollower(_Follower):
-    """Sets what the exact inverse says of the reference, ahead by the input's lag.
+    """Sets the inverse of the reference, ahead by the input's lag.
 
     Parameters
     ----------
     inverse : Inverse
-        Exact inverse of the identified model. Of an answer with two elements the first is set; the next
+        Inverse of the identified model. Of an answer with two elements the first is set; the next
         period is asked anew, so that the second follows when the actuator has come there.
-    state : object or None
-        Memory of the actuator at the first reading; default that of the model.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower; only `lead` is used.
     """
@@ -125,10 +123,8 @@ class ClosedLoopFollower(OpenLoopFollower):
     ----------
     inverse : Inverse
         Exact inverse of the identified model; see `OpenLoopFollower` for answers with two elements.
-    state : object or None
-        Memory of the actuator at the first reading; default that of the model.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower.
     """
@@ -152,10 +148,7 @@ class ClosedLoopFollower(OpenLoopFollower):
 
 
 class IntegralFollower(_Follower):
-    """Integral action without a model: the comparison for what the inverse is worth.
-
-    The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
-    error turns: it cannot wind up.
+    """Integral action without a model, as `IntegralControl`.
 
     Parameters
     ----------

@@ -135,10 +135,8 @@ class Latched(Correcting):
     inverse : Inverse
         Exact inverse of the identified model, which must have a reversible part: its slope is what a
         locked actuator answers with.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : LatchParameters
         Numbers of the lock.
     correction : CorrectionParameters

@@ -26,7 +26,7 @@ class ControlTask(Protocol):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
+        """Internal values at present."""
 
 
 class SampledController(Protocol):
@@ -40,7 +40,7 @@ class SampledController(Protocol):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
+        """Internal values at present."""
 
 
 class Playback:
@@ -160,5 +160,5 @@ class FollowReference:
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks, with the reference of the moment of the last reading."""
+        """Internal values, with the reference at the time of the last reading."""
         return replace(self._follower.trace, reference=self._reference(self._now))

@@ -7,15 +7,14 @@ a fixed rate with a reference that moves.
 Rules for all of them:
 
 * Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
-* The memory of the hysteresis is moved by what the actuator did, the measured input of every call, not by
-  what was wished (`state`).
+* The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point.
 * A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
   next complete reading, estimators take no value in. A missing output does not keep the memory from following
   the measured input. Controllers with a hysteresis model also take for missing what is further outside the
-  model's range than that is wide. How long to put up with missing readings is for the caller to say.
+  model's range than that is wide. The caller decides how long missing readings are tolerated.
 * A target that cannot be met is replaced by the closest output, and `reach` says so.
-* Between targets the set-point belongs to the controller: who moves the actuator by other means makes a new
-  controller, from the memory that it has then.
+* Between targets the set-point belongs to the controller. After the actuator was moved by other means, make a new
+  controller from the memory that it has then.
 
 The inverse and its use in open loop: Zhang, Merced, Sepúlveda, Tan, *Modeling and inverse compensation of
 nonmonotonic hysteresis in VO2-coated microactuators*, IEEE/ASME Transactions on Mechatronics, 2013.
@@ -38,7 +37,7 @@ _CLOSE = 1e-9
 
 @dataclass(frozen=True)
 class Command:
-    """What a controller wants next.
+    """The next set-point of a controller.
 
     Parameters
     ----------
@@ -57,7 +56,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a controller thinks, for the record and the live view; nan where it has no opinion.
+    """Internal values of a controller, for the record and the live view; nan where it has none.
 
     Parameters
     ----------
@@ -77,7 +76,26 @@ class Trace:
     uncertainty: float = math.nan
 
 
-class TargetController(Protocol):
+class Controller(Protocol):
+    """What the record asks of every controller."""
+
+    @property
+    def trace(self) -> Trace:
+        """Internal values at present."""
+        ...
+
+    @property
+    def state(self) -> Any:  # noqa: ANN401 - each operator has its own
+        """Memory of the actuator as the controller knows it; None if it keeps none."""
+        ...
+
+    @property
+    def reach(self) -> Reach:
+        """Whether the present target or reference can be met."""
+        ...
+
+
+class TargetController(Controller, Protocol):
     """Brings the output to one target after another.
 
     `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
@@ -91,23 +109,8 @@ class TargetController(Protocol):
         """Take in a reading, `Command.wait` after the last or later, and return the next command."""
         ...
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        ...
 
-    @property
-    def state(self) -> Any:  # noqa: ANN401 - each operator has its own
-        """Memory of the actuator as the controller knows it; None if it keeps none."""
-        ...
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present target can be met."""
-        ...
-
-
-class Follower(Protocol):
+class Follower(Controller, Protocol):
     """Makes the output follow a reference that moves; called at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
@@ -124,21 +127,6 @@ class Follower(Protocol):
         reference : float
             Wanted output at the end of the coming period.
         """
-        ...
-
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        ...
-
-    @property
-    def state(self) -> Any:  # noqa: ANN401 - each operator has its own
-        """Memory of the actuator as the controller knows it; None if it keeps none."""
-        ...
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present reference can be met."""
         ...
 
 
@@ -191,7 +179,7 @@ def check_positive(parameters: object, *names: str) -> None:
 
 
 class ControllerBase:
-    """What every controller keeps: limits, memory, reference, the last set-point, whether the target can be met.
+    """Base of the controllers: limits, memory, reference, the last set-point, and whether the target can be met.
 
     Parameters
     ----------
@@ -241,7 +229,7 @@ class ControllerBase:
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
+        """Internal values at present."""
         if self._model is None:
             return Trace(reference=self._reference)
         if self._estimator is None:
@@ -404,7 +392,7 @@ class Scripted(ControllerBase, ABC):
 
 
 class OpenLoopInverse(Scripted):
-    """Sets what the exact inverse says, and waits (Zhang et al. 2013, section V).
+    """Sets the input that the inverse gives, and waits (Zhang et al. 2013, section V).
 
     Where the inverse has two elements the actuator is sent to the first, an end of the transition, waits
     there, and then goes to the second, found again from what the actuator really did.
@@ -498,7 +486,7 @@ class Correcting(Scripted):
         )
 
     def _towards(self, target: float) -> Move:
-        """Go where the model has the output at `target`, through saturation if need be."""
+        """Go where the model's output is `target`, through saturation if necessary."""
         arrival = self._correction.arrival
         first, *rest = self._answer(self._inverse.invert(self._state, target), target)
         reading = yield from self._arrive(first, arrival)
@@ -519,7 +507,7 @@ class Correcting(Scripted):
 
 
 class ClosedLoopInverse(Correcting):
-    """Feedforward by the exact inverse, feedback by the disturbance that it is found to have.
+    """Feedforward by the inverse, feedback by the measured disturbance.
 
     The disturbance z = y - Ω(ψ) of the measured output y against the model's output Ω of the memory ψ goes
     into a Kalman filter of a random walk, d; each set-point is the inverse at target - d. This is an
@@ -530,10 +518,8 @@ class ClosedLoopInverse(Correcting):
     ----------
     inverse : Inverse
         Exact inverse of the identified model.
-    state : object or None
-        Memory of the actuator at the first reading; default that of the model.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : CorrectionParameters
         Numbers of the loop.
     """

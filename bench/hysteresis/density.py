@@ -14,13 +14,15 @@ class Density:
     Attributes
     ----------
     title : str
-        Part of the model to which it belongs, such as `H2`; empty if the operator is the whole model.
+        Name of the operator within its model, such as `H2`; empty for a model of one operator.
     levels : ndarray, shape (M + 1,)
-        Increasing edges of the cells, input units.
+        Increasing edges of rows and columns, input units.
     values : ndarray, shape (M, M)
         Density by cell, indexed [α, β], output units per input unit squared; nan above the diagonal.
-    input_unit, output_unit : str
-        Units; empty if unknown.
+    unit : str
+        Unit of the levels, empty if unknown.
+    output_unit : str
+        Unit of the output, empty if unknown.
     measured : bool
         Whether the input is a quantity that is measured, not one that only the model knows.
     """
@@ -28,14 +30,9 @@ class Density:
     title: str
     levels: Floats
     values: Floats
-    input_unit: str = ""
+    unit: str
     output_unit: str = ""
     measured: bool = True
-
-    @property
-    def unit(self) -> str:
-        """Unit of the values."""
-        return density_unit(self.output_unit, self.input_unit)
 
 
 def density_unit(output_unit: str, input_unit: str) -> str:

@@ -360,8 +360,8 @@ class PreisachInverse(Inverse[MemoryCurve]):
     operator : Preisach
         The model to invert.
     policy : {"nearest", "paper"}
-        Which answer to take if both directions have one: the one nearest to the present input; or, as the
-        paper has it, upwards for a target above the present output up to that at positive saturation,
+        Which answer to take if both directions have one: the one nearest to the present input; or, by the
+        rule of the paper, upwards for a target above the present output up to that at positive saturation,
         downwards for one below it down to that at negative saturation, and otherwise the nearest.
     """
 

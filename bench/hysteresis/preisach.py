@@ -240,41 +240,18 @@ class Preisach(Operator[MemoryCurve]):
         ValueError
             If `inputs` is empty, not one-dimensional or not finite.
         """
-        from bench.hysteresis import _kernels
-
-        t = self.lattice
-        return np.asarray(
-            _kernels.evaluate(
-                _checks.samples("inputs", inputs),
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.below,
-                t.offset,
-                t.breaks,
-                t.quadratics,
-                *self._pieces(state),
-            )
-        )
+        return self._outputs(_checks.samples("inputs", inputs), state)
 
     def value(self, state: MemoryCurve) -> float:
         """Return the output of a state, in a time proportional to its corners."""
+        return float(self._outputs(np.array([state.input]), state)[0])
+
+    def _outputs(self, inputs: Floats, state: MemoryCurve | None) -> Floats:
         from bench.hysteresis import _kernels
 
         t = self.lattice
-        return float(
-            _kernels.evaluate(
-                np.array([state.input]),
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.below,
-                t.offset,
-                t.breaks,
-                t.quadratics,
-                *self._pieces(state),
-            )[0]
-        )
+        tables = t.levels, t.inverse_step, t.table, t.below, t.offset, t.breaks, t.quadratics
+        return np.asarray(_kernels.evaluate(inputs, *tables, *self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
         """Return memory and output after the input moved monotonically to `value`.

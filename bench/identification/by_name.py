@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,11 +15,12 @@ from bench.identification.least_squares import Certificate, Fit
 from bench.identification.measures import Errors, measure_errors
 from bench.identification.shape import fit_operator, fit_shape
 
+M = TypeVar("M", bound=Operator[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class Identification(Generic[M]):
     """An identified model with the evidence for it.
 
     Parameters
@@ -46,7 +47,7 @@ class Identification:
     """
 
     model_name: str
-    model: Operator[Any]
+    model: M
     residuals: Floats
     errors: Errors
     uncertainties: Floats
@@ -66,7 +67,7 @@ def identify(
     smoothing: float = 0.0,
     initial: Initial | None = None,
     **options: Any,  # noqa: ANN401 - each template names and types its own
-) -> Identification:
+) -> Identification[Any]:
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
 
     ==========================  ==============================================================================

@@ -43,7 +43,7 @@ def check_data(
         raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
     span = float(np.ptp(u))
     if span == 0.0:
-        return [f"the input is {u[0]:g} throughout: it excites nothing"]
+        return [f"the input is {u[0]:g} throughout, so nothing can be identified"]
     found = _plateaus(u, y) + _branches(u, span)
     if plane is not None:
         low, high = _checks.increasing("plane", plane).tolist()
@@ -71,7 +71,7 @@ def _plateaus(u: Floats, y: Floats | None) -> list[str]:
 
 
 def _branches(u: Floats, span: float) -> list[str]:
-    """Tell if the runs in one direction are jumps while the other way is made in steps."""
+    """Return whether branches in one direction are jumps while those in the other are made in steps."""
     steps = np.diff(u[np.append(True, np.diff(u) != 0.0)])
     turns = np.flatnonzero(np.diff(np.sign(steps)) != 0.0) + 1
     edges = np.concatenate([[0], turns, [steps.size]])

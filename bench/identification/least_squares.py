@@ -335,7 +335,22 @@ class _Factor:
 
 
 class _ActiveSet:
-    """The working state of one constrained fit, in centred and scaled columns."""
+    """The working state of one constrained fit, in centred and scaled columns.
+
+    With A the centred, weighted columns scaled to unit norm, t the centred outputs and λL the roughness penalty, the
+    cost is |A x - t|² + λ x'Lx, x >= 0 where constrained. Its negative half-gradient is g = A'(t - A x) - λ L x, and
+    optimality (Karush-Kuhn-Tucker) means g = 0 on the passive columns P, g <= 0 on those held at zero.
+
+    1. Start with P = the free columns; with a penalty also the `promising` ones, from a plane of half the order.
+    2. `refine` the passive coefficients by the true residual and compute g; stop if g is within the tolerance.
+    3. Choose the `candidates`: columns with g > 0 near the greatest, of neighbours in the plane only the `crests`.
+       If only columns are left that were found dependent on P (`barred`), lower the threshold of dependence.
+    4. `learn` the rows of the Gram matrix G = A'A + λL of the candidates, and let them `enter` the Cholesky factor
+       U'U = G[P, P]; a column whose pivot falls below the threshold is dependent and is barred.
+    5. `settle`: solve U'U x = (A't)[P]. While constrained coefficients come out negative, they `leave` P, all at
+       once while that raises the `gain` (`bold`), otherwise as far as the step to the first zero allows.
+    6. Go to 2. The factor is updated by appended columns and by rotations, never formed anew from the data.
+    """
 
     def __init__(
         self,

@@ -17,8 +17,8 @@ from bench.hysteresis import (
     Operator,
     Policy,
     Preisach,
-    QuadraticTerm,
     Reach,
+    ThermalExpansion,
     find_model,
     identifiable_models,
     uniform_levels,
@@ -68,7 +68,7 @@ class IdentifiedFile:
     """
 
     file: ModelFile
-    identification: Identification
+    identification: Identification[Any]
     warnings: tuple[str, ...]
     inputs: Floats
     outputs: Floats
@@ -96,6 +96,7 @@ class IdentifiedFile:
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
+            **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
 
@@ -188,6 +189,12 @@ def identify_file(
     }
     file = ModelFile(model, found.model, memory, provenance)
     return IdentifiedFile(file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials)
+
+
+def _shape(operator: Operator[Any]) -> dict[str, float]:
+    """Return the shape parameters by name; none of an operator that is linear in all it has."""
+    shape = operator.shape_parameters()
+    return dict(zip(shape.names, shape.values, strict=True))
 
 
 def _largest(uncertainties: Floats) -> float | None:
@@ -300,7 +307,9 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     found, operator = identified.identification, identified.file.operator
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate = found.errors, found.certificate
+    shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
     return (
+        *([("shape", shape)] if shape else []),
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
@@ -398,11 +407,11 @@ def assess_designs(
     low, high = operating
     try:
         grid = uniform_levels(*plane, levels)
-        # The quadratic term stands for any reversible part of two coefficients.
+        # The term stands for any reversible part of two coefficients.
         operator = Preisach(
             grid,
             np.zeros(levels * (levels + 1) // 2),
-            reversible=QuadraticTerm(quadratic=0.0, origin=0.5 * (plane[0] + plane[1])),
+            reversible=ThermalExpansion(low=plane[0], high=plane[1]),
             input_range=operating,
         )
         span = high - low

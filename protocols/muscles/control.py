@@ -13,7 +13,7 @@ from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
 from bench.protocol import Control, Dwell, Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
 from bench.results.model_file import load_model
-from bench.tracking_results import REACH, READING
+from bench.results.tracking import REACH, READING
 from protocols.muscles.force_voltage import condition
 from protocols.muscles.parts import (
     FORCE,

@@ -60,7 +60,7 @@ class HybridIdentification:
     model: HybridModel
     network: NetworkIdentification
     order: OrderChoice
-    polynomial: Identification
+    polynomial: Identification[Polynomial]
     piezo: PiezoIdentification
     dynamics: DynamicsIdentification
 
@@ -216,8 +216,6 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
         polynomial = identify_polynomial(rises, deflections, order.order)
         piezo = identify_piezo(read_loop(loops), plays)
         dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
-        if not isinstance(polynomial.model, Polynomial):
-            raise TypeError("expected a polynomial")
         model = HybridModel(network.network, polynomial.model, piezo.operator, dynamics.model, REFERENCE)
     except ValueError as error:
         raise DataError(f"the hybrid cannot be identified: {error}") from error
@@ -239,8 +237,6 @@ def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
         found = identify_pi(applied, deflections - drift, plays=plays, maximum=float(np.abs(applied).max()))
         rest = found.residuals - found.residuals.mean()
         drift = drift + columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
-    if not isinstance(found.model, PrandtlIshlinskii):
-        raise TypeError("expected a Prandtl-Ishlinskii operator")
     return PiezoIdentification(found.model, found.errors, applied, deflections - drift)
 
 

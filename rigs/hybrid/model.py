@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Model, ModelSpec, Polynomial, PrandtlIshlinskii, _checks
+from bench.hysteresis import Model, ModelSpec, Operator, Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.documents import Parts
 from bench.identification.by_name import Identification, Initial, identify
@@ -211,7 +211,9 @@ def choose_order(
     return OrderChoice(order, rms)
 
 
-def identify_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int | None = None) -> Identification:
+def identify_polynomial(
+    rises: ArrayLike, deflections: ArrayLike, order: int | None = None
+) -> Identification[Polynomial]:
     """Return the thermomechanical polynomial that fits best (Rakotondrabe and Ivan 2010, eqs. 18 and 19).
 
     The offset is free, as a sensor has its own zero; `HybridModel` subtracts it.
@@ -231,12 +233,11 @@ def identify_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int | N
         If a sequence is wrong, there are too few samples, or the rises do not extend to 0 K.
     """
     found = _fit_polynomial(rises, deflections, choose_order(rises, deflections).order if order is None else order)
-    assert isinstance(found.model, Polynomial)
     _check_contains_rest(found.model)
     return found
 
 
-def _fit_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int) -> Identification:
+def _fit_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int) -> Identification[Polynomial]:
     levels = np.unique(_checks.samples("rises", rises)).size
     if levels <= order:
         raise ValueError(f"rises: expected more than {order} different values for order {order}, got {levels}")
@@ -250,7 +251,7 @@ def identify_pi(
     plays: int = 15,
     maximum: float | None = None,
     initial: Initial | None = None,
-) -> Identification:
+) -> Identification[PrandtlIshlinskii]:
     """Return the Prandtl-Ishlinskii operator that fits the quasi-static piezo deflection best.
 
     Plays with thresholds i maximum / plays, weights not negative, and a free offset (Rakotondrabe and Ivan 2010,
@@ -296,7 +297,7 @@ def identify_pi(
     return found
 
 
-def _check_contains_rest(polynomial: Polynomial) -> None:
+def _check_contains_rest(polynomial: Operator[Any]) -> None:
     low, high = polynomial.input_range
     span = _BEYOND * (high - low)
     if not low - span <= 0.0 <= high + span:

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult
-from bench.figures import Curve, plot_panels, plot_tracking
 from bench.identification import measure_errors
 from bench.journal import Record
+from bench.results.figures import Curve, plot_panels, plot_tracking
 from bench.results.model_file import ModelFile
 from bench.runs import RunResult
 from rigs.hybrid.design import Design

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.campaign import Campaign, Study, StudyResult
-from bench.figures import Curve, plot_panels
+from bench.results.figures import Curve, plot_panels
 from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths
 
 

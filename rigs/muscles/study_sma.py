@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
-from bench.figures import (
+from bench.hysteresis import Preisach, TwoStage
+from bench.identification.two_stage import predict_series
+from bench.results.figures import (
     Curve,
     plot_densities,
     plot_errors,
@@ -20,9 +22,7 @@ from bench.figures import (
     plot_sequence_and_errors,
     plot_tracking,
 )
-from bench.hysteresis import Preisach, TwoStage
-from bench.identification.two_stage import predict_series
-from bench.tracking_results import TargetResults
+from bench.results.tracking import TargetResults
 from protocols.muscles.parts import FORCE, LENGTH
 from rigs.muscles.characterization import (
     TITLES,

@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.errors import DataError
-from bench.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
+from bench.results.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.runs import RunResult
-from bench.tracking_results import FollowingResult, TargetResults, following_result
 
 Floats = npt.NDArray[np.float64]
 

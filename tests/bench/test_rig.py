@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
-from bench.dashboard import DashboardLayout
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.layout import DashboardLayout
 from bench.rig import Rig
 from bench.rig_file import load_rig, packaged_rigs
 
@@ -120,8 +120,8 @@ class TestRight:
             table = rig.file.dashboard.model_dump(mode="json")
         assert (first.input, first.output, first.output_range) == ("probe_temperature", "tec_current", (-2.0, 2.0))
         assert second.output == "tec_voltage"
-        layout = DashboardLayout(title="a heated plate", **table)
-        assert list(layout.all_loops) == ["", "loops.0.", "loops.1."]
+        layout = DashboardLayout.model_validate(table)
+        assert list(layout.plots) == ["", "loops.0.", "loops.1."]
         assert [loop.output for loop in layout.loops] == ["tec_current", "tec_voltage"]
 
 

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DeviceConnectionError
-from bench.journal import Event, Record, StepRecord
+from bench.journal import Event, Record, StepRecord, run_card
 from bench.protocol import Dwell, Step, find_protocol, protocol
 from bench.rig_file import load_rig
-from bench.runs import RIG_FILE_NAME, Run, carry_out, run_card
+from bench.runs import RIG_FILE_NAME, Run, carry_out
 from bench.settling import Settled
 from bench.terminal import ProgressDisplay, ask_operator
 

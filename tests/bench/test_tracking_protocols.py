@@ -14,7 +14,7 @@ from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
 from bench.results.model_file import ModelFile
-from bench.tracking_results import following_result, target_results
+from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
 

@@ -13,8 +13,8 @@ from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
+from bench.results.tracking import target_results
 from bench.rig_file import load_rig
-from bench.tracking_results import target_results
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import LOADS
 from rigs.muscles.identification import FORCE, LENGTH, SAMPLE

@@ -1,8 +1,12 @@
-"""Figures of runs and models (matplotlib), in the manner of the papers that the rigs come from."""
+"""Figures of runs and models, by matplotlib.
+
+Each function draws one figure to the file `path`, PNG or PDF by its ending. Axis labels include units.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +18,9 @@ mpl.use("Agg")
 
 from matplotlib.figure import Figure
 
-from bench.hysteresis import MemoryCurve, Preisach
+from bench.hysteresis import Density, MemoryCurve
+from bench.hysteresis.density import density_unit
+from bench.units import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,9 +39,17 @@ _STYLE: dict[Any, Any] = {
 }
 _COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
 
-
 _MARKED = 200
 """Most samples of a curve that are marked one by one."""
+
+
+@contextmanager
+def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterator[Figure]:
+    """Give an empty figure of a size in inches, and save it."""
+    with mpl.rc_context({**_STYLE, "axes.grid": grid}):
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure
+        figure.savefig(path)
 
 
 class Curve(NamedTuple):
@@ -49,73 +63,55 @@ class Curve(NamedTuple):
 def plot_loops(
     path: Path, inputs: Floats, measured: Floats, modelled: Floats | None, *, input_label: str, output_label: str
 ) -> None:
-    """Draw measured loops, and those of a model beside them (Zhang et al. 2013, Fig. 5a).
+    """Draw measured loops, and those of a model beside them.
 
     Parameters
     ----------
-    path : Path
-        File to write, PNG or PDF by its ending.
     inputs, measured : ndarray, shape (N,)
         Input and output, one sample a step.
     modelled : ndarray or None, shape (N,)
         Output of the model.
-    input_label, output_label : str
-        Axis labels, with units.
     """
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+    with _figure(path, (6.0, 4.2)) as figure:
         axes = figure.subplots()
         axes.plot(inputs, measured, "-", color=_COLORS[0], linewidth=0.8, label="measured")
         if modelled is not None:
             axes.plot(inputs, modelled, "--", color=_COLORS[1], linewidth=0.7, label="model")
             axes.legend(loc="upper left")
         axes.set(xlabel=input_label, ylabel=output_label)
-        figure.savefig(path)
 
 
-def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, limits: str = "") -> None:
-    """Draw the error of each model against the sample index, one panel a model (Figs. 5b, 7 and 9).
+def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str) -> None:
+    """Draw the error of each model against the sample index, one panel a model.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     errors : mapping of str to ndarray
         Measured minus modelled by the model's title, each of shape (N,).
-    error_label : str
-        Axis label, with unit.
-    limits : str
-        A line of text above the panels.
     """
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(6.0, 1.0 + 1.7 * len(errors)), layout="constrained")
+    with _figure(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
         for i, (title, error) in enumerate(errors.items()):
-            _error_panel(panels[i], title, error, error_label, i)
+            panels[i].plot(error, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            panels[i].set_ylabel(error_label)
+            rms = float(np.sqrt(np.mean(error**2)))
+            panels[i].set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
-        if limits:
-            figure.suptitle(limits)
-        figure.savefig(path)
 
 
 def plot_sequence_and_errors(
     path: Path, inputs: Floats, errors: Mapping[str, Floats], *, input_label: str, error_label: str
 ) -> None:
-    """Draw an input sequence, and below it the errors of several models (Fig. 10).
+    """Draw an input sequence, and below it the errors of several models.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     inputs : ndarray, shape (N,)
         Input, one sample a step.
     errors : mapping of str to ndarray
         Measured minus modelled by the model's title, each of shape (N,).
-    input_label, error_label : str
-        Axis labels, with units.
     """
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+    with _figure(path, (6.0, 5.5)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True)
         top.plot(inputs, color=_COLORS[0], linewidth=0.8)
         top.set_ylabel(input_label)
@@ -123,7 +119,6 @@ def plot_sequence_and_errors(
             bottom.plot(error, color=_COLORS[i], linewidth=0.8, label=title)
         bottom.set(xlabel="index of the set-point", ylabel=error_label)
         bottom.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(errors), fontsize=7.5)
-        figure.savefig(path)
 
 
 def plot_tracking(
@@ -136,25 +131,20 @@ def plot_tracking(
     output_label: str,
     error_label: str,
 ) -> None:
-    """Draw a reference and the outputs under several controllers, and below it their errors (Fig. 12).
+    """Draw a reference and the outputs under several controllers, and below it their errors.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     reference : ndarray, shape (N,)
-        What was wanted.
+        The reference.
     outputs : mapping of str to ndarray
-        What came of it by the controller's title, each of shape (N,).
+        Measured outputs by the controller's title, each of shape (N,).
     horizontal : ndarray or None, shape (N,)
-        Where they are drawn, such as times; their index if None.
-    horizontal_label, output_label, error_label : str
-        Axis labels, with units.
+        Horizontal positions, such as times; the index if None.
     """
     places = np.arange(reference.size, dtype=np.float64) if horizontal is None else horizontal
     marker = "." if horizontal is None else ""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+    with _figure(path, (6.0, 5.5)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True)
         top.plot(places, reference, color="black", linewidth=1.2, label="reference")
         for i, (title, output) in enumerate(outputs.items()):
@@ -164,7 +154,6 @@ def plot_tracking(
         top.set_ylabel(output_label)
         bottom.set(xlabel=horizontal_label, ylabel=error_label)
         top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(outputs) + 1, fontsize=7.5)
-        figure.savefig(path)
 
 
 def plot_panels(
@@ -179,25 +168,20 @@ def plot_panels(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     panels : mapping of str to sequence of Curve
         Curves by the panel's title.
-    horizontal_label, vertical_label : str
-        Axis labels, with units.
     columns : int
         Panels beside each other.
     """
     rows = -(-len(panels) // columns)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.3 * columns, 0.4 + 2.6 * rows), layout="constrained")
+    with _figure(path, (3.3 * columns, 0.4 + 2.6 * rows)) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for i, (axes, (title, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
             for k, curve in enumerate(curves):
                 axes.plot(
                     curve.horizontal,
                     curve.vertical,
-                    # Where samples are dense, their marks would hide what is behind.
+                    # Marks of dense samples would hide other curves.
                     ".-" if curve.horizontal.size <= _MARKED else "-",
                     color=f"C{k}",
                     linewidth=0.7,
@@ -213,92 +197,57 @@ def plot_panels(
             axes.set_xlabel(horizontal_label)
         for axes in grid[:, 0]:
             axes.set_ylabel(vertical_label)
-        figure.savefig(path)
 
 
-def plot_densities(path: Path, models: Mapping[str, Preisach]) -> None:
+def plot_densities(path: Path, densities: Sequence[Density]) -> None:
     """Draw Preisach densities on their planes, side by side; cells without density are white.
 
     Parameters
     ----------
-    path : Path
-        File to write.
-    models : mapping of str to Preisach
-        Operators by the panel's title.
+    densities : sequence of Density
+        Their titles are those of the panels.
     """
-    with mpl.rc_context({**_STYLE, "axes.grid": False}):
-        figure = Figure(figsize=(5.2 * len(models), 4.2), layout="constrained")
-        panels = figure.subplots(1, len(models), squeeze=False)[0]
-        for axes, (title, model) in zip(panels, models.items(), strict=True):
-            _density_panel(axes, model)
-            axes.set_title(title, fontsize=9, loc="left")
-        figure.savefig(path)
+    with _figure(path, (5.2 * len(densities), 4.2), grid=False) as figure:
+        panels = figure.subplots(1, len(densities), squeeze=False)[0]
+        for axes, density in zip(panels, densities, strict=True):
+            signed = bool(np.nanmin(density.values) < 0)
+            largest = float(np.nanmax(np.abs(density.values))) or 1.0
+            image = axes.pcolormesh(
+                density.levels,
+                density.levels,
+                np.ma.masked_where(~(np.abs(density.values) > 0), density.values),
+                cmap="RdBu_r" if signed else "viridis",
+                vmin=-largest if signed else 0.0,
+                vmax=largest,
+            )
+            _frame_plane(axes, density)
+            figure.colorbar(image, ax=axes, label=f"density / {density_unit(density.output_unit, density.unit)}")
+            axes.set_title(density.title, fontsize=9, loc="left")
 
 
-def plot_density(path: Path, model: Preisach) -> None:
-    """Draw one Preisach density on its plane; see `plot_densities`."""
-    plot_densities(path, {"": model})
-
-
-def _density_panel(axes: Axes, model: Preisach) -> None:
-    levels = np.asarray(model.levels)
-    matrix = np.full((levels.size - 1, levels.size - 1), np.nan)
-    rows, columns = np.tril_indices(levels.size - 1)
-    matrix[rows, columns] = model.density
-    signed = bool(np.any(model.density < 0))
-    largest = float(np.max(np.abs(model.density))) or 1.0
-    image = axes.pcolormesh(
-        levels,
-        levels,
-        np.ma.masked_where(~(np.abs(matrix) > 0), matrix),
-        cmap="RdBu_r" if signed else "viridis",
-        vmin=-largest if signed else 0.0,
-        vmax=largest,
-    )
-    axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
-    axes.set(
-        xlabel=f"β / {model.input_unit or '1'}",
-        ylabel=f"α / {model.input_unit or '1'}",
-        aspect="equal",
-        xlim=(levels[0], levels[-1]),
-        ylim=(levels[0], levels[-1]),
-    )
-    unit = f"({model.output_unit or '1'})/({model.input_unit or '1'})²"
-    axes.figure.colorbar(image, ax=axes, label=f"density / {unit}")
-
-
-def plot_coverage(path: Path, model: Preisach, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
+def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
     """Draw which cells of a plane were swept, and the memory curve at the end.
 
     Parameters
     ----------
-    path : Path
-        File to write.
-    model : Preisach
-        The operator.
+    density : Density
+        The operator's density, for its levels.
     swept : ndarray of bool, shape (K,)
-        By cell.
+        By cell, as in `Preisach`.
     memory : MemoryCurve
         The staircase that is drawn over the cells.
     """
-    levels = np.asarray(model.levels)
-    matrix = np.full((levels.size - 1, levels.size - 1), np.nan)
-    matrix[np.tril_indices(levels.size - 1)] = swept
-    corners = memory.corners(float(levels[0]), float(levels[-1]))
-    with mpl.rc_context({**_STYLE, "axes.grid": False}):
-        figure = Figure(figsize=(4.6, 4.2), layout="constrained")
+    cells = np.full(density.values.shape, np.nan)
+    cells[np.tril_indices(len(cells))] = swept
+    corners = memory.corners(float(density.levels[0]), float(density.levels[-1]))
+    with _figure(path, (4.6, 4.2), grid=False) as figure:
         axes = figure.subplots()
-        axes.pcolormesh(levels, levels, np.ma.masked_invalid(matrix), cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
-        axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color="black", linewidth=0.8)
+        image = np.ma.masked_invalid(cells)
+        axes.pcolormesh(density.levels, density.levels, image, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
         axes.plot(corners[:, 0], corners[:, 1], color=_COLORS[0], linewidth=1.5, label="memory curve")
-        axes.set(
-            xlabel=f"β / {model.input_unit or '1'}",
-            ylabel=f"α / {model.input_unit or '1'}",
-            aspect="equal",
-            title=f"green: swept ({np.mean(swept):.0%} of the cells)",
-        )
+        _frame_plane(axes, density)
+        axes.set_title(f"green: swept ({np.mean(swept):.0%} of the cells)")
         axes.legend(loc="lower right")
-        figure.savefig(path)
 
 
 def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], labels: Sequence[str]) -> None:
@@ -306,8 +255,6 @@ def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], label
 
     Parameters
     ----------
-    path : Path
-        File to write.
     hours : ndarray, shape (N,)
         Laboratory time in h.
     signals : mapping of str to ndarray
@@ -315,18 +262,17 @@ def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], label
     labels : sequence of str
         Axis label of each, with unit.
     """
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.0, 0.8 + 1.2 * len(signals)), layout="constrained")
+    with _figure(path, (7.0, 0.8 + 1.2 * len(signals))) as figure:
         panels = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
         for i, values in enumerate(signals.values()):
             panels[i].plot(hours, values, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
             panels[i].set_ylabel(labels[i], rotation=0, ha="right", va="center", fontsize=8)
         panels[-1].set_xlabel("laboratory time / h")
-        figure.savefig(path)
 
 
-def _error_panel(axes: Axes, title: str, error: Floats, label: str, color: int) -> None:
-    axes.plot(error, color=_COLORS[color % len(_COLORS)], linewidth=0.7)
-    axes.set_ylabel(label)
-    rms = float(np.sqrt(np.mean(error**2)))
-    axes.set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
+def _frame_plane(axes: Axes, density: Density) -> None:
+    """Draw the diagonal of a plane, and label its axes."""
+    ends = float(density.levels[0]), float(density.levels[-1])
+    axes.plot(ends, ends, color="black", linewidth=0.8)
+    labels = {"xlabel": with_unit("β", density.unit), "ylabel": with_unit("α", density.unit)}
+    axes.set(**labels, aspect="equal", xlim=ends, ylim=ends)

@@ -1,4 +1,4 @@
-"""How well a run reached its targets or followed its reference, from its journal."""
+"""Errors of a run that reached targets or followed a reference, from its journal."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ Floats = npt.NDArray[np.float64]
 REACH = "reach"
 READING = "reading"
 FOLLOW = "follow"
-"""Labels by which a protocol marks the steps that count."""
+"""Labels of the steps of a protocol that are evaluated."""
 
 
 @dataclass(frozen=True)
 class TargetResults:
-    """Targets and what came of them.
+    """Targets and the outputs reached.
 
     Attributes
     ----------
     targets, outputs : ndarray, shape (N,)
-        Each target, and the mean of the readings that were taken once the controller was done.
+        Each target, and the mean of the readings after the controller had finished.
     seconds : ndarray, shape (N,)
-        Laboratory time that the controller took for each, s.
+        Laboratory time of the controller for each, s.
     """
 
     targets: Floats
@@ -37,18 +37,14 @@ class TargetResults:
 
     def summary(self) -> dict[str, float]:
         """Return `max`, `rms`, `median` of the absolute error in output units, and `seconds_per_target`."""
-        error = np.abs(self.outputs - self.targets)
-        return {
-            "max": float(error.max()),
-            "rms": float(np.sqrt(np.mean(error**2))),
-            "median": float(np.median(error)),
-            "seconds_per_target": float(self.seconds.mean()),
-        }
+        error = self.outputs - self.targets
+        median, seconds = float(np.median(np.abs(error))), float(self.seconds.mean())
+        return {**_greatest_and_rms(error), "median": median, "seconds_per_target": seconds}
 
 
 @dataclass(frozen=True)
 class FollowingResult:
-    """A reference that moved and what followed it.
+    """A moving reference and the output that followed it.
 
     Attributes
     ----------
@@ -64,50 +60,37 @@ class FollowingResult:
 
     def summary(self) -> dict[str, float]:
         """Return `max` and `rms` of the error, output units."""
-        error = np.abs(self.output - self.reference)
-        return {"max": float(error.max()), "rms": float(np.sqrt(np.mean(error**2)))}
+        return _greatest_and_rms(self.output - self.reference)
 
 
 def target_results(record: Record, output: str) -> TargetResults | None:
-    """Return what came of a run's targets, or None if it had none.
+    """Return the targets of a run and the outputs reached, or None if it had none.
 
     Parameters
     ----------
     record : Record
         The run; its protocol marks the steps that reach a target and the readings after it.
     output : str
-        Signal that was controlled.
+        The controlled signal.
     """
     names = [signal.name for signal in record.signals]
-    if "reference" not in names:
-        return None
-    targets: list[float] = []
-    seconds: list[float] = []
-    readings: list[list[float]] = []
+    found: list[tuple[float, float, list[float]]] = []
     for step in record.step_records():
         values = dict(zip(names, step.values, strict=True))
-        if step.label == REACH:
-            targets.append(values["reference"])
-            seconds.append(step.finished - step.started)
-            readings.append([])
-        elif step.label == READING and readings:
-            readings[-1].append(values[output])
-    complete = [i for i, values in enumerate(readings) if values]
-    if not complete:
-        return None
-    return TargetResults(
-        np.array([targets[i] for i in complete]),
-        np.array([np.mean(readings[i]) for i in complete]),
-        np.array([seconds[i] for i in complete]),
-    )
+        if step.label == REACH and "reference" in values:
+            found.append((values["reference"], step.finished - step.started, []))
+        elif step.label == READING and found:
+            found[-1][2].append(values[output])
+    complete = [(target, float(np.mean(readings)), seconds) for target, seconds, readings in found if readings]
+    return TargetResults(*np.array(complete).T.copy()) if complete else None
 
 
 def following_result(record: Record, output: str) -> FollowingResult | None:
-    """Return how a run followed a moving reference, or None if it did not; arguments as `target_results`."""
-    if "reference" not in [signal.name for signal in record.signals]:
-        return None
+    """Return a moving reference and its output, or None if there was none; arguments as `target_results`."""
     steps = [step.step for step in record.step_records() if step.label == FOLLOW]
     ticks = record.telemetry()
+    if "reference" not in ticks.columns:
+        return None
     rows = np.isin(ticks["step"], steps) & np.isfinite(ticks["reference"])
     if not rows.any():
         return None
@@ -116,10 +99,14 @@ def following_result(record: Record, output: str) -> FollowingResult | None:
 
 
 def results_json(record: Record, output: str) -> Mapping[str, Any]:
-    """Return what there is of both, for programs."""
+    """Return the summaries of both, as far as the run has them, for programs."""
     results: dict[str, Any] = {}
     if (reached := target_results(record, output)) is not None:
         results["tracking"] = reached.summary()
     if (followed := following_result(record, output)) is not None:
         results["following"] = followed.summary()
     return results
+
+
+def _greatest_and_rms(error: Floats) -> dict[str, float]:
+    return {"max": float(np.abs(error).max()), "rms": float(np.sqrt(np.mean(error**2)))}

@@ -12,16 +12,18 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table as Columns
 
+from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.figures import plot_coverage, plot_density, plot_errors, plot_loops, plot_signals
-from bench.hysteresis import MemoryCurve, Operator, Preisach
+from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
-from bench.journal import Record, Table
+from bench.journal import Record, Table, run_card
 from bench.results.data import header_with_unit, write_csv
+from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
 from bench.results.model_file import ModelFile, load_model, parse_model
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
-from bench.runs import RECORDING_NAME, run_card
-from bench.tracking_results import results_json
+from bench.results.tracking import results_json
+from bench.runs import RECORDING_NAME
+from bench.units import format_numbers, with_unit
 
 
 def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console: Console) -> dict[str, Any]:
@@ -34,9 +36,9 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
     model_paths : sequence of Path
         Model files to compare, besides those that were identified from the run.
     out : Path or None
-        Where figures go; the folder `report` beside the journal if None.
+        Folder of the figures; `report` beside the journal if None.
     console : Console
-        Where to print.
+        Console to print on.
 
     Returns
     -------
@@ -61,8 +63,8 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
         comparison, more = _compare(record, steps, models, folder)
         controlled = str(record.meta.get("controls", ""))
         control = results_json(record, controlled) if controlled else {}
-        _print_control(control, record.unit(controlled), console)
-    _print_comparison(comparison, console)
+        _print_control(control, record, controlled, console)
+        _print_comparison(comparison, models, record, console)
     for path in [*figures, *more]:
         console.print(f"figure: {path}", highlight=False, soft_wrap=True)
     return {
@@ -125,7 +127,7 @@ def draw_comparison(result: ComparedModels, out: Path) -> Path:
     """Draw the residuals of compared models; return the file."""
     path = _make_folder(out) / "residuals.png"
     residuals = {name: entry.residuals for name, entry in result.comparisons.items()}
-    plot_errors(path, residuals, error_label=f"error / {result.unit or '1'}")
+    plot_errors(path, residuals, error_label=with_unit("error", result.unit))
     return path
 
 
@@ -138,7 +140,7 @@ def _picture(record: Record, folder: Path) -> Path:
         rebuild(record, recording)
         complaints = picture(recording, path)
     if complaints:
-        raise DataError(f"{path}: the viewer complains: {'; '.join(complaints)}")
+        raise DataError(f"{path}: the viewer reports: {'; '.join(complaints)}")
     return path
 
 
@@ -147,24 +149,23 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     folder = _make_folder(out)
     operator = found.file.operator
     name = found.file.name
-    unit = f" / {operator.output_unit}" if operator.output_unit else ""
     loops, errors = folder / f"{name}-loops.png", folder / f"{name}-errors.png"
     plot_loops(
         loops,
         found.inputs,
         found.outputs,
         found.outputs - found.identification.residuals,
-        input_label=f"{found.file.provenance['input']} / {operator.input_unit or '1'}",
-        output_label=f"{found.file.provenance['output']}{unit}",
+        input_label=with_unit(found.file.provenance["input"], operator.input_unit),
+        output_label=with_unit(found.file.provenance["output"], operator.output_unit),
     )
-    plot_errors(errors, {name: found.identification.residuals}, error_label=f"error{unit}")
+    plot_errors(errors, {name: found.identification.residuals}, error_label=with_unit("error", operator.output_unit))
     paths = [loops, errors]
-    if isinstance(operator, Preisach):
+    for density in operator.densities():
         paths.append(folder / f"{name}-density.png")
-        plot_density(paths[-1], operator)
+        plot_densities(paths[-1], [density])
         if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
             paths.append(folder / f"{name}-coverage.png")
-            plot_coverage(paths[-1], operator, found.coverage.swept, found.file.memory)
+            plot_coverage(paths[-1], density, found.coverage.swept, found.file.memory)
     return paths
 
 
@@ -197,8 +198,7 @@ def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], c
     )
     for signal in record.signals:
         entry = extremes[signal.name]
-        shown = ["–" if entry[end] is None else f"{entry[end]:.{signal.precision}f}" for end in ("low", "high")]
-        table.add_row(signal.name, *shown, signal.unit)
+        table.add_row(signal.name, *format_numbers([entry["low"], entry["high"]], signal.unit, signal.precision))
     console.print(table)
 
 
@@ -212,7 +212,7 @@ def _draw_run(record: Record, steps: Table, folder: Path) -> list[Path]:
     if len(steps) == 0:
         return []
     names = [signal.name for signal in record.signals if np.any(np.isfinite(steps[signal.name]))]
-    labels = [f"{name}\n/ {record.unit(name)}" for name in names]
+    labels = [with_unit(name, record.unit(name)).replace(" / ", "\n/ ") for name in names]
     paths = [folder / "signals.png"]
     plot_signals(paths[0], steps["finished"] / 3600.0, {name: steps[name] for name in names}, labels)
     layout = record.meta.get("dashboard")
@@ -223,8 +223,8 @@ def _draw_run(record: Record, steps: Table, folder: Path) -> list[Path]:
             steps[layout["input"]],
             steps[layout["output"]],
             None,
-            input_label=f"{layout['input']} / {record.unit(layout['input'])}",
-            output_label=f"{layout['output']} / {record.unit(layout['output'])}",
+            input_label=with_unit(layout["input"], record.unit(layout["input"])),
+            output_label=with_unit(layout["output"], record.unit(layout["output"])),
         )
     return paths
 
@@ -251,29 +251,40 @@ def _compare(
         return comparison, []
     unit = next(iter(comparison.values()))["unit"]
     path = folder / "errors.png"
-    plot_errors(path, residuals, error_label=f"error / {unit}")
+    plot_errors(path, residuals, error_label=with_unit("error", unit))
     return comparison, [path]
 
 
-def _print_comparison(comparison: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+def _print_comparison(
+    comparison: Mapping[str, Mapping[str, Any]], models: Sequence[ModelFile], record: Record, console: Console
+) -> None:
     if not comparison:
         return
     table = Columns(
         "model", "max", "RMS", "unit", "RMS / % of range", title="models on this run", title_justify="left"
     )
+    outputs = {model.name: str(model.provenance["output"]) for model in models}
     for name, entry in comparison.items():
-        table.add_row(
-            name, f"{entry['max']:.2f}", f"{entry['rms']:.2f}", entry["unit"], f"{entry['rms_percent']:.2f}"
-        )
+        cells = format_numbers([entry["max"], entry["rms"]], entry["unit"], _precision(record, outputs[name]))
+        table.add_row(name, *cells, f"{entry['rms_percent']:.2f}")
     console.print(table)
 
 
-def _print_control(results: Mapping[str, Mapping[str, float]], unit: str, console: Console) -> None:
+def _print_control(
+    results: Mapping[str, Mapping[str, float]], record: Record, controlled: str, console: Console
+) -> None:
     for name, entry in results.items():
-        parts = [f"error {key} {entry[key]:.2f} {unit}" for key in ("max", "rms", "median") if key in entry]
+        keys = [key for key in ("max", "rms", "median") if key in entry]
+        errors = [entry[key] for key in keys]
+        *numbers, unit = format_numbers(errors, record.unit(controlled), _precision(record, controlled))
+        parts = [f"error {key} {number} {unit}".rstrip() for key, number in zip(keys, numbers, strict=True)]
         if "seconds_per_target" in entry:
             parts.append(f"{entry['seconds_per_target']:.1f} s a target")
         console.print(f"{name}: {', '.join(parts)}", highlight=False)
+
+
+def _precision(record: Record, name: str) -> int:
+    return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)
 
 
 def _models_of(record: Record) -> list[ModelFile]:
@@ -289,7 +300,7 @@ def _headers(record: Record, table: Table) -> list[str]:
 
 
 def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
-    # A fifth of a second of import that only this format needs.
+    # Takes a fifth of a second to import.
     import pyarrow as pa
     import pyarrow.parquet as pq
 

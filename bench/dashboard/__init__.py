@@ -1,0 +1,40 @@
+"""The live view of a run and its .rrd file, both by Rerun, both derived from what the journal holds.
+
+The control thread only puts what happened into a queue. One thread takes it out about once a second and hands it to
+Rerun in columns, which costs a twentieth of logging row by row; the same code rebuilds an .rrd from a journal. A
+viewer connects to a server of this process, bound to the loopback address.
+
+File and live view are two streams of one recording, so that a stalled viewer cannot delay the file. Rerun keeps the
+data that such a viewer does not read, some 8 kB for each batch of a quantity, until its channel is full; the live
+view is then suspended until the viewer resumes, and the log says so.
+
+The queue is bounded, too. If Rerun itself stalls, because a disk does, telemetry is dropped beyond `QUEUED_TICKS`
+entries and everything beyond `QUEUED_ENTRIES`; the log says how much. Nothing of the record is lost by any of this:
+`rebuild` makes the whole .rrd from the journal.
+
+What is recorded, on the timelines `t` (laboratory time) and `step`
+--------------------------------------------------------------------
+`/signals/QUANTITY`, `/readings/QUANTITY`
+    One vector a unit: quick readings of each tick, and the reading of each step.
+`/control/tracking`, `/control/error`, `/control/disturbance`
+    Of a run under control, one vector each: reference, predicted output and output; output less reference; the
+    estimated disturbance. Each has a band of two standard deviations of that estimate. nan while no controller
+    is at work.
+`/loop/data/path`, `/loop/data/now`
+    Output against input: the line from each point to the next, and the last point. Further plots of the rig are
+    `/loops/0`, `/loops/1` ...
+`/plane/data/memory`, `/plane/data/input`, `/plane/density`
+    The Preisach plane: the memory curve at each point, the input on the diagonal, the model's density.
+`/planes/NAME/density`
+    A density over another input, on a plane of its own, which has no memory curve.
+`/state/phase`, `/state/run`
+    Phase and state of the protocol: changes only.
+`/events`, `/card`
+    The log, and the run card.
+"""
+
+from bench.dashboard.from_journal import rebuild
+from bench.dashboard.live import Dashboard
+from bench.dashboard.screenshot import picture
+
+__all__ = ["Dashboard", "picture", "rebuild"]

@@ -1,0 +1,175 @@
+"""Colours, axes and images: how plots are drawn in Rerun's two-dimensional views.
+
+Rerun has no view of one quantity over another. In its spatial view y points down and both axes have one scale, so
+a transform places what is logged below `PATH/data` in physical units within a drawn frame of height 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bench.dashboard.recording import Floats, Recording
+from bench.devices import Signal
+from bench.layout import XYPlot
+from bench.units import fitting_prefix
+
+Colour = tuple[int, int, int]
+
+INK: Colour = (214, 219, 226)
+FAINT: Colour = (58, 65, 74)
+MARKER: Colour = (150, 248, 228)
+_BACKGROUND: Colour = (17, 20, 24)
+_DENSITY_COLOURS: tuple[tuple[float, Colour], ...] = (
+    (-1.0, (92, 190, 255)),
+    (-0.4, (36, 92, 168)),
+    (0.0, (28, 33, 39)),
+    (0.25, (84, 34, 92)),
+    (0.6, (206, 66, 82)),
+    (1.0, (255, 226, 138)),
+)
+
+_WIDTH = 1.15
+"""Width of a frame whose height is 1."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pair of axes: ranges in the units of the data, titles, and the factors of the numbers beside them."""
+
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    x_title: str
+    y_title: str
+    x_factor: float
+    y_factor: float
+
+    @classmethod
+    def of_plot(cls, plot: XYPlot, x: Signal, y: Signal) -> Frame:
+        """Return the frame of one signal over another."""
+        x_factor, x_unit = fitting_prefix(x.unit, *plot.input_range)
+        y_factor, y_unit = fitting_prefix(y.unit, *plot.output_range)
+        titles = f"{x.description} [{x_unit}]", f"{y.description} [{y_unit}]"
+        return cls(plot.input_range, plot.output_range, *titles, x_factor, y_factor)
+
+    @classmethod
+    def of_plane(cls, extent: tuple[float, float], unit: str) -> Frame:
+        """Return the frame of a Preisach plane over an input in `unit`."""
+        factor, shown = fitting_prefix(unit, *extent)
+        return cls(extent, extent, f"β [{shown}]", f"α [{shown}]", factor, factor)
+
+    def x(self, value: float) -> float:
+        """Return where a value stands on the horizontal axis."""
+        low, high = self.x_range
+        return _WIDTH * (value - low) / (high - low)
+
+    def y(self, value: float) -> float:
+        """Return where a value stands on the vertical axis."""
+        low, high = self.y_range
+        return -(value - low) / (high - low)
+
+    def draw(self, recording: Recording, path: str) -> None:
+        """Draw the axes, and give what is logged below `path`/data their units."""
+        columns = [(self.x(value), value * self.x_factor) for value in _round_values(*self.x_range)]
+        rows = [(self.y(value), value * self.y_factor) for value in _round_values(*self.y_range)]
+        grid = [[(x, 0.0), (x, -1.0)] for x, _ in columns] + [[(0.0, y), (_WIDTH, y)] for y, _ in rows]
+        box = [(0.0, 0.0), (_WIDTH, 0.0), (_WIDTH, -1.0), (0.0, -1.0), (0.0, 0.0)]
+        recording.log(f"{path}/axes/grid", lines(grid, FAINT, 0.5, -20.0))
+        recording.log(f"{path}/axes/box", lines([box], INK, 0.75, 10.0))
+        places = [(x, 0.02) for x, _ in columns] + [(-0.065, y - 0.035) for y, _ in rows]
+        numbers = [f"{value:.6g}" for _, value in (*columns, *rows)]
+        recording.log(f"{path}/axes/ticks", texts(places, numbers))
+        titles = [(_WIDTH / 2, 0.09), (0.0, -1.1)]
+        recording.log(f"{path}/axes/titles", texts(titles, [self.x_title, self.y_title]))
+        matrix = np.diag([self.x(1.0) - self.x(0.0), self.y(1.0) - self.y(0.0), 1.0])
+        shift = [self.x(0.0), self.y(0.0), 0.0]
+        recording.log(f"{path}/data", rr.Transform3D(mat3x3=matrix, translation=shift))
+
+    def draw_image(
+        self, recording: Recording, path: str, values: Floats, x: Sequence[float], y: Sequence[float]
+    ) -> None:
+        """Draw values from -1 to 1 as colours, the first row at the top, between two values of x and two of y."""
+        height, width = values.shape
+        across, down = (self.x(x[1]) - self.x(x[0])) / width, (self.y(y[0]) - self.y(y[1])) / height
+        recording.log(
+            path,
+            rr.Transform3D(mat3x3=np.diag([across, down, 1.0]), translation=[self.x(x[0]), self.y(y[1]), 0.0]),
+            rr.Image(_coloured(values), draw_order=-10.0),
+        )
+
+
+def lines(strips: Any, colour: Colour, points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
+    """Return lines of a width in points of the screen."""
+    return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)
+
+
+def line_style(points: float, colour: Colour | None = None) -> rr.LineStrips2D:
+    """Return the look of lines that change in time."""
+    return rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(points), colors=colour, draw_order=20.0)
+
+
+def point_style() -> rr.Points2D:
+    """Return the look of the latest point."""
+    return rr.Points2D.from_fields(radii=rr.Radius.ui_points(5.0), colors=MARKER, draw_order=30.0)
+
+
+def texts(places: Sequence[tuple[float, float]], labels: Sequence[str]) -> rr.Points2D:
+    """Return texts at places of a frame."""
+    return rr.Points2D(places, labels=labels, show_labels=True, colors=INK, radii=0.0)
+
+
+def xy_view(path: str, name: str, of_the_past: str = "") -> rrb.Spatial2DView:
+    """Return the view of what a `Frame` frames; of the entity `of_the_past` it shows the whole history."""
+    forever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    past = [rrb.VisibleTimeRange(timeline, start=forever, end=now) for timeline in ("t", "step")]
+    return rrb.Spatial2DView(
+        origin=f"/{path}",
+        name=name,
+        visual_bounds=rrb.VisualBounds2D(x_range=(-0.2, _WIDTH + 0.08), y_range=(-1.16, 0.2)),
+        background=_BACKGROUND,
+        overrides={of_the_past: rrb.VisibleTimeRanges(past)} if of_the_past else None,
+    )
+
+
+def time_view(
+    origin: str, name: str, legend: rrb.Corner2D | None = None, y: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Return the view of a quantity over the time of the whole run."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=whole_run(),
+        axis_y=None if y is None else rrb.ScalarAxis(range=y),
+    )
+
+
+def whole_run() -> rrb.TimeAxis:
+    """Return a time axis that shows the whole run."""
+    forever = rrb.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Return some five round values within a range."""
+    rough = (high - low) / 5
+    magnitude = 10.0 ** math.floor(math.log10(rough))
+    step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda step: abs(step - rough))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [n * step for n in range(first, last + 1)]
+
+
+def _coloured(values: Floats) -> npt.NDArray[np.uint8]:
+    """Return colours of values from -1 to 1; nan is transparent."""
+    stops = np.array([stop for stop, _ in _DENSITY_COLOURS])
+    colours = np.array([colour for _, colour in _DENSITY_COLOURS], dtype=np.float64)
+    known = np.nan_to_num(values)
+    channels = [np.interp(known, stops, colours[:, i]) for i in range(3)]
+    return np.stack([*channels, np.where(np.isnan(values), 0.0, 255.0)], axis=-1).round().astype(np.uint8)

@@ -1,0 +1,37 @@
+"""What the dashboard is given: ticks, steps, events, densities and the end of a run, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+from bench.hysteresis import Density
+from bench.journal import Event, StepRecord
+
+
+class Tick(NamedTuple):
+    """One tick of a hold: laboratory time in s, step number, one value a signal."""
+
+    t: float
+    step: int
+    values: Sequence[float]
+
+
+@dataclass(frozen=True)
+class ModelDensity:
+    """A density to draw, and the name of its model."""
+
+    name: str
+    density: Density
+
+
+@dataclass(frozen=True)
+class End:
+    """How the run ended: `completed`, `aborted` or `failed`, and why."""
+
+    status: str
+    reason: str
+
+
+Entry: TypeAlias = Tick | StepRecord | Event | ModelDensity | End

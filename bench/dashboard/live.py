@@ -1,0 +1,154 @@
+"""The live view of a run: takes what happens from the control thread and hands it to Rerun in a thread of its own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.writer import Writer
+from bench.devices import Signal
+from bench.hysteresis import Density
+from bench.journal import Event, StepRecord
+
+QUEUED_TICKS = 20_000
+"""Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""
+
+QUEUED_ENTRIES = 60_000
+"""Entries waiting for Rerun beyond which steps and events are dropped as well."""
+
+CHUNK_ROWS = 4096
+"""Most rows at once: the more, the faster a recording loads, but the longer it takes to turn them into columns."""
+
+_BATCH_ROWS = 200
+_BATCH_SECONDS = 1.0
+_CLOSE_SECONDS = 5.0
+
+
+class Dashboard:
+    """Shows a run while it goes on, and records it in an .rrd file; an `Observer` of the engine.
+
+    Every method is for the control thread and never waits, except `close`, which waits a bounded time.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        What is measured, in the order of the values; those of the controllers too, if the run has any.
+    meta : mapping
+        The run's metadata, as in its journal: layout, controlled signal, run card.
+    path : Path or None
+        The .rrd file to write; its folder exists, the file does not.
+    live : bool
+        Whether a viewer can connect.
+    port : int
+        Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file exists, the layout or `controls` names a signal that does not exist, or no port is free.
+    ValueError
+        If there is neither a file nor a live view.
+    """
+
+    def __init__(
+        self, signals: Sequence[Signal], meta: Mapping[str, Any], *, path: Path | None, live: bool, port: int = 9876
+    ) -> None:
+        if path is None and not live:
+            raise ValueError("a dashboard needs a file or a live view")
+        self._writer = Writer(signals, meta)
+        self._writer.open(path, port if live else None)
+        self.uri = self._writer.recording.uri
+        """Address for a viewer, None without a live view."""
+        # One counter a thread, as adding is not atomic.
+        self._not_queued = self._not_written = self._reported = 0
+        self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
+        self._wake = threading.Event()
+        self._closing = False
+        self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
+        self._thread.start()
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """Show one tick of a hold: laboratory time in s, step number, one value a signal."""
+        self._put(Tick(t, step, tuple(values)), QUEUED_TICKS)
+
+    def step(self, record: StepRecord) -> None:
+        """Show a finished step."""
+        self._put(record, QUEUED_ENTRIES)
+
+    def event(self, event: Event) -> None:
+        """Show something that happened."""
+        self._put(event, QUEUED_ENTRIES)
+
+    def model(self, name: str, density: Density) -> None:
+        """Show the density of the model `name` under the memory curve, from now on."""
+        self._put(ModelDensity(name, density), QUEUED_ENTRIES)
+
+    def finish(self, status: str, reason: str) -> None:
+        """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
+        self._put(End(status, reason), QUEUED_ENTRIES)
+
+    def close(self) -> None:
+        """Hand over what is queued and let go of file and viewers; waits a bounded time.
+
+        The file is complete first. Rerun takes some 30 s to give up a stalled viewer; the thread that
+        waits for that ends by itself, later.
+        """
+        self._closing = True
+        self._wake.set()
+        self._thread.join(_CLOSE_SECONDS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def dropped(self) -> int:
+        """Number of entries that are not shown because Rerun was stalled or refused them."""
+        return self._not_queued + self._not_written
+
+    @property
+    def viewer_keeps_up(self) -> bool:
+        """Whether there is a live view and no viewer has stalled."""
+        return self._writer.recording.viewer_keeps_up
+
+    def _put(self, entry: Entry, most: int) -> None:
+        waiting = self._queue.qsize()
+        if waiting >= most:
+            self._not_queued += 1
+            return
+        self._queue.put(entry)
+        if waiting >= _BATCH_ROWS and not self._wake.is_set():
+            self._wake.set()
+
+    def _work(self) -> None:
+        while not self._closing:
+            self._wake.wait(_BATCH_SECONDS)
+            self._wake.clear()
+            self._hand_over()
+        # What came between the last look and the closing.
+        self._hand_over()
+        self._writer.recording.close()
+
+    def _hand_over(self) -> None:
+        # In portions, so that turning them into columns does not keep the interpreter from other threads.
+        while waiting := min(self._queue.qsize(), CHUNK_ROWS):
+            entries = [self._queue.get() for _ in range(waiting)]
+            try:
+                if change := self._writer.recording.follow_viewer(len(entries)):
+                    self._writer.warn(change)
+                self._writer.write(entries)
+                if (missing := self.dropped - self._reported) > 0:
+                    self._writer.warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
+                    self._reported += missing
+            # Whatever fails in the view, the run goes on, and so does the rest of the view.
+            except Exception:
+                self._not_written += len(entries)

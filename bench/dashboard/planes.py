@@ -1,0 +1,96 @@
+"""Preisach planes: the one of the first input, with lattice and memory curve, and those over other inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines, point_style, texts, xy_view
+from bench.dashboard.entries import ModelDensity
+from bench.dashboard.recording import Recording
+from bench.devices import Signal
+from bench.hysteresis.density import density_unit
+from bench.layout import DashboardLayout
+from bench.units import fitting_prefix
+
+
+class Planes:
+    """The planes of a layout with the first input x and output y.
+
+    Those of `densities`, which are known from the start, that do not fit the first plane get views of their own.
+    """
+
+    def __init__(self, layout: DashboardLayout, x: Signal, y: Signal, densities: Sequence[ModelDensity]) -> None:
+        self._layout, self._x, self._y = layout, x, y
+        self._others = {path: model for model in densities if (path := self._path_of(model)) != "plane"}
+
+    def draw(self, recording: Recording) -> None:
+        """Draw the first input's plane."""
+        low, high = self._layout.plane
+        _draw_plane(recording, "plane", Frame.of_plane((low, high), self._x.unit))
+        inner = np.linspace(low, high, self._layout.levels + 1)[1:-1]
+        lattice = [[(low, value), (value, value), (value, high)] for value in inner]
+        recording.log("plane/data/lattice", lines(lattice, FAINT, 0.5, -15.0))
+        recording.log("plane/data/memory", line_style(1.75, MARKER))
+        recording.log("plane/data/input", point_style())
+
+    def draw_density(self, recording: Recording, model: ModelDensity) -> None:
+        """Draw a density with its legend, on a plane of its own if it is over another input than the first."""
+        density, path = model.density, self._path_of(model)
+        x_unit, y_unit = density.unit or self._x.unit, density.output_unit or self._y.unit
+        low, high, cells = float(density.levels[0]), float(density.levels[-1]), len(density.levels) - 1
+        if path == "plane":
+            frame = Frame.of_plane(self._layout.plane, self._x.unit)
+        else:
+            frame = Frame.of_plane((low, high), x_unit)
+            _draw_plane(recording, path, frame)
+        # Several pixels a cell, for the diagonal and for intervals of unequal length.
+        pixels = cells * max(8, 256 // cells)
+        middles = low + (np.arange(pixels) + 0.5) * (high - low) / pixels
+        cell = np.clip(np.searchsorted(density.levels, middles, side="right") - 1, 0, cells - 1)
+        values = np.where(middles[:, None] >= middles, density.values[np.ix_(cell, cell)], np.nan)
+        greatest = float(np.nanmax(np.abs(values))) or 1.0
+        frame.draw_image(recording, f"{path}/density", (values / greatest)[::-1], (low, high), (low, high))
+        # The legend stands in the corner below the diagonal, which belongs to no cell.
+        least = -greatest if np.nanmin(values) < 0 else 0.0
+        ramp = np.linspace(least / greatest, 1.0, 128)[None, :].repeat(8, axis=0)
+        low, high = frame.x_range
+        left, right, bottom, top = low + np.array([0.62, 0.92, 0.06, 0.1]) * (high - low)
+        frame.draw_image(recording, f"{path}/legend/bar", ramp, (left, right), (bottom, top))
+        factor, y_unit = fitting_prefix(y_unit, greatest)
+        above = frame.y(top)
+        ends = [(frame.x(left), above - 0.09), (frame.x(right), above - 0.09)]
+        numbers = [f"{factor * value:.3g}" for value in (least, greatest)]
+        recording.log(f"{path}/legend/ends", texts(ends, numbers))
+        middle = frame.x((left + right) / 2)
+        title = f"{' '.join(('density', density.title)).strip()} [{density_unit(y_unit, x_unit)}]"
+        recording.log(
+            f"{path}/legend/title", texts([(middle, above - 0.23), (middle, above - 0.16)], [model.name, title])
+        )
+
+    def views(self) -> list[rrb.Spatial2DView | rrb.Tabs]:
+        """Return the view of the first input's plane, and those of the others in tabs."""
+        views = [
+            xy_view(path, f"Preisach plane of {model.density.title or model.name}")
+            for path, model in sorted(self._others.items())
+        ]
+        others = [rrb.Tabs(*views, active_tab=0)] if len(views) > 1 else views
+        return [xy_view("plane", "Preisach plane"), *others]
+
+    def _path_of(self, model: ModelDensity) -> str:
+        """Return the path of the plane on which a density is drawn."""
+        density = model.density
+        if density.measured and density.unit in ("", self._x.unit):
+            return "plane"
+        return f"planes/{rr.escape_entity_path_part(density.title or model.name)}"
+
+
+def _draw_plane(recording: Recording, path: str, frame: Frame) -> None:
+    """Draw axes and triangle of a plane."""
+    frame.draw(recording, path)
+    low, high = frame.x_range
+    triangle = [(low, low), (high, high), (low, high), (low, low)]
+    recording.log(f"{path}/data/triangle", lines([triangle], INK, 1.0, 10.0))

@@ -1,0 +1,108 @@
+"""The log of a run, and the lanes that show its phase and its state over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import rerun as rr
+
+from bench.dashboard.drawing import Colour
+from bench.dashboard.entries import Entry, Tick
+from bench.dashboard.recording import Recording, times
+from bench.journal import Event, StepRecord
+
+_RUNNING = "running"
+_NOT_SETTLED = "not settled"
+_STATES: Mapping[str, Colour] = {
+    _RUNNING: (66, 140, 92),
+    "paused": (190, 146, 44),
+    "interlock": (206, 62, 58),
+    "safe": (64, 112, 176),
+    "completed": (66, 140, 92),
+    "aborted": (190, 146, 44),
+    "failed": (206, 62, 58),
+    _NOT_SETTLED: (206, 118, 52),
+}
+_STATE_OF_EVENT = {"pause": "paused", "resume": _RUNNING, "interlock": "interlock", "safe-state": "safe"}
+_PHASE_COLOURS: tuple[Colour, ...] = (
+    (58, 92, 138),
+    (52, 116, 122),
+    (104, 84, 140),
+    (74, 112, 78),
+    (128, 96, 62),
+    (122, 74, 104),
+)
+
+
+class Timeline:
+    """Writes events and the changes of phase and state to a recording."""
+
+    def __init__(self) -> None:
+        self._states: dict[str, str] = {}
+        self._phases: list[str] = []
+        self._step = 0
+        self._t = 0.0
+
+    def draw(self, recording: Recording) -> None:
+        """Give the states their colours."""
+        recording.log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
+
+    def write(self, recording: Recording, entries: Sequence[Entry]) -> None:
+        """Write events, and the changes that events and steps bring."""
+        events: list[tuple[int, Event]] = []
+        changes: dict[str, list[tuple[float, int, str]]] = {"run": [], "phase": []}
+
+        def enter(lane: str, t: float, step: int, state: str | None) -> None:
+            if state is not None and self._states.get(lane) != state:
+                self._states[lane] = state
+                changes[lane].append((t, step, state))
+
+        for entry in entries:
+            if isinstance(entry, StepRecord):
+                enter("run", entry.started, entry.step, _NOT_SETTLED if entry.settled.failed else _RUNNING)
+                self._step, self._t = entry.step + 1, entry.finished
+            elif isinstance(entry, Event):
+                events.append((self._step, entry))
+                if entry.kind == "phase":
+                    self._colour_phase(recording, entry.text)
+                    enter("phase", entry.t, self._step, entry.text)
+                enter("run", entry.t, self._step, _state_after(entry))
+                self._t = entry.t
+            elif isinstance(entry, Tick):
+                self._t = max(self._t, entry.t)
+        _write_events(recording, events)
+        for lane, changed in changes.items():
+            if changed:
+                t, step, state = zip(*changed, strict=True)
+                recording.send(f"state/{lane}", times(t, step), rr.StateChange.columns(state=state))
+
+    def warn(self, recording: Recording, text: str) -> None:
+        """Report a problem of the dashboard itself in the log."""
+        _write_events(recording, [(self._step, Event(self._t, "WARN", "dashboard", text))])
+
+    def _colour_phase(self, recording: Recording, phase: str) -> None:
+        if phase not in self._phases:
+            self._phases.append(phase)
+            colours = [_PHASE_COLOURS[i % len(_PHASE_COLOURS)] for i in range(len(self._phases))]
+            recording.log("state/phase", rr.StateConfiguration(values=self._phases, colors=colours))
+
+
+def _write_events(recording: Recording, events: Sequence[tuple[int, Event]]) -> None:
+    if not events:
+        return
+    columns = rr.TextLog.columns(
+        # The viewer leaves its own time column too narrow to read.
+        text=[f"{_clock_face(event.t)}  {event.text}" for _, event in events],
+        level=[event.level for _, event in events],
+    )
+    recording.send("events", times([event.t for _, event in events], [step for step, _ in events]), columns)
+
+
+def _state_after(event: Event) -> str | None:
+    """Return the state of the run after an event; None if it changes nothing."""
+    return event.text if event.kind == "end" else _STATE_OF_EVENT.get(event.kind)
+
+
+def _clock_face(t: float) -> str:
+    minutes, seconds = divmod(max(int(t), 0), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
