@@ -17,6 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn
 import typer
 from rich.console import Console
 from rich.markdown import Markdown
+from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperGroup
 
@@ -137,7 +138,7 @@ def fail(error: BenchError) -> NoReturn:
 
 def _print_error(error: BenchError) -> None:
     for line in str(error).splitlines():
-        _errors.print("[bold red]error:[/]", line, highlight=False, markup=True, soft_wrap=True)
+        _errors.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
 
 
 @app.command("list")
@@ -373,7 +374,7 @@ def identify_(
         console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
-        _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
+        _errors.print("[yellow]warning:[/]", escape(warning), highlight=False, soft_wrap=True)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
     if out is not None:
         found.file.save(out)
@@ -417,7 +418,7 @@ def predict_(
     inputs = columns.values[input_column]
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
-        _errors.print("[yellow]warning:[/]", warning, highlight=False, soft_wrap=True)
+        _errors.print("[yellow]warning:[/]", escape(warning), highlight=False, soft_wrap=True)
     predicted = predict(model, inputs, continue_memory=continue_memory)
     write_csv(out, [input_column, "predicted"], [inputs, predicted])
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}

@@ -93,13 +93,13 @@ def parameter(
     if isinstance(default, FromSlot):
         extra["default"] = default
         default = ...
-    # A default that is a text may stand for another type, such as a list of numbers.
     return Field(
         default,
         description=help,
         ge=low,
         le=high,
         json_schema_extra=extra,
+        # A default that is a text may stand for another type, such as a list of numbers.
         validate_default=isinstance(default, str),
     )
 

@@ -11,24 +11,30 @@ from bench import registry
 from bench.control.loops import Reaching, ReachTarget
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
-from bench.protocol import Control, Dwell, Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
+from bench.protocol import (
+    Control,
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    ProtocolParameters,
+    Slots,
+    Step,
+    parameter,
+    protocol,
+)
 from bench.results.model_file import load_model
 from bench.results.tracking import REACH, READING
-from protocols.muscles.force_voltage import condition
 from protocols.muscles.parts import (
-    FORCE,
-    LENGTH,
     ON_STAGE,
     ON_WEIGHTS,
-    Part,
     ResetParameters,
     StageParameters,
-    fasten,
     hang,
-    reset_on_stage,
+    prepare_on_stage,
     reset_under_weights,
-    stretch,
 )
+from protocols.preparation import Part
 
 ControllerName = Literal["open-loop-inverse", "proportional-integral", "closed-loop-inverse"]
 Output = Literal["length", "force"]
@@ -65,8 +71,8 @@ class ForceParameters(Controlled, StageParameters):
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
 
-@protocol(needs=ON_WEIGHTS, controls=LENGTH)
-def length_control(parameters: LengthParameters) -> Messages:
+@protocol(needs=ON_WEIGHTS, controls="response")
+def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     """Bring the length of a muscle under a weight to one target after another.
 
     The memory is reset, the weight is hung on, and targets are drawn at random from the range that the model says
@@ -83,21 +89,21 @@ def length_control(parameters: LengthParameters) -> Messages:
     low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
     if not low < high:
         raise ValueError("change: under the two weights the model has no length in common; choose a smaller one")
-    yield from reset_under_weights(parameters)
-    yield from hang(parameters.load)
+    yield from reset_under_weights(parameters, slots)
+    yield from hang(slots, parameters.load)
     controller = _make_controller(parameters, model, state, "length")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for i, target in enumerate(_targets(parameters, low, high)):
         if parameters.change and i and i % _TARGETS_AT_A_LOAD == 0:
             heavier = i // _TARGETS_AT_A_LOAD % 2 == 1
-            yield from hang(parameters.load + parameters.change * heavier)
-        errors.append((yield from _reach(parameters, controller, target, LENGTH, (FORCE,))))
+            yield from hang(slots, parameters.load + parameters.change * heavier)
+        errors.append((yield from _reach(parameters, slots, controller, target, "response", ("force",))))
     yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
 
 
-@protocol(needs=ON_STAGE, controls=FORCE)
-def force_control(parameters: ForceParameters) -> Messages:
+@protocol(needs=ON_STAGE, controls="force")
+def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     """Bring the force of a muscle between fixed ends to one target after another.
 
     The muscle is fastened to the stage, reset, conditioned by cycles of the voltage and stretched to the
@@ -106,15 +112,12 @@ def force_control(parameters: ForceParameters) -> Messages:
     model = _load_model(parameters.model)
     state = model.initial_state()
     low, high = _range(model, state, parameters.highest, "force")
-    yield from fasten()
-    yield from reset_on_stage(parameters)
-    yield from condition(parameters, parameters.conditioning)
-    yield from stretch(parameters.pretension)
+    yield from prepare_on_stage(parameters, slots, parameters.conditioning)
     controller = _make_controller(parameters, model, state, "force")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for target in _targets(parameters, low, high):
-        errors.append((yield from _reach(parameters, controller, target, FORCE, ())))
+        errors.append((yield from _reach(parameters, slots, controller, target, "force", ())))
     yield _summary(parameters.controller, np.array(errors), "N")
 
 
@@ -163,21 +166,23 @@ def _targets(parameters: Controlled, low: float, high: float) -> list[float]:
 
 def _reach(
     parameters: LengthParameters | ForceParameters,
+    slots: Slots,
     controller: Reaching,
     target: float,
-    signal: str,
+    controlled: str,
     others: tuple[str, ...],
 ) -> Part[float]:
-    """Go to a target and read; return the error (m or N)."""
+    """Bring a slot to a target, with further slots for the controller, and read; return the error (m or N)."""
+    drive, signal = slots["drive"], slots[controlled].signal
     yield Control(
         task=ReachTarget(controller, target),
-        actuator="supply",
-        drive="supply_voltage",
+        actuator=drive.device,
+        drive=drive.signal,
         response=signal,
         limits=(0.0, parameters.highest),
         timeout=parameters.duration + _GRACE,
         label=REACH,
-        others=others,
+        others=tuple(slots[name].signal for name in others),
     )
     outputs = []
     for _ in range(parameters.readings):

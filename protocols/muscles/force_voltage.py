@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bench.identification.two_stage import voltage_steps
-from bench.protocol import Dwell, Messages, Phase, Step, parameter, protocol
-from protocols.muscles.parts import ON_STAGE, StageParameters, fasten, reset_on_stage, sample_voltages, stretch
+from bench.protocol import Messages, Phase, Slots, parameter, protocol
+from protocols.muscles.parts import ON_STAGE, StageParameters, prepare_on_stage, sample_voltages
 
 
 class Parameters(StageParameters):
@@ -15,27 +15,16 @@ class Parameters(StageParameters):
 
 
 @protocol(needs=ON_STAGE)
-def force_voltage(parameters: Parameters) -> Messages:
+def force_voltage(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the force of a muscle over the voltage, with its ends held near its resting length.
 
     The muscle is fastened to the stage, reset, and conditioned by cycles of the voltage at constant length. Then
     the stage stretches it to the pretension, and the voltage goes through a damped oscillation, with one reading
     after each dwell (Zhang and Yip 2017, sections II-A and V-A: 0 to 3 V, 37 voltages, 30 s, 0.3 N).
     """
-    yield from fasten()
-    yield from reset_on_stage(parameters)
-    yield from condition(parameters, parameters.conditioning)
-    yield from stretch(parameters.pretension)
+    yield from prepare_on_stage(parameters, slots, parameters.conditioning)
     yield Phase("force over voltage")
-    yield from sample_voltages(parameters, scaled_steps(parameters.highest, parameters.points))
-
-
-def condition(parameters: StageParameters, cycles: int) -> Messages:
-    """Condition the muscle by cycles of the voltage at constant length."""
-    yield Phase("conditioning")
-    for _ in range(cycles):
-        yield Step({"supply": parameters.highest}, Dwell(parameters.dwell), label="conditioning")
-        yield Step({"supply": 0.0}, Dwell(parameters.dwell), label="conditioning")
+    yield from sample_voltages(parameters, slots, scaled_steps(parameters.highest, parameters.points))
 
 
 def scaled_steps(highest: float, points: int) -> list[float]:

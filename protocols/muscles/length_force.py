@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from bench.number_list import NumberList
-from bench.protocol import Dwell, Messages, Phase, Step, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, parameter, protocol
 from protocols.muscles.parts import (
     ON_STAGE,
     SAMPLE,
     StageParameters,
+    drive_to,
     fasten,
     reset_on_stage,
     stretch,
@@ -28,7 +29,7 @@ class Parameters(StageParameters):
 
 
 @protocol(needs=ON_STAGE)
-def length_force(parameters: Parameters) -> Messages:
+def length_force(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the length of a muscle over the force, at one constant voltage after another.
 
     For each voltage the memory is reset, the slack muscle is brought to the voltage, and the stage stretches it
@@ -39,12 +40,12 @@ def length_force(parameters: Parameters) -> Messages:
         raise ValueError("smallest_force must be below largest_force")
     up = np.linspace(parameters.smallest_force, parameters.largest_force, parameters.points)
     forces = [*up, *up[-2::-1]]
-    yield from fasten()
+    yield from fasten(slots)
     for voltage in parameters.voltages:
-        yield from reset_on_stage(parameters)
+        yield from reset_on_stage(parameters, slots)
         yield Phase(f"length over force at {voltage:g} V")
-        yield Step({"stage": parameters.slack}, Dwell(5.0))
-        yield Step({"supply": voltage}, Dwell(parameters.dwell))
+        yield Step({slots["stage"].device: parameters.slack}, Dwell(5.0))
+        yield drive_to(slots, voltage, parameters.dwell, "")
         for force in forces:
-            yield from stretch(float(force), tolerance=_TOLERANCE)
+            yield from stretch(slots, float(force), tolerance=_TOLERANCE)
             yield Step({}, Dwell(parameters.dwell), label=SAMPLE)

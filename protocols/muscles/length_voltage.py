@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bench.number_list import NumberList
-from bench.protocol import Messages, Phase, parameter, protocol
+from bench.protocol import Messages, Phase, Slots, parameter, protocol
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import (
     LOADS,
@@ -41,33 +41,33 @@ class RandomParameters(Loaded):
 
 
 @protocol(needs=ON_WEIGHTS)
-def length_voltage(parameters: Parameters) -> Messages:
+def length_voltage(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the length of a muscle over the voltage, under one dead load after another.
 
     For each load the operator hangs the pretension alone, the memory is reset, the load is hung on, and the
     voltage goes through a damped oscillation, with one reading after each dwell (Zhang and Yip 2017, sections
     II-A and V-A: five loads, 37 voltages, 30 s).
     """
-    yield from _under_loads(parameters, scaled_steps(parameters.highest, parameters.points))
+    yield from _under_loads(parameters, slots, scaled_steps(parameters.highest, parameters.points))
 
 
 @protocol(needs=ON_WEIGHTS)
-def length_verification(parameters: RandomParameters) -> Messages:
+def length_verification(parameters: RandomParameters, slots: Slots) -> Messages:
     """Verify a model of a muscle by random voltages, the same under one dead load after another.
 
     As `length-voltage`, with uniformly distributed voltages (Zhang and Yip 2017, section V-C: five loads, 18
     voltages).
     """
     rng = np.random.default_rng(parameters.sequence_seed)
-    yield from _under_loads(parameters, rng.uniform(0.0, parameters.highest, parameters.points).tolist())
+    yield from _under_loads(parameters, slots, rng.uniform(0.0, parameters.highest, parameters.points).tolist())
 
 
-def _under_loads(parameters: Loaded, voltages: Sequence[float]) -> Messages:
+def _under_loads(parameters: Loaded, slots: Slots, voltages: Sequence[float]) -> Messages:
     if min(parameters.loads) <= 0:
         loads = ", ".join(f"{load:g}" for load in parameters.loads)
         raise ValueError(f"loads = {loads}: expected positive loads")
     for load in parameters.loads:
-        yield from reset_under_weights(parameters)
-        yield from hang(load)
+        yield from reset_under_weights(parameters, slots)
+        yield from hang(slots, load)
         yield Phase(f"length over voltage at {load:g} N")
-        yield from sample_voltages(parameters, voltages)
+        yield from sample_voltages(parameters, slots, voltages)

@@ -1,36 +1,38 @@
 """Parts of the protocols for artificial muscles: the reset, the weights, and the stage that stretches.
 
-The rig has a `supply` that drives the muscle, a `load_cell` from which it hangs, a sensor at its lower end
-(`wire_end_position`, m, positive when the muscle is longer than at rest), and a `stage` to which that end may be
-fastened. Sequences follow Zhang and Yip, "Three-Dimensional Hysteresis Modeling of Robotic Artificial Muscles with
-Application to Shape Memory Alloy Actuators", Robotics: Science and Systems, 2017, sections II-A and V-A.
+The slots are a `drive` (V), the `force` in the muscle (N), a `response` (the position of its lower end, m, positive
+when the muscle is longer than at rest), and either a `load` that an operator hangs on it (N) and a `cooling` (a fan),
+or a `stage` to which the lower end is fastened (m). Sequences follow Zhang and Yip, "Three-Dimensional Hysteresis
+Modeling of Robotic Artificial Muscles with Application to Shape Memory Alloy Actuators", Robotics: Science and
+Systems, 2017, sections II-A and V-A.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from typing import TypeAlias, TypeVar
+from collections.abc import Sequence
 
 from bench.control.approach import Approach
+from bench.devices import Actuator, Signal
 from bench.protocol import (
     Control,
     Dwell,
-    Message,
     Phase,
     Prompt,
     ProtocolParameters,
     Reading,
+    Slots,
     Step,
+    from_slot,
     parameter,
+    unit_of,
 )
+from protocols.preparation import DRIVE_AND_RESPONSE, Part
 
-FORCE = "load_cell_force"
-LENGTH = "wire_end_position"
 SAMPLE = "sample"
 """Label of the readings that count."""
 
-ON_WEIGHTS = ("supply", FORCE, LENGTH, "fan")
-ON_STAGE = ("supply", FORCE, LENGTH, "stage", "stage_position")
+ON_WEIGHTS = {**DRIVE_AND_RESPONSE, "force": Signal, "load": Signal, "cooling": Actuator}
+ON_STAGE = {**DRIVE_AND_RESPONSE, "force": Signal, "stage": Actuator}
 """Needs of a protocol where the muscle carries weights, and where the stage holds it."""
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
@@ -44,16 +46,16 @@ _LARGEST_STEP = 0.2e-3
 """Longest step of the stage, m. Where a slack muscle becomes taut, its stiffness doubles within one."""
 _STRETCH_TIMEOUT = 900.0
 
-R = TypeVar("R")
-Part: TypeAlias = Generator[Message, Reading, R]
-"""A part of a protocol that returns something, such as its last reading."""
-
 
 class ResetParameters(ProtocolParameters):
     """Parameters of each of these protocols."""
 
-    highest: float = parameter(3.0, unit="V", low=0.1, high=60, help="highest voltage, where the memory is reset")
-    dwell: float = parameter(30.0, unit="s", low=0.5, high=3600, help="hold at each set-point before the reading")
+    highest: float = parameter(
+        from_slot("drive", "high"), unit=unit_of("drive"), help="highest set-point, where the memory is reset"
+    )
+    dwell: float = parameter(
+        from_slot("drive", "dwell"), unit="s", low=0.5, high=3600, help="hold at each set-point before the reading"
+    )
     pretension: float = parameter(0.3, unit="N", low=0.05, high=10, help="force under which the memory is reset")
 
 
@@ -65,83 +67,101 @@ class StageParameters(ResetParameters):
     )
 
 
-def hang(load: float) -> Part[Reading]:
+def drive_to(slots: Slots, value: float, seconds: float, label: str) -> Step:
+    """Return the step that holds a set-point of the drive for a time (s)."""
+    return Step({slots["drive"].device: value}, Dwell(seconds), label=label)
+
+
+def hang(slots: Slots, load: float) -> Part[Reading]:
     """Prompt for a load (N) on the muscle, and verify it with the load cell."""
+    slot = slots["load"]
     tolerance = 0.15 + 0.02 * load
     reading = yield Prompt(
-        text=f"Hang {load:g} N on the muscle, hook and magnet included, and let it come to rest",
-        task="load",
+        text=slot.table.prompt.format(value=load, unit=slot.unit),
+        task=slot.table.task or slot.name,
         value=load,
         settle=_SETTLE_LOAD,
-        signal=FORCE,
+        signal=slot.signal,
         low=load - tolerance,
         high=load + tolerance,
     )
     return reading
 
 
-def reset_under_weights(parameters: ResetParameters) -> Part[Reading]:
-    """Reset the memory: drive the muscle to its highest voltage and back to 0 V under the pretension.
+def reset_under_weights(parameters: ResetParameters, slots: Slots) -> Part[Reading]:
+    """Reset the memory: drive the muscle to its highest set-point and back to 0 under the pretension.
 
     The muscle cools before the weight is changed, as a hot one must not be touched.
     """
     yield Phase("reset")
-    yield Step({"supply": 0.0, "fan": 1.0}, Dwell(_COOL_SECONDS), label="reset")
-    yield Step({"fan": 0.0}, Dwell(0.5), label="reset")
-    yield from hang(parameters.pretension)
-    yield Step({"supply": parameters.highest}, Dwell(parameters.dwell), label="reset")
-    return (yield from cool(parameters))
+    yield from cool(slots, 0.5)
+    yield from hang(slots, parameters.pretension)
+    yield drive_to(slots, parameters.highest, parameters.dwell, "reset")
+    return (yield from cool(slots, parameters.dwell))
 
 
-def cool(parameters: ResetParameters) -> Part[Reading]:
-    """Go to 0 V with the fan on, then let the muscle stand without it."""
-    yield Step({"supply": 0.0, "fan": 1.0}, Dwell(_COOL_SECONDS), label="reset")
-    reading = yield Step({"fan": 0.0}, Dwell(parameters.dwell), label="reset")
+def cool(slots: Slots, seconds: float) -> Part[Reading]:
+    """Go to 0 with the fan on, then let the muscle stand without it for a time (s)."""
+    drive, fan = slots["drive"].device, slots["cooling"].device
+    yield Step({drive: 0.0, fan: 1.0}, Dwell(_COOL_SECONDS), label="reset")
+    reading = yield Step({fan: 0.0}, Dwell(seconds), label="reset")
     return reading
 
 
-def fasten() -> Part[Reading]:
+def fasten(slots: Slots) -> Part[Reading]:
     """Prompt for the end of the cold muscle to be fastened to the stage."""
-    yield Step({"supply": 0.0, "stage": 0.0}, Dwell(5.0), label="fasten")
+    yield Step({slots["drive"].device: 0.0, slots["stage"].device: 0.0}, Dwell(5.0), label="fasten")
     reading = yield Prompt(
         text="Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
         task="stage",
         value=0.0,
         settle=_SETTLE_LOAD,
-        signal=FORCE,
+        signal=slots["force"].signal,
         low=-0.3,
         high=1.0,
     )
     return reading
 
 
-def stretch(force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> Part[Reading]:
+def stretch(slots: Slots, force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> Part[Reading]:
     """Stretch the muscle until it pulls with a force (N); or hold that force for a time (s)."""
+    stage = slots["stage"]
     reading = yield Control(
         task=Approach(force, slopes=_STIFFNESSES, largest_step=_LARGEST_STEP, tolerance=tolerance, duration=duration),
-        actuator="stage",
-        drive="stage_position",
-        response=FORCE,
+        actuator=stage.device,
+        drive=stage.signal,
+        response=slots["force"].signal,
         timeout=duration + _STRETCH_TIMEOUT,
         label="stretch",
     )
     return reading
 
 
-def reset_on_stage(parameters: StageParameters) -> Part[Reading]:
+def prepare_on_stage(parameters: StageParameters, slots: Slots, cycles: int) -> Part[Reading]:
+    """Fasten the muscle, reset it, condition it by cycles of the voltage, and stretch it to the pretension."""
+    yield from fasten(slots)
+    yield from reset_on_stage(parameters, slots)
+    yield Phase("conditioning")
+    for _ in range(cycles):
+        yield drive_to(slots, parameters.highest, parameters.dwell, "conditioning")
+        yield drive_to(slots, 0.0, parameters.dwell, "conditioning")
+    return (yield from stretch(slots, parameters.pretension))
+
+
+def reset_on_stage(parameters: StageParameters, slots: Slots) -> Part[Reading]:
     """Reset the memory as under weights: heat the slack muscle, and cool it while the stage holds the pretension."""
     yield Phase("reset")
-    yield Step({"stage": parameters.slack}, Dwell(5.0), label="reset")
-    yield Step({"supply": parameters.highest}, Dwell(parameters.dwell), label="reset")
-    yield from stretch(parameters.pretension)
+    yield Step({slots["stage"].device: parameters.slack}, Dwell(5.0), label="reset")
+    yield drive_to(slots, parameters.highest, parameters.dwell, "reset")
+    yield from stretch(slots, parameters.pretension)
     # Without the fan: the stage has to keep up with the muscle.
-    yield Step({"supply": 0.0}, Dwell(0.1), label="reset")
-    yield from stretch(parameters.pretension, duration=parameters.dwell + _COOL_SECONDS)
-    return (yield from stretch(parameters.pretension))
+    yield drive_to(slots, 0.0, 0.1, "reset")
+    yield from stretch(slots, parameters.pretension, duration=parameters.dwell + _COOL_SECONDS)
+    return (yield from stretch(slots, parameters.pretension))
 
 
-def sample_voltages(parameters: ResetParameters, voltages: Sequence[float]) -> Part[Reading]:
+def sample_voltages(parameters: ResetParameters, slots: Slots, voltages: Sequence[float]) -> Part[Reading]:
     """Step through voltages (V), with one reading each after the dwell."""
     for voltage in voltages:
-        reading = yield Step({"supply": voltage}, Dwell(parameters.dwell), label=SAMPLE)
+        reading = yield drive_to(slots, voltage, parameters.dwell, SAMPLE)
     return reading

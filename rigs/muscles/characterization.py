@@ -94,25 +94,22 @@ def json_key(name: str) -> str:
     return name.replace("-", "_")
 
 
-def characterize(campaign: Campaign, settings: Mapping[str, Mapping[str, str]] | None = None) -> Characterization:
+def characterize(campaign: Campaign) -> Characterization:
     """Run the four protocols of a muscle, and identify each model; the model files go into the campaign's folder.
 
     Parameters
     ----------
     campaign : Campaign
         Where to run; its seed chooses the random voltages of the verification.
-    settings : mapping of str to mapping, optional
-        Further parameters by protocol.
 
     Raises
     ------
     BenchError
         If a run did not complete, or a model cannot be identified.
     """
-    given = settings or {}
     folders = {
-        protocol: campaign.run(protocol, {**given.get(protocol, {}), **own}).folder
-        for protocol, own in {
+        protocol: campaign.run(protocol, settings).folder
+        for protocol, settings in {
             "force-voltage": {},
             "length-voltage": {},
             "length-force": {},

@@ -27,11 +27,13 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.results.model_file import ModelFile
-from protocols.muscles.parts import FORCE, LENGTH, SAMPLE
+from protocols.muscles.parts import SAMPLE
 
 Floats = npt.NDArray[np.float64]
 
 VOLTAGE = "supply_setpoint"
+FORCE = "load_cell_force"
+LENGTH = "wire_end_position"
 
 UNITS = ("V", "N", "m")
 

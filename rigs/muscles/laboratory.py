@@ -7,10 +7,7 @@ muscle, a fan blows at it.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from contextlib import ExitStack
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -19,18 +16,17 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.errors import ConfigurationError
 from bench.rig_file import LaboratorySettings
-from sim_devices import protocol_emulated
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_drum import EmulatedDrum
 from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.laboratory import EmulatedLaboratory, Event
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.magnet import RatiometricSensor
-from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
@@ -157,8 +153,8 @@ class Frame:
         self.muscle.advance(dt)
 
 
-class MuscleLaboratory:
-    """A `bench.rig.Laboratory` with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
+class MuscleLaboratory(EmulatedLaboratory):
+    """A laboratory with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
     Parameters
     ----------
@@ -178,7 +174,6 @@ class MuscleLaboratory:
         # One stream a source of noise: how often one instrument is read must not change the readings of another.
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
-        self._clock = clock
         self.muscle = settings.make_muscle(plant)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
@@ -204,33 +199,18 @@ class MuscleLaboratory:
         self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
         self.frame.t7 = self.t7
-        self._t7_server = ModbusTcpServer(self.t7)
-        self._opened = ExitStack()
         if settings.fault != "none":
-            self.world.add(_Fault(self, settings.fault_time))
-
-    def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name.
-
-        Raises
-        ------
-        ValueError
-            If another laboratory of this process has the same ports open; it keeps them.
-        """
-        servers: dict[str, WireServer] = {
-            "supply": CanopenSlcanServer(self.supply),
-            "load_cell": ModbusRtuServer(self.load_cell),
-            "stage": Dynamixel2Server([self.servo]),
-        }
-        with ExitStack() as started:
-            self._t7_server.start()
-            started.callback(self._t7_server.close)
-            ports = {"t7": self._t7_server.address}
-            for name, server in servers.items():
-                ports[name] = protocol_emulated.register(name, server, self._clock)
-                started.callback(protocol_emulated.unregister, name)
-            self._opened = started.pop_all()
-        return ports
+            self.world.add(Event(settings.fault_time, self._go_wrong))
+        super().__init__(
+            "muscle laboratory",
+            {
+                "t7": ModbusTcpServer(self.t7),
+                "supply": CanopenSlcanServer(self.supply),
+                "load_cell": ModbusRtuServer(self.load_cell),
+                "stage": Dynamixel2Server([self.servo]),
+            },
+            clock,
+        )
 
     def operate(self, task: str, value: float) -> None:
         """Hang a load of `value` N on the muscle, or fasten its end to the stage.
@@ -254,11 +234,7 @@ class MuscleLaboratory:
                 except ValueError as error:
                     raise ConfigurationError(f"a load of {load:g} N cannot be hung on the muscle: {error}") from None
 
-    def close(self) -> None:
-        """Switch the instruments off."""
-        self._opened.close()
-
-    def go_wrong(self) -> None:
+    def _go_wrong(self) -> None:
         """Make the fault of the settings happen, if it is one of an instant."""
         fault = self._settings.fault
         if fault == "silent-supply":
@@ -274,23 +250,6 @@ class MuscleLaboratory:
 
     def _sensed_force(self) -> float:
         return _BROKEN_CELL if self._cell_is_broken else self.muscle.force
-
-
-class _Fault:
-    """A fault at its time; a `Timed` part of the world."""
-
-    def __init__(self, laboratory: MuscleLaboratory, instant: float) -> None:
-        self._laboratory = laboratory
-        self._due = instant
-
-    def deadline(self) -> float:
-        """Return when it is due, s."""
-        return self._due
-
-    def expire(self) -> None:
-        """Make it happen, once."""
-        self._due = math.inf
-        self._laboratory.go_wrong()
 
 
 class _ThermalSettings(MuscleLaboratorySettings):

@@ -5,47 +5,21 @@ Protocols and models are those of the SMA wire, see `rigs.muscles.characterizati
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from bench.campaign import Campaign, Study, StudyResult
 from bench.results.figures import Curve, plot_panels
 from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths
 
-
-class Specimen(NamedTuple):
-    """One muscle: its name in tables, its rig, and parameters by protocol."""
-
-    title: str
-    rig: str
-    settings: Mapping[str, Mapping[str, str]]
-
-
-_CONTRACTS_FAR = {"slack": "-19e-3"}
-_SLOW = {"dwell": "60"}
-_SLOW_ON_STAGE = {"dwell": "60", "slack": "-10e-3"}
-
-SPECIMENS = {
-    "mckibben": Specimen(
-        "McKibben muscle", "mckibben", {"force-voltage": _CONTRACTS_FAR, "length-force": _CONTRACTS_FAR}
-    ),
-    "coiled_polymer": Specimen(
-        "super-coiled polymer muscle",
-        "coiled-polymer",
-        {
-            "force-voltage": _SLOW_ON_STAGE,
-            "length-voltage": _SLOW,
-            "length-force": _SLOW_ON_STAGE,
-            "length-verification": _SLOW,
-        },
-    ),
+MUSCLES = {
+    "mckibben": ("McKibben muscle", "mckibben"),
+    "coiled_polymer": ("super-coiled polymer muscle", "coiled-polymer"),
 }
-"""Their time constants are 0.3 s and 8 s, so that the latter is given twice the dwell."""
+"""Name in tables, and rig, by the key in the JSON."""
 
 TABLES = tuple(
-    errors_table(f"{specimen.title}: errors, average / RMS in % of the range", f"{key}[{{}}]")
-    for key, specimen in SPECIMENS.items()
+    errors_table(f"{title}: errors, average / RMS in % of the range", f"{key}[{{}}]")
+    for key, (title, _) in MUSCLES.items()
 )
 
 
@@ -60,9 +34,9 @@ def carry_out(campaign: Campaign) -> StudyResult:
         If a run did not complete; its record is kept.
     """
     values, figures = {}, []
-    for key, specimen in SPECIMENS.items():
-        part = campaign.part(key, specimen.rig)
-        measured = characterize(part, specimen.settings)
+    for key, (_, rig) in MUSCLES.items():
+        part = campaign.part(key, rig)
+        measured = characterize(part)
         measured.keep_model(part)
         values[key] = measured.errors_json()
         figures += _draw(part, measured)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
-from bench.hysteresis import Preisach, TwoStage
 from bench.identification.two_stage import predict_series
 from bench.results.figures import (
     Curve,
@@ -23,7 +22,6 @@ from bench.results.figures import (
     plot_tracking,
 )
 from bench.results.tracking import TargetResults
-from protocols.muscles.parts import FORCE, LENGTH
 from rigs.muscles.characterization import (
     TITLES,
     Characterization,
@@ -32,6 +30,7 @@ from rigs.muscles.characterization import (
     json_key,
     plot_lengths,
 )
+from rigs.muscles.identification import FORCE, LENGTH
 
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
 LOAD_CHANGE = 1.96
@@ -168,15 +167,8 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             TITLES[which]: [predict_series(found.model, s) for s in chosen] for which, found in models.items()
         }
         plot_lengths(paths[-1], kind, chosen, {"measured": [s.lengths for s in chosen], **modelled})
-    two_stage = models["two-stage"].model
-    if not (
-        isinstance(two_stage, TwoStage)
-        and isinstance(two_stage.first, Preisach)
-        and isinstance(two_stage.second, Preisach)
-    ):
-        raise TypeError("expected a two-stage model of Preisach operators")
     paths.append(campaign.figure("figure-09-densities"))
-    plot_densities(paths[-1], {"H1": two_stage.first, "H2": two_stage.second})
+    plot_densities(paths[-1], models["two-stage"].model.densities())
     for panel, kind in (("a", "length-voltage"), ("b", "length-force")):
         paths.append(campaign.figure(f"figure-10{panel}-errors-{kind}"))
         residuals = {TITLES[which]: found.residuals[kind] * 1e3 for which, found in models.items()}

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.errors import ConfigurationError
 from bench.rig_file import LaboratorySettings
-from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
@@ -36,8 +34,8 @@ class VO2LaboratorySettings(LaboratorySettings):
     )
 
 
-class VO2Laboratory:
-    """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `psd` (Modbus TCP).
+class VO2Laboratory(EmulatedLaboratory):
+    """The laboratory with the instruments `tec` (serial, MeCom) and `psd` (Modbus TCP).
 
     Parameters
     ----------
@@ -62,36 +60,10 @@ class VO2Laboratory:
         if not settings.disturbances:
             specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
         self.plant = VO2Cantilever(specimen, plant_stream)
-        self._clock = clock
         self.world = World(self.plant, clock)
         self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
         detector = NormalisedPSD(
             lambda: self.plant.tip_deflection, settings.volts_per_metre, settings.psd_noise, rng=psd_stream
         )
         self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
-        self._t7_server = ModbusTcpServer(self.t7)
-
-    def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name."""
-        self._t7_server.start()
-        try:
-            port = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
-        except ValueError:
-            self._t7_server.close()
-            raise
-        return {"tec": port, "psd": self._t7_server.address}
-
-    def operate(self, task: str, value: float) -> None:  # noqa: ARG002
-        """Refuse any task.
-
-        Raises
-        ------
-        ConfigurationError
-            Always.
-        """
-        raise ConfigurationError(f"the VO2 laboratory cannot carry out {task!r}; nothing is done by hand there")
-
-    def close(self) -> None:
-        """Switch the instruments off."""
-        protocol_emulated.unregister("tec")
-        self._t7_server.close()
+        super().__init__("VO2 laboratory", {"psd": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)

@@ -19,7 +19,7 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.results.figures import plot_density, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
+from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.runs import RunResult
@@ -286,10 +286,9 @@ def _draw_models(
     ):
         paths.append(campaign.figure(errors_figure))
         plot_errors(paths[-1], {MODELS[key].title: residuals[key]}, error_label=error)
-        operator = models[key].file.operator
-        if density_figure is not None and isinstance(operator, Preisach):
+        if density_figure is not None:
             paths.append(campaign.figure(density_figure))
-            plot_density(paths[-1], operator)
+            plot_densities(paths[-1], models[key].file.operator.densities())
     paths.append(campaign.figure("figure-10-validation"))
     plot_sequence_and_errors(
         paths[-1],

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from bench.cli import main
+from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
 from bench.results.model_file import ModelFile
 from bench.results.tracking import target_results
+from bench.rig import Rig
 from bench.rig_file import load_rig
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import LOADS
@@ -42,10 +44,19 @@ def assignments(option, values):
     return [part for key, value in values.items() for part in (option, f"{key}={value}")]
 
 
+def bound(protocol, settings):
+    """A protocol with its parameters and its slots on the rig `sma`."""
+    definition, file = find_protocol(protocol), load_rig("sma")
+    texts = {key: str(value) for key, value in settings.items()}
+    parameters = definition.parse(texts, file.roles, file.protocols.get(protocol))
+    with Rig(file, VirtualClock(), 0) as rig:
+        return definition, parameters, rig.slots(definition)
+
+
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
-    definition = find_protocol(protocol)
-    messages = definition.generator(definition.parse({key: str(value) for key, value in settings.items()}))
+    definition, parameters, slots = bound(protocol, settings)
+    messages = definition.start(parameters, slots)
     zeros = dict.fromkeys((FORCE, LENGTH), 0.0)
     found, reading = [], None
     while True:
@@ -71,8 +82,7 @@ def samples_by_phase(messages):
 
 
 def planned(protocol, **settings):
-    definition = find_protocol(protocol)
-    return plan(definition, definition.parse({key: str(value) for key, value in settings.items()}))
+    return plan(*bound(protocol, settings))
 
 
 def preisach(low, high, least, greatest, units):
@@ -224,7 +234,7 @@ class TestRefused:
             find_protocol("length-voltage").parse({"loads": text})
 
     def test_numbers(self):
-        parameters = find_protocol("length-voltage").parse({"loads": " 1, 2.5 ,-3e-1"})
+        _, parameters, _ = bound("length-voltage", {"loads": " 1, 2.5 ,-3e-1"})
         assert parameters.loads == (1.0, 2.5, -0.3)
 
     @pytest.mark.parametrize(
@@ -293,8 +303,9 @@ class TestRefused:
         code, _, err = bench("run", protocol, "--rig", "vo2", "--clock", "virtual", *settings, "--out", tmp_path)
         assert code == 2
         on_weights = protocol in ("length-voltage", "length-verification", "length-control")
-        last = "fan" if on_weights else "stage, stage_position"
-        assert f"needs supply, load_cell_force, wire_end_position, {last}, which rig vo2 does not have" in err
+        missing = "[roles.force], [roles.load], [roles.cooling]" if on_weights else "[roles.force], [roles.stage]"
+        text = re.sub(r"\s+", " ", err)
+        assert f"vo2.toml: protocol {protocol} needs {missing}; the file binds: drive, response" in text
         assert not list(tmp_path.iterdir())
 
     def test_forces_out_of_order(self):

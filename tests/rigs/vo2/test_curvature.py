@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bench.calibration import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 from bench.errors import DeviceError
+from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 LENGTH = 300e-6
 LARGEST_ANGLE = 2.331122370414423  # tan(x/2) = x

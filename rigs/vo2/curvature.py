@@ -1,4 +1,4 @@
-"""Signals that are computed from measured ones: a calibration turns what a sensor sees into what is meant."""
+"""The curvature of a cantilever from the deflection of its tip: a derived signal."""
 
 from __future__ import annotations
 

@@ -1,0 +1,85 @@
+"""Base of the emulated laboratories: the lines of their instruments, and events at a given time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+
+from bench.clock import Clock
+from bench.errors import ConfigurationError
+from sim_devices import protocol_emulated
+from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+
+
+class EmulatedLaboratory:
+    """A `bench.rig.Laboratory` whose instruments are served on lines, and where nothing is done by hand.
+
+    Parameters
+    ----------
+    title : str
+        Its name in messages.
+    servers : mapping of str to server
+        The instruments by the name of their port: serial ones, and those on TCP.
+    clock : Clock
+        The clock of the run.
+    """
+
+    def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpServer], clock: Clock) -> None:
+        self._title = title
+        self._servers = servers
+        self._clock = clock
+        self._opened = ExitStack()
+
+    def open(self) -> Mapping[str, str]:
+        """Switch the instruments on; return the port of each by name.
+
+        Raises
+        ------
+        ValueError
+            If another laboratory of this process has the same ports open; it keeps them.
+        """
+        ports = {}
+        with ExitStack() as opened:
+            for name, server in self._servers.items():
+                if isinstance(server, ModbusTcpServer):
+                    server.start()
+                    opened.callback(server.close)
+                    ports[name] = server.address
+                else:
+                    ports[name] = protocol_emulated.register(name, server, self._clock)
+                    opened.callback(protocol_emulated.unregister, name)
+            self._opened = opened.pop_all()
+        return ports
+
+    def operate(self, task: str, value: float) -> None:  # noqa: ARG002
+        """Refuse a task.
+
+        Raises
+        ------
+        ConfigurationError
+            Always.
+        """
+        raise ConfigurationError(f"the {self._title} cannot carry out {task!r}; nothing is done by hand there")
+
+    def close(self) -> None:
+        """Switch the instruments off; those of another laboratory stay as they are."""
+        self._opened.close()
+
+
+class Event:
+    """Something that happens once, at its time (s); a `Timed` part of the world."""
+
+    def __init__(self, instant: float, happen: Callable[[], None]) -> None:
+        self._due = instant
+        self._happen = happen
+
+    def deadline(self) -> float:
+        """Return when it is due, s; inf once it has happened."""
+        return self._due
+
+    def expire(self) -> None:
+        """Make it happen."""
+        self._due = math.inf
+        self._happen()
