@@ -154,11 +154,11 @@ def list_(
     A protocol is shown with its parameters, a rig with its file: `bench list vo2-hardware > desk.toml`
     gives you a copy to fill in.
     """
-    from bench.identification import MODELS
+    from bench.hysteresis import identifiable_models
     from bench.protocol import packaged_protocols
     from bench.rig_file import load_rig, packaged_rigs
 
-    models = {model: spec.summary for model, spec in MODELS.items()}
+    models = {model: spec.summary for model, spec in identifiable_models().items()}
     protocols = packaged_protocols().protocols
     rigs = {rig: load_rig(rig) for rig in packaged_rigs()}
     if name is None:
@@ -180,11 +180,11 @@ def list_(
     elif name in protocols:
         print_protocol(protocols[name])
         write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in protocols[name].help()]})
-    elif name in MODELS:
+    elif name in models:
         console.print(models[name])
         write_json(json_file, {"name": name, "summary": models[name]})
     else:
-        known = ", ".join([*rigs, *protocols, *MODELS])
+        known = ", ".join([*rigs, *protocols, *models])
         raise ConfigurationError(f"there is no rig, protocol or model {name!r}; there are: {known}")
 
 
@@ -334,6 +334,12 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="KEY=VALUE", help="Another option of the model, a number; may come several times."
+        ),
+    ] = None,
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
@@ -344,10 +350,10 @@ def identify_(
     """Identify a hysteresis model from measurements, and say how good it is.
 
     Columns are named as in the header; a unit in brackets at the end, as in `force [N]`, may be left out and
-    goes into the model. Of a run, the readings are taken: `bench identify RUN --input tec_temperature
-    --output curvature --model preisach-nonmonotonic --out model.json`.
+    goes into the model. Of a run, the readings are taken: `bench identify RUN --input voltage
+    --output displacement --model preisach --out model.json`.
     """
-    from bench.modelling import certificate_lines, identify_file
+    from bench.results.models import certificate_lines, identify_file
 
     found = identify_file(
         file,
@@ -361,6 +367,7 @@ def identify_(
         smoothing=smoothing,
         skip=skip,
         initial=initial,
+        **parse_numbers("--option", options or ()),
         cross_validated=cross_validate,
     )
     if found.trials is not None:
@@ -402,9 +409,9 @@ def predict_(
     Writes a CSV file with the input column and `predicted`.
     """
     from bench.identification import measure_errors
-    from bench.measurements import read_columns, write_csv
-    from bench.model_file import load_model
-    from bench.modelling import check_unit, errors_json, outside_of_range, predict
+    from bench.results.data import read_columns, write_csv
+    from bench.results.model_file import load_model
+    from bench.results.models import check_unit, errors_json, outside_of_range, predict
 
     model = load_model(model_path)
     columns = read_columns(file, [input_column] + ([output_column] if output_column else []))
@@ -453,7 +460,7 @@ def compare_(
     Shows each model's errors raw, and after re-zeroing the sensor: between sessions a sensor's offset moves, and
     what a model is worth then is another number.
     """
-    from bench.modelling import compare_models
+    from bench.results.models import compare_models
 
     result = compare_models(models, data, input_column, output_column, skip=skip)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
@@ -493,7 +500,7 @@ def design(
     and the same twice as fine with two set-points a level, which averages noise. Each is a protocol:
     damped-oscillation, first-order-reversals, covering.
     """
-    from bench.modelling import assess_designs
+    from bench.results.models import assess_designs
 
     result = assess_designs(plane, operating, levels, dwell)
     table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
@@ -543,9 +550,9 @@ def invert(
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value).
     """
-    from bench.measurements import header_with_unit, read_columns, write_csv
-    from bench.model_file import load_model
-    from bench.modelling import check_unit, invert_targets
+    from bench.results.data import header_with_unit, read_columns, write_csv
+    from bench.results.model_file import load_model
+    from bench.results.models import check_unit, invert_targets
 
     model = load_model(model_path)
     columns = read_columns(file, [column])
@@ -673,6 +680,17 @@ def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"{option}: {key} is given twice")
         pairs[key] = value
     return pairs
+
+
+def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
+    """Split texts of the form `key=number`; errors as `parse_assignments`, or if a value is not a number."""
+    numbers: dict[str, int | float] = {}
+    for key, text in parse_assignments(option, texts).items():
+        try:
+            numbers[key] = int(text) if text.lstrip("-").isdigit() else float(text)
+        except ValueError:
+            raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
+    return numbers
 
 
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold

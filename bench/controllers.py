@@ -1,28 +1,146 @@
-"""Controllers by name, made from a model file: what protocols and the command line choose from."""
+"""Controllers by name, made from a model file: what protocols and the command line choose from.
+
+A controller is an entry of the group `bench.controllers` under `TASK.NAME`, such as `target.latched` (a sequence of
+targets) or `follow.integral` (a moving reference). The entry is a `ControllerSpec`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
+from bench import registry
 from bench.control.baselines import IntegralControl, LookUp
 from bench.control.following import ClosedLoopFollower, IntegralFollower, OpenLoopFollower
-from bench.control.inverse import Inverse
 from bench.control.latched import Latched
-from bench.control.tracking import (
-    ClosedLoopInverse,
-    Follower,
-    OpenLoopInverse,
-    TargetController,
-)
-from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach
-from bench.model_file import ModelFile, load_model
+from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import Inverse, Operator, Policy
+from bench.results.model_file import ModelFile, load_model
 
-Policy = Literal["nearest", "paper"]
-TargetControllerName = Literal["open-loop-inverse", "polynomial", "integral", "closed-loop-inverse", "latched"]
-FollowerName = Literal["open-loop-inverse", "integral", "closed-loop-inverse"]
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerSetup:
+    """What a controller is made from.
+
+    Parameters
+    ----------
+    name : str
+        Name under which it was asked for, for messages.
+    model : ModelFile
+        The identified model.
+    limits : (float, float)
+        Set-points that it may ask for, input units.
+    state : object
+        The specimen's memory, a state of the model; None is the model's initial one.
+    policy : {"nearest", "paper"}
+        Which answer of the inverse is taken where there are several.
+    options : mapping
+        Further numbers that a task's controllers need, such as the time for each target.
+    """
+
+    name: str = ""
+    model: ModelFile
+    limits: tuple[float, float]
+    state: Any = None
+    policy: Policy = "nearest"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def inverse(self) -> Inverse[Any]:
+        """Return the inverse of a model with memory.
+
+        Raises
+        ------
+        DataError
+            If the model has no memory.
+        """
+        if self.model.operator.memoryless:
+            raise DataError(
+                f"controller {self.name} needs a model with memory, such as a Preisach model; this one is "
+                f"{self.model.name}"
+            )
+        return self.model.operator.inverse(self.policy)
+
+
+@dataclass(frozen=True)
+class ControllerSpec:
+    """An entry of the group `bench.controllers`.
+
+    Parameters
+    ----------
+    summary : str
+        What the controller does, in one line.
+    make : callable
+        Takes a `ControllerSetup`; returns the controller. A DataError says what kind of model it needs.
+    """
+
+    summary: str
+    make: Callable[[ControllerSetup], Any]
+
+
+def controller_names(task: str) -> tuple[str, ...]:
+    """Return the names of the registered controllers of a task, such as `target` or `follow`."""
+    prefix = f"{task}."
+    return tuple(name.removeprefix(prefix) for name in registry.entries("controllers") if name.startswith(prefix))
+
+
+def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noqa: ANN401 - by the task
+    """Return a controller by name: of `target` a `TargetController`, of `follow` a `Follower`.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none of this name for the task.
+    DataError
+        If the model is not of the kind that the controller needs.
+    """
+    if name not in controller_names(task):
+        known = ", ".join(controller_names(task)) or "none"
+        raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
+    return registry.load("controllers", f"{task}.{name}").make(replace(setup, name=name))
+
+
+def _look_up(setup: ControllerSetup) -> LookUp:
+    operator = setup.model.operator
+    if not operator.memoryless:
+        raise DataError(
+            f"controller {setup.name} needs a model without memory, such as a polynomial; this one is "
+            f"{setup.model.name}"
+        )
+    return LookUp(operator, setup.limits)
+
+
+def _latched(setup: ControllerSetup) -> Latched:
+    inverse: Any = setup.inverse()
+    if getattr(setup.model.operator, "reversible", None) is None:
+        raise DataError(
+            f"controller {setup.name} needs a Preisach model with a reversible part, by which a locked output is "
+            f"moved; this one is {setup.model.name}"
+        )
+    return Latched(inverse, setup.state, setup.limits)
+
+
+OPEN_LOOP_INVERSE = ControllerSpec(
+    "the inverse of the model, without feedback", lambda s: OpenLoopInverse(s.inverse(), s.state, s.limits)
+)
+CLOSED_LOOP_INVERSE = ControllerSpec(
+    "the inverse of the model, corrected by the measured disturbance",
+    lambda s: ClosedLoopInverse(s.inverse(), s.state, s.limits),
+)
+LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
+POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
+INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits))
+OPEN_LOOP_FOLLOWER = ControllerSpec(
+    "the inverse of the model, without feedback", lambda s: OpenLoopFollower(s.inverse(), s.state, s.limits)
+)
+CLOSED_LOOP_FOLLOWER = ControllerSpec(
+    "the inverse of the model, corrected by the measured disturbance",
+    lambda s: ClosedLoopFollower(s.inverse(), s.state, s.limits),
+)
+INTEGRAL_FOLLOWER = ControllerSpec("integral action without a model", lambda s: IntegralFollower(s.limits))
 
 
 def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile:
@@ -53,71 +171,6 @@ def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile
     return model
 
 
-def make_target_controller(
-    name: TargetControllerName,
-    model: ModelFile,
-    *,
-    limits: tuple[float, float],
-    policy: Policy = "nearest",
-    state: MemoryCurve | None = None,
-) -> TargetController:
-    """Make a controller that reaches targets.
-
-    Parameters
-    ----------
-    name : str
-        Which.
-    model : ModelFile
-        A Preisach model for the inverses, a polynomial for `polynomial`; `integral` uses none.
-    limits : (float, float)
-        Set-points that it may ask for, input units.
-    policy : {"nearest", "paper"}
-        Which answer of the inverse is taken where there are several.
-    state : MemoryCurve, optional
-        The specimen's memory; negative saturation if not given.
-
-    Raises
-    ------
-    DataError
-        If the model is not of the kind that the controller needs.
-    """
-    if name == "integral":
-        return IntegralControl(limits)
-    if name == "polynomial":
-        if not isinstance(model.operator, Polynomial):
-            raise DataError(f"controller {name} needs a polynomial model; this one is {model.name}")
-        return LookUp(model.operator, limits)
-    inverse = _inverse(name, model, policy)
-    if name == "open-loop-inverse":
-        return OpenLoopInverse(inverse, state, limits)
-    if name == "closed-loop-inverse":
-        return ClosedLoopInverse(inverse, state, limits)
-    return Latched(inverse, state, limits)
-
-
-def make_follower(
-    name: FollowerName,
-    model: ModelFile,
-    *,
-    limits: tuple[float, float],
-    state: MemoryCurve | None = None,
-) -> Follower:
-    """Make a controller that follows a moving reference; see `make_target_controller`."""
-    if name == "integral":
-        return IntegralFollower(limits)
-    inverse = _inverse(name, model, "nearest")
-    if name == "open-loop-inverse":
-        return OpenLoopFollower(inverse, state, limits)
-    return ClosedLoopFollower(inverse, state, limits)
-
-
-def saturated_below(model: ModelFile, value: float) -> bool:
-    """Return whether an input value brings a specimen of this model to negative saturation from any state."""
-    operator = model.operator
-    return not isinstance(operator, Preisach) or (math.isfinite(value) and value <= float(operator.levels[0]))
-
-
-def _inverse(name: str, model: ModelFile, policy: Policy) -> Inverse:
-    if not isinstance(model.operator, Preisach):
-        raise DataError(f"controller {name} needs a Preisach model, whose inverse is exact; this one is {model.name}")
-    return Inverse(model.operator, policy)
+def saturated_below(operator: Operator[Any], value: float) -> bool:
+    """Return whether an input brings a specimen of this model to negative saturation from any state."""
+    return operator.plane is None or (math.isfinite(value) and value <= operator.plane[0])

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.control.inverse import Inverse
 from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
-from bench.controllers import FollowerName, load_model_for, make_follower
-from bench.hysteresis import MemoryCurve, Preisach
-from bench.measurements import read_columns
+from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
+from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
@@ -25,7 +23,9 @@ class Parameters(LoadedParameters):
     """What can be set."""
 
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
-    controller: FollowerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: str = parameter(
+        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('follow'))}"
+    )
     reference: str = parameter("", unit="", help="CSV file with columns `time` and `reference`; a sine if not given")
     low: float = parameter(from_slot("response", "low"), unit=unit_of("response"), help="lowest value of the sine")
     high: float = parameter(from_slot("response", "high"), unit=unit_of("response"), help="highest value of the sine")
@@ -51,8 +51,8 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=response.unit)
     check_reset(model, drive, parameters.reset)
     times, values = _reference(parameters)
-    if isinstance(model.operator, Preisach):
-        slope = fastest_slope(Inverse(model.operator), times, values)
+    if not model.operator.memoryless:
+        slope = fastest_slope(model.operator.inverse(), times, values)
         if not slope.within(parameters.fastest):
             raise ValueError(
                 f"the reference asks for {slope.rate:.2f} {drive.rate_unit} at {slope.time:g} s; the drive follows "
@@ -64,8 +64,9 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     reading = yield from reset(
         slots, parameters.reset, _RESET_SECONDS, load=parameters.load, why=unknown_memory(drive, parameters.reset)
     )
-    state = MemoryCurve.from_negative_saturation(reading[drive.signal])
-    follower = make_follower(parameters.controller, model, limits=limits, state=state)
+    state = model.operator.saturated_state(-1, reading[drive.signal])
+    setup = ControllerSetup(model=model, limits=limits, state=state)
+    follower = make_controller("follow", parameters.controller, setup)
     yield Phase(f"approach, {parameters.controller}")
     # The way to the first value is no part of the reference.
     yield Control(

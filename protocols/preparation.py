@@ -7,7 +7,6 @@ from typing import TypeAlias, TypeVar
 
 from bench.controllers import saturated_below
 from bench.devices import Actuator, Signal
-from bench.model_file import ModelFile
 from bench.protocol import (
     Dwell,
     Message,
@@ -23,6 +22,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
+from bench.results.model_file import ModelFile
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""
@@ -68,7 +68,7 @@ def check_reset(model: ModelFile, drive: Slot, setpoint: float) -> None:
     ValueError
         If it does not.
     """
-    if not saturated_below(model, setpoint):
+    if not saturated_below(model.operator, setpoint):
         raise ValueError(
             f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; choose it lower"
         )

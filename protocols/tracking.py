@@ -9,14 +9,14 @@ import numpy as np
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
 from bench.controllers import (
-    Policy,
-    TargetControllerName,
+    ControllerSetup,
+    controller_names,
     load_model_for,
-    make_target_controller,
+    make_controller,
 )
-from bench.hysteresis import MemoryCurve
-from bench.measurements import read_columns
+from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
 
@@ -29,7 +29,9 @@ class Parameters(LoadedParameters):
     """What can be set."""
 
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
-    controller: TargetControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: str = parameter(
+        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('target'))}"
+    )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
     targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")
     low: float = parameter(
@@ -70,10 +72,9 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     reading = yield from reset(
         slots, parameters.reset, _RESET_SECONDS, load=parameters.load, why=unknown_memory(drive, parameters.reset)
     )
-    state = MemoryCurve.from_negative_saturation(reading[drive.signal])
-    controller = make_target_controller(
-        parameters.controller, model, limits=limits, policy=parameters.policy, state=state
-    )
+    state = model.operator.saturated_state(-1, reading[drive.signal])
+    setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state)
+    controller = make_controller("target", parameters.controller, setup)
     yield Phase(parameters.controller)
     errors: list[float] = []
     seconds: list[float] = []

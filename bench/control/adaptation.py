@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.hysteresis.inverse import PreisachInverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,9 @@ class Adapter:
         object.__setattr__(self, "noise", noise)
 
     @cached_property
-    def inverse(self) -> Inverse:
+    def inverse(self) -> PreisachInverse:
         """The exact inverse of the present model."""
-        return Inverse(self.model, self.policy)
+        return PreisachInverse(self.model, self.policy)
 
     def update(self, value: float, output: float | None) -> Adapter:
         """Return the adapter after the input moved monotonically to `value` and `output` was measured there.

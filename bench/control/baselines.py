@@ -1,28 +1,25 @@
-"""Controllers without hysteresis model: the comparisons that show what an inverse is worth."""
+"""Controllers without a hysteresis model, for comparison with those that invert one."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from bench.control.inverse import Reach
-from bench.control.tracking import Reading, Script, Scripted, Trace, check_positive
-from bench.hysteresis import Polynomial
+from bench.control.tracking import Sample, Script, Scripted, Trace, check_positive
+from bench.hysteresis import Operator, Reach
+from bench.hysteresis.inverse import TableInverse
 
 
 class LookUp(Scripted):
-    """Sets what the single-valued inverse of a polynomial says: the model without hysteresis, for comparison.
+    """Sets what the single-valued inverse of a model without hysteresis says, for comparison.
 
-    A polynomial need not be monotone. The table is its running maximum from the lowest point of the range up
-    to the highest one (running minimum, if the lowest comes after the highest), which has one input for each
-    output. Targets beyond are given the input of the lowest or highest point, and `reach` says so.
+    Targets beyond its table (see `TableInverse`) are given the input of the lowest or highest point, and `reach`
+    says so.
 
     Parameters
     ----------
-    polynomial : Polynomial
-        The model.
+    model : Operator
+        The model, without memory.
     limits : tuple of float or None
         Least and greatest set-point, input units; default the range of the model. The table spans no more.
     wait : float
@@ -35,7 +32,7 @@ class LookUp(Scripted):
 
     def __init__(
         self,
-        polynomial: Polynomial,
+        model: Operator[None],
         limits: tuple[float, float] | None = None,
         *,
         wait: float = 8.0,
@@ -43,30 +40,19 @@ class LookUp(Scripted):
     ) -> None:
         if not 0.0 < wait < math.inf:
             raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
-        if points < 2:
-            raise ValueError(f"points: expected at least 2, got {points}")
-        super().__init__(polynomial.input_range, limits)
-        self._polynomial = polynomial
+        super().__init__(model.input_range, limits)
         self._wait = wait
-        inputs = np.linspace(*self.limits, points)
-        outputs = polynomial.evaluate(inputs)
-        lowest, highest = int(outputs.argmin()), int(outputs.argmax())
-        step = 1 if lowest <= highest else -1
-        rising = slice(lowest, highest + step if highest + step >= 0 else None, step)
-        envelope = np.maximum.accumulate(outputs[rising])
-        # Of a level stretch only the first input: one input for each output.
-        rows = np.flatnonzero(np.concatenate([[True], np.diff(envelope) > 0.0]))
-        self._outputs, self._inputs, self._rows = envelope[rows], inputs[rising][rows], rows
+        self._table = TableInverse(model, self.limits, points)
         self._measured = math.nan
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        low, high = self._polynomial.input_range
-        # Outside its range a polynomial says nothing of the actuator.
+        """Internal values at present."""
+        low, high = self._table.operator.input_range
+        # Outside its range the model says nothing of the actuator.
         known = low <= self._measured <= high
-        predicted = self._polynomial.evaluate([self._measured]).item() if known else math.nan
-        return Trace(reference=self._target, predicted=predicted)
+        predicted = self._table.operator.evaluate([self._measured]).item() if known else math.nan
+        return Trace(reference=self._reference, predicted=predicted)
 
     def _observe(self, measured_input: float) -> bool:
         known = super()._observe(measured_input)
@@ -74,21 +60,8 @@ class LookUp(Scripted):
             self._measured = measured_input
         return known
 
-    def look_up(self, target: float) -> tuple[float, Reach]:
-        """Return the input of a target in output units, within the table, and whether the table holds it."""
-        reach = Reach.MET
-        if target > self._outputs[-1]:
-            reach = Reach.TOO_HIGH
-        elif target < self._outputs[0]:
-            reach = Reach.TOO_LOW
-        after = int(np.searchsorted(self._outputs, target))
-        if 0 < after < self._rows.size and self._rows[after] > self._rows[after - 1] + 1:
-            # Between the ends of a level stretch there is nothing to interpolate.
-            return self._inputs[after].item(), reach
-        return float(np.interp(target, self._outputs, self._inputs)), reach
-
-    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
-        setpoint, self._reach = self.look_up(target)
+    def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
+        setpoint, self._reach = self._table.look_up(target)
         yield self._command(setpoint, self._wait)
         yield from self._hold(self._poll)
 
@@ -121,7 +94,7 @@ class IntegralParameters:
 
 
 class IntegralControl(Scripted):
-    """Integral action without a model: the comparison for what the inverse is worth.
+    """Integral action without a model, for comparison with the inverse.
 
     The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
     error turns: it cannot wind up.
@@ -138,12 +111,7 @@ class IntegralControl(Scripted):
         super().__init__(limits)
         self._parameters = parameters or IntegralParameters()
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        return Trace(reference=self._target)
-
-    def _run(self, target: float, reading: Reading) -> Script:
+    def _run(self, target: float, reading: Sample) -> Script:
         p = self._parameters
         for _ in range(max(1, round(p.duration / p.period))):
             error = target - reading.output

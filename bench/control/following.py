@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse, Reach
-from bench.control.tracking import Actuator, Trace, check_positive
-from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.control.tracking import ControllerBase, check_positive
+from bench.hysteresis import Inverse, Reach, _checks
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,8 @@ class FollowingParameters:
             raise ValueError(f"lead: expected a number of periods, at least 0, got {self.lead}")
 
 
-class _Follower(Actuator, ABC):
-    """What the followers share: the last reference and what was made of it."""
-
-    def __init__(
-        self,
-        input_range: tuple[float, float],
-        limits: tuple[float, float] | None = None,
-        model: Preisach | None = None,
-        state: MemoryCurve | None = None,
-    ) -> None:
-        super().__init__(input_range, limits, model, state)
-        self._reference = math.nan
+class _Follower(ControllerBase, ABC):
+    """What the followers share: one step at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
         """Take in a reading and return the set-point for the coming period.
@@ -84,25 +74,23 @@ class _Follower(Actuator, ABC):
 
 
 class OpenLoopFollower(_Follower):
-    """Sets what the exact inverse says of the reference, ahead by the input's lag.
+    """Sets the inverse of the reference, ahead by the input's lag.
 
     Parameters
     ----------
     inverse : Inverse
-        Exact inverse of the identified model. Of an answer with two elements the first is set; the next
+        Inverse of the identified model. Of an answer with two elements the first is set; the next
         period is asked anew, so that the second follows when the actuator has come there.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower; only `lead` is used.
     """
 
     def __init__(
         self,
-        inverse: Inverse,
-        state: MemoryCurve | None = None,
+        inverse: Inverse[Any],
+        state: Any = None,  # noqa: ANN401 - each operator has its own
         limits: tuple[float, float] | None = None,
         parameters: FollowingParameters | None = None,
     ) -> None:
@@ -110,17 +98,10 @@ class OpenLoopFollower(_Follower):
         self._inverse = inverse
         self._parameters = parameters or FollowingParameters()
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        assert self._state is not None
-        return Trace(reference=self._reference, predicted=self._inverse.operator.value(self._state))
-
     def _answer_to(self, step: float, output: float) -> float:  # noqa: ARG002
         return self._inverted(step, 0.0)
 
     def _inverted(self, step: float, disturbance: float) -> float:
-        assert self._state is not None
         target = self._reference - disturbance
         wished = target + self._parameters.lead * step
         found = self._inverse.invert(self._state, wished)
@@ -128,7 +109,7 @@ class OpenLoopFollower(_Follower):
             # Not for the sake of an extrapolation: a passage through saturation is far, and may be needless.
             wished = target
             found = self._inverse.invert(self._state, wished)
-        return self._answer(self._inverse.operator, found, wished)[0]
+        return self._answer(found, wished)[0]
 
 
 class ClosedLoopFollower(OpenLoopFollower):
@@ -142,50 +123,32 @@ class ClosedLoopFollower(OpenLoopFollower):
     ----------
     inverse : Inverse
         Exact inverse of the identified model; see `OpenLoopFollower` for answers with two elements.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower.
     """
 
     def __init__(
         self,
-        inverse: Inverse,
-        state: MemoryCurve | None = None,
+        inverse: Inverse[Any],
+        state: Any = None,  # noqa: ANN401 - each operator has its own
         limits: tuple[float, float] | None = None,
         parameters: FollowingParameters | None = None,
     ) -> None:
         super().__init__(inverse, state, limits, parameters)
-        self._estimator = DisturbanceEstimator(
+        self._estimator: DisturbanceEstimator = DisturbanceEstimator(
             walk_variance=self._parameters.walk_variance, reading_variance=self._parameters.reading_variance
         )
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        assert self._state is not None
-        disturbance = self._estimator.value
-        return Trace(
-            reference=self._reference,
-            predicted=self._inverse.operator.value(self._state) + disturbance,
-            disturbance=disturbance,
-            uncertainty=self._estimator.uncertainty,
-        )
-
     def _answer_to(self, step: float, output: float) -> float:
-        assert self._state is not None
         known = self._is_known(output)
-        self._estimator.update(output - self._inverse.operator.value(self._state) if known else None)
+        self._estimator.update(output - self._modelled() if known else None)
         return self._inverted(step, self._estimator.value)
 
 
 class IntegralFollower(_Follower):
-    """Integral action without a model: the comparison for what the inverse is worth.
-
-    The integrator is the set-point itself, so that it stops at the limits and leaves them at once when the
-    error turns: it cannot wind up.
+    """Integral action without a model, as `IntegralControl`.
 
     Parameters
     ----------
@@ -198,11 +161,6 @@ class IntegralFollower(_Follower):
     def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
         super().__init__(limits)
         self._parameters = parameters or IntegralParameters()
-
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        return Trace(reference=self._reference)
 
     def _answer_to(self, step: float, output: float) -> float:
         if not self._is_known(output):

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse
 from bench.control.tracking import (
     Arrival,
     Correcting,
     CorrectionParameters,
     Move,
-    Reading,
+    Sample,
     Script,
     check_positive,
 )
 from bench.hysteresis import MemoryCurve, Preisach
+from bench.hysteresis.inverse import PreisachInverse
 
 Direction = Literal[-1, 1]
 
@@ -135,10 +135,8 @@ class Latched(Correcting):
     inverse : Inverse
         Exact inverse of the identified model, which must have a reversible part: its slope is what a
         locked actuator answers with.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : LatchParameters
         Numbers of the lock.
     correction : CorrectionParameters
@@ -152,7 +150,7 @@ class Latched(Correcting):
 
     def __init__(
         self,
-        inverse: Inverse,
+        inverse: PreisachInverse,
         state: MemoryCurve | None = None,
         limits: tuple[float, float] | None = None,
         parameters: LatchParameters | None = None,
@@ -164,6 +162,7 @@ class Latched(Correcting):
         self._parameters = parameters or LatchParameters()
         self._poll = self._parameters.arrival.poll
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
+        self._operator = inverse.operator
         self._extreme: float | None = None
         self._direction: Direction = 1
         self._tries = 0
@@ -191,7 +190,7 @@ class Latched(Correcting):
             self._extreme = max(self._direction * self._extreme, self._direction * measured_input) * self._direction
         return known
 
-    def _run(self, target: float, reading: Reading) -> Script:
+    def _run(self, target: float, reading: Sample) -> Script:
         p = self._parameters
         self._extreme, self._locked, self._tries = None, False, 0
         low, high = self._saturated
@@ -208,12 +207,12 @@ class Latched(Correcting):
             yield from self._correct(target)
         yield from self._hold(self._poll)
 
-    def _latch(self, target: float, reading: Reading) -> Move:
+    def _latch(self, target: float, reading: Sample) -> Move:
         """Try to lock from one side."""
         p = self._parameters
         direction = self._direction
 
-        def left(reading: Reading) -> float:
+        def left(reading: Sample) -> float:
             """Return the part of the way that is left, output units; negative beyond the target."""
             return direction * (target - reading.output)
 
@@ -224,12 +223,12 @@ class Latched(Correcting):
             if setpoint is None:
                 return reading
             reading = yield from self._arrive(setpoint, p.arrival)
-            self._estimator.update(reading.output - self._model())
+            self._estimator.update(reading.output - self._modelled())
 
         for _ in range(round(p.creep_limit / self._poll)):
             if left(reading) <= p.creep_until:
                 break
-            ahead = self._ahead(self._model() + direction * left(reading))
+            ahead = self._ahead(self._modelled() + direction * left(reading))
             if ahead is None:
                 return reading
             rate = max(p.creep_least + p.creep_gain * (left(reading) - p.creep_offset), p.creep_least)
@@ -248,7 +247,7 @@ class Latched(Correcting):
         assert self._extreme is not None
         locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
         origin = setpoint = self._behind(self._extreme - self._direction * p.step_back)
-        slope = reversible_slope(self._inverse.operator, origin)
+        slope = reversible_slope(self._operator, origin)
         for move in range(p.fine_moves + 1):
             for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
                 reading = yield self._command(setpoint, self._poll)
@@ -272,8 +271,7 @@ class Latched(Correcting):
 
     def _ahead(self, target: float) -> float | None:
         """Return the input of the model's output `target` in the present direction, None beyond the limits."""
-        assert self._state is not None
-        found = walk(self._inverse.operator, self._state, self._direction, target)
+        found = walk(self._operator, self._state, self._direction, target)
         return found if found is not None and self._low < found < self._high else None
 
 

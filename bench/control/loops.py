@@ -1,4 +1,4 @@
-"""Loops: what a bench carries out sample by sample, made of a controller and what it has to reach or follow."""
+"""Control tasks: a controller and what it has to reach or follow, carried out sample by sample."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHORTEST_WAIT = 1e-3
 """Least time between two commands of a loop that is late, s."""
 
 
-class Loop(Protocol):
+class ControlTask(Protocol):
     """A controller at work: asked for a command at its beginning and after each reading, until it is done.
 
     Beside input and output it is given whatever further signals its `Control` names, in that order.
@@ -26,7 +26,7 @@ class Loop(Protocol):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
+        """Internal values at present."""
 
 
 class SampledController(Protocol):
@@ -40,7 +40,7 @@ class SampledController(Protocol):
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks."""
+        """Internal values at present."""
 
 
 class Playback:
@@ -160,5 +160,5 @@ class FollowReference:
 
     @property
     def trace(self) -> Trace:
-        """What the controller thinks, with the reference of the moment of the last reading."""
+        """Internal values, with the reference at the time of the last reading."""
         return replace(self._follower.trace, reference=self._reference(self._now))

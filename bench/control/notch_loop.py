@@ -45,8 +45,7 @@ def notch(frequency: float, rate: float, zero_damping: float, pole_damping: floa
         raise ValueError(f"frequency: expected rad/s between 0 and pi times the rate {rate:g} Hz, got {frequency:g}")
     if not _checks.number("zero_damping", zero_damping) >= 0.0:
         raise ValueError(f"zero_damping: expected a number >= 0, got {zero_damping}")
-    if not _checks.number("pole_damping", pole_damping) > 0.0:
-        raise ValueError(f"pole_damping: expected a positive number, got {pole_damping}")
+    _checks.positive("pole_damping", pole_damping)
     # s/ω becomes c (z - 1)/(z + 1).
     c = 1.0 / math.tan(0.5 * frequency / rate)
     numerator, denominator = (

@@ -36,7 +36,7 @@ class PlayInverse:
             raise ValueError("hysteresis: expected an operator of plays alone, got one with dead zones")
         if not stroke > 0.0:
             raise ValueError(f"stroke: expected a positive number, got {stroke}")
-        inverse = operator.inverse()
+        inverse = operator.inverse_operator()
         self._offset = inverse.bias
         self._thresholds: list[float] = inverse.thresholds.tolist()
         self._weights: list[float] = inverse.weights.tolist()

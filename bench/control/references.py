@@ -6,15 +6,15 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.control.inverse import Inverse
-from bench.hysteresis import MemoryCurve, _checks
+from bench.hysteresis import Inverse, _checks
 from bench.hysteresis._checks import Floats
 
+S = TypeVar("S")
 Reference: TypeAlias = Callable[[float], float]
 """Wanted output at a time in s from the start; also defined before 0 and after the end."""
 
@@ -253,9 +253,7 @@ class Slope:
         return self.rate <= limit
 
 
-def fastest_slope(
-    inverse: Inverse, times: ArrayLike, reference: ArrayLike, state: MemoryCurve | None = None
-) -> Slope:
+def fastest_slope(inverse: Inverse[S], times: ArrayLike, reference: ArrayLike, state: S | None = None) -> Slope:
     """Return the input rate that a moving reference asks for, by inverting it.
 
     A step from the present output to the start of the reference does not count, nor do the two samples about
@@ -270,8 +268,8 @@ def fastest_slope(
         Increasing times, s, N >= 3.
     reference : array_like, shape (N,)
         Reference at these times, output units.
-    state : MemoryCurve or None
-        Memory before the reference; default negative saturation.
+    state : object or None
+        Memory before the reference; default that of the model.
 
     Raises
     ------

@@ -7,15 +7,14 @@ a fixed rate with a reference that moves.
 Rules for all of them:
 
 * Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
-* The memory of the hysteresis is moved by what the actuator did, the measured input of every call, not by
-  what was wished (`state`).
+* The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point.
 * A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
   next complete reading, estimators take no value in. A missing output does not keep the memory from following
   the measured input. Controllers with a hysteresis model also take for missing what is further outside the
-  model's range than that is wide. How long to put up with missing readings is for the caller to say.
+  model's range than that is wide. The caller decides how long missing readings are tolerated.
 * A target that cannot be met is replaced by the closest output, and `reach` says so.
-* Between targets the set-point belongs to the controller: who moves the actuator by other means makes a new
-  controller, from the memory that it has then.
+* Between targets the set-point belongs to the controller. After the actuator was moved by other means, make a new
+  controller from the memory that it has then.
 
 The inverse and its use in open loop: Zhang, Merced, Sepúlveda, Tan, *Modeling and inverse compensation of
 nonmonotonic hysteresis in VO2-coated microactuators*, IEEE/ASME Transactions on Mechatronics, 2013.
@@ -27,11 +26,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass, fields
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Inverse, Inversion, Reach
-from bench.hysteresis import MemoryCurve, Preisach, _checks
+from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
 
 # Part of the output at stake within which a clipped answer still counts as met.
 _CLOSE = 1e-9
@@ -39,7 +37,7 @@ _CLOSE = 1e-9
 
 @dataclass(frozen=True)
 class Command:
-    """What a controller wants next.
+    """The next set-point of a controller.
 
     Parameters
     ----------
@@ -58,7 +56,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a controller thinks, for the record and the live view; nan where it has no opinion.
+    """Internal values of a controller, for the record and the live view; nan where it has none.
 
     Parameters
     ----------
@@ -78,7 +76,26 @@ class Trace:
     uncertainty: float = math.nan
 
 
-class TargetController(Protocol):
+class Controller(Protocol):
+    """What the record asks of every controller."""
+
+    @property
+    def trace(self) -> Trace:
+        """Internal values at present."""
+        ...
+
+    @property
+    def state(self) -> Any:  # noqa: ANN401 - each operator has its own
+        """Memory of the actuator as the controller knows it; None if it keeps none."""
+        ...
+
+    @property
+    def reach(self) -> Reach:
+        """Whether the present target or reference can be met."""
+        ...
+
+
+class TargetController(Controller, Protocol):
     """Brings the output to one target after another.
 
     `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
@@ -92,23 +109,8 @@ class TargetController(Protocol):
         """Take in a reading, `Command.wait` after the last or later, and return the next command."""
         ...
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        ...
 
-    @property
-    def state(self) -> MemoryCurve | None:
-        """Memory of the actuator as the controller knows it; None if it keeps none."""
-        ...
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present target can be met."""
-        ...
-
-
-class Follower(Protocol):
+class Follower(Controller, Protocol):
     """Makes the output follow a reference that moves; called at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
@@ -127,23 +129,8 @@ class Follower(Protocol):
         """
         ...
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        ...
 
-    @property
-    def state(self) -> MemoryCurve | None:
-        """Memory of the actuator as the controller knows it; None if it keeps none."""
-        ...
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present reference can be met."""
-        ...
-
-
-class Reading(NamedTuple):
+class Sample(NamedTuple):
     """One complete reading: time in s, measured input, output."""
 
     time: float
@@ -151,10 +138,10 @@ class Reading(NamedTuple):
     output: float
 
 
-Script = Generator[Command, Reading, None]
+Script = Generator[Command, Sample, None]
 """What a controller does for one target: yields commands, is sent readings, goes on holding for ever."""
 
-Move = Generator[Command, Reading, Reading]
+Move = Generator[Command, Sample, Sample]
 """A part of a script, which returns its last reading."""
 
 
@@ -191,8 +178,8 @@ def check_positive(parameters: object, *names: str) -> None:
             raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
-class Actuator:
-    """What every controller keeps: limits, memory, the last set-point, whether the target can be met.
+class ControllerBase:
+    """Base of the controllers: limits, memory, reference, the last set-point, and whether the target can be met.
 
     Parameters
     ----------
@@ -200,10 +187,10 @@ class Actuator:
         Range of the set-points, input units.
     limits : tuple of float or None
         A narrower range, input units.
-    model : Preisach or None
+    model : Operator or None
         The model whose memory is kept.
-    state : MemoryCurve or None
-        Memory at the first reading; default the model's initial one.
+    state : object or None
+        Memory at the first reading, a state of the model; default the model's initial one.
 
     Raises
     ------
@@ -211,12 +198,14 @@ class Actuator:
         If the limits do not increase or have nothing in common with the range.
     """
 
+    _estimator: DisturbanceEstimator | None = None
+
     def __init__(
         self,
         input_range: tuple[float, float],
         limits: tuple[float, float] | None = None,
-        model: Preisach | None = None,
-        state: MemoryCurve | None = None,
+        model: Operator[Any] | None = None,
+        state: Any = None,  # noqa: ANN401 - each operator has its own
     ) -> None:
         low, high = _checks.increasing("limits", input_range).tolist()
         if limits is not None:
@@ -225,18 +214,36 @@ class Actuator:
             if low >= high:
                 raise ValueError(f"limits: expected an overlap with the range {input_range}, got {limits}")
         self._low, self._high = float(low), float(high)
-        self._state = state
+        self._model, self._state = model, state
         self._plausible_input = self._plausible_output = (-math.inf, math.inf)
+        present = 0.5 * (low + high)
         if model is not None:
             self._state = model.initial_state() if state is None else state
+            present = model.present_input(self._state)
             self._plausible_input = widened(*model.input_range)
             self._plausible_output = widened(*model.output_range())
-        self._setpoint = self._clip(0.5 * (low + high) if self._state is None else self._state.input)
-        self._started = self._state is not None
+        self._setpoint = self._clip(present)
+        self._started = model is not None
         self._reach = Reach.MET
+        self._reference = math.nan
 
     @property
-    def state(self) -> MemoryCurve | None:
+    def trace(self) -> Trace:
+        """Internal values at present."""
+        if self._model is None:
+            return Trace(reference=self._reference)
+        if self._estimator is None:
+            return Trace(reference=self._reference, predicted=self._modelled())
+        disturbance = self._estimator.value
+        return Trace(
+            reference=self._reference,
+            predicted=self._modelled() + disturbance,
+            disturbance=disturbance,
+            uncertainty=self._estimator.uncertainty,
+        )
+
+    @property
+    def state(self) -> Any:  # noqa: ANN401
         """Memory of the actuator as the controller knows it; None if it keeps none."""
         return self._state
 
@@ -258,8 +265,8 @@ class Actuator:
         low, high = self._plausible_input
         if not (math.isfinite(measured_input) and low <= measured_input <= high):
             return False
-        if self._state is not None:
-            self._state = self._state.step(measured_input)
+        if self._model is not None:
+            self._state, _ = self._model.step(self._state, measured_input)
         if not self._started:
             # Without a memory, the first reading says where the actuator is.
             self._setpoint, self._started = self._clip(measured_input), True
@@ -270,12 +277,17 @@ class Actuator:
         low, high = self._plausible_output
         return math.isfinite(output) and low <= output <= high
 
-    def _answer(self, operator: Preisach, found: Inversion, target: float) -> tuple[float, ...]:
+    def _modelled(self) -> float:
+        """Return the model's output after what the actuator did."""
+        assert self._model is not None
+        return self._model.value(self._state)
+
+    def _answer(self, found: Inversion[Any], target: float) -> tuple[float, ...]:
         """Return the set-points of an inversion within the limits, and note whether they meet the target."""
         setpoints = tuple(self._clip(value) for value in found.setpoints)
         self._reach = found.reach
-        if setpoints != found.setpoints and self._state is not None:
-            short = target - float(operator.evaluate(setpoints, self._state)[-1])
+        if setpoints != found.setpoints and self._model is not None:
+            short = target - float(self._model.evaluate(setpoints, self._state)[-1])
             if abs(short) > _CLOSE * (abs(target) + 1.0):
                 self._reach = Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
         return setpoints
@@ -286,7 +298,7 @@ def widened(low: float, high: float) -> tuple[float, float]:
     return 2.0 * low - high, 2.0 * high - low
 
 
-class Scripted(Actuator, ABC):
+class Scripted(ControllerBase, ABC):
     """A target controller as a script: a generator that yields commands and is sent readings."""
 
     _poll = 0.1
@@ -296,11 +308,10 @@ class Scripted(Actuator, ABC):
         self,
         input_range: tuple[float, float],
         limits: tuple[float, float] | None = None,
-        model: Preisach | None = None,
-        state: MemoryCurve | None = None,
+        model: Operator[Any] | None = None,
+        state: Any = None,  # noqa: ANN401 - each operator has its own
     ) -> None:
         super().__init__(input_range, limits, model, state)
-        self._target = math.nan
         self._script: Script | None = None
         self._done = False
 
@@ -323,7 +334,7 @@ class Scripted(Actuator, ABC):
         ValueError
             If the target is not finite.
         """
-        self._target = _checks.number("target", target)
+        self._reference = _checks.number("target", target)
         self._script, self._done, self._reach = None, False, Reach.MET
         return self.update(t, measured_input, output)
 
@@ -335,14 +346,14 @@ class Scripted(Actuator, ABC):
         RuntimeError
             If there is no target yet.
         """
-        if math.isnan(self._target):
+        if math.isnan(self._reference):
             raise RuntimeError("update: expected a target first, by aim")
         known = self._observe(measured_input)
         if not known or (self._needs_output and not self._is_known(output)):
             return Command(self._setpoint, self._poll, self._done)
-        reading = Reading(t, measured_input, output)
+        reading = Sample(t, measured_input, output)
         if self._script is None:
-            self._script = self._run(self._target, reading)
+            self._script = self._run(self._reference, reading)
             command = next(self._script)
         else:
             command = self._script.send(reading)
@@ -350,7 +361,7 @@ class Scripted(Actuator, ABC):
         return command
 
     @abstractmethod
-    def _run(self, target: float, reading: Reading) -> Script:
+    def _run(self, target: float, reading: Sample) -> Script:
         """Return the script that leads to a target."""
 
     def _command(self, setpoint: float, wait: float, done: bool = False) -> Command:
@@ -381,7 +392,7 @@ class Scripted(Actuator, ABC):
 
 
 class OpenLoopInverse(Scripted):
-    """Sets what the exact inverse says, and waits (Zhang et al. 2013, section V).
+    """Sets the input that the inverse gives, and waits (Zhang et al. 2013, section V).
 
     Where the inverse has two elements the actuator is sent to the first, an end of the transition, waits
     there, and then goes to the second, found again from what the actuator really did.
@@ -390,8 +401,8 @@ class OpenLoopInverse(Scripted):
     ----------
     inverse : Inverse
         Exact inverse of the identified model; its `policy` says which answer is taken.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
+    state : object or None
+        Memory of the actuator at the first reading; default that of the model.
     limits : tuple of float or None
         Least and greatest set-point, input units; default the operating range of the model.
     wait : float
@@ -402,8 +413,8 @@ class OpenLoopInverse(Scripted):
 
     def __init__(
         self,
-        inverse: Inverse,
-        state: MemoryCurve | None = None,
+        inverse: Inverse[Any],
+        state: Any = None,  # noqa: ANN401
         limits: tuple[float, float] | None = None,
         *,
         wait: float = 8.0,
@@ -414,19 +425,11 @@ class OpenLoopInverse(Scripted):
         self._inverse = inverse
         self._wait = wait
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        assert self._state is not None
-        return Trace(reference=self._target, predicted=self._inverse.operator.value(self._state))
-
-    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
-        operator = self._inverse.operator
-        assert self._state is not None
-        first, *rest = self._answer(operator, self._inverse.invert(self._state, target), target)
+    def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
+        first, *rest = self._answer(self._inverse.invert(self._state, target), target)
         yield self._command(first, self._wait)
         if rest:
-            (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
+            (second,) = self._answer(self._inverse.invert(self._state, target), target)[-1:]
             yield self._command(second, self._wait)
         yield from self._hold(self._poll)
 
@@ -469,8 +472,8 @@ class Correcting(Scripted):
 
     def __init__(
         self,
-        inverse: Inverse,
-        state: MemoryCurve | None,
+        inverse: Inverse[Any],
+        state: Any,  # noqa: ANN401
         limits: tuple[float, float] | None,
         parameters: CorrectionParameters,
     ) -> None:
@@ -478,36 +481,17 @@ class Correcting(Scripted):
         self._inverse = inverse
         self._correction = parameters
         self._poll = parameters.arrival.poll
-        self._estimator = DisturbanceEstimator(
+        self._estimator: DisturbanceEstimator = DisturbanceEstimator(
             walk_variance=parameters.walk_variance, reading_variance=parameters.reading_variance
         )
 
-    @property
-    def trace(self) -> Trace:
-        """What the controller thinks at present."""
-        assert self._state is not None
-        disturbance = self._estimator.value
-        return Trace(
-            reference=self._target,
-            predicted=self._inverse.operator.value(self._state) + disturbance,
-            disturbance=disturbance,
-            uncertainty=self._estimator.uncertainty,
-        )
-
-    def _model(self) -> float:
-        """Return the model's output after what the actuator did."""
-        assert self._state is not None
-        return self._inverse.operator.value(self._state)
-
     def _towards(self, target: float) -> Move:
-        """Go where the model has the output at `target`, through saturation if need be."""
-        assert self._state is not None
-        operator = self._inverse.operator
+        """Go where the model's output is `target`, through saturation if necessary."""
         arrival = self._correction.arrival
-        first, *rest = self._answer(operator, self._inverse.invert(self._state, target), target)
+        first, *rest = self._answer(self._inverse.invert(self._state, target), target)
         reading = yield from self._arrive(first, arrival)
         if rest:
-            (second,) = self._answer(operator, self._inverse.invert(self._state, target), target)[-1:]
+            (second,) = self._answer(self._inverse.invert(self._state, target), target)[-1:]
             reading = yield from self._arrive(second, arrival)
         return reading
 
@@ -515,7 +499,7 @@ class Correcting(Scripted):
         """Go to the target and correct by the disturbance that is measured where the actuator has come to."""
         reading = yield from self._towards(target - self._estimator.value)
         for _ in range(self._correction.corrections):
-            self._estimator.update(reading.output - self._model())
+            self._estimator.update(reading.output - self._modelled())
             if abs(target - reading.output) <= self._correction.close_enough:
                 break
             reading = yield from self._towards(target - self._estimator.value)
@@ -523,7 +507,7 @@ class Correcting(Scripted):
 
 
 class ClosedLoopInverse(Correcting):
-    """Feedforward by the exact inverse, feedback by the disturbance that it is found to have.
+    """Feedforward by the inverse, feedback by the measured disturbance.
 
     The disturbance z = y - Ω(ψ) of the measured output y against the model's output Ω of the memory ψ goes
     into a Kalman filter of a random walk, d; each set-point is the inverse at target - d. This is an
@@ -534,23 +518,21 @@ class ClosedLoopInverse(Correcting):
     ----------
     inverse : Inverse
         Exact inverse of the identified model.
-    state : MemoryCurve or None
-        Memory of the actuator at the first reading; default negative saturation.
-    limits : tuple of float or None
-        Least and greatest set-point, input units; default the operating range of the model.
+    state, limits
+        As in `OpenLoopInverse`.
     parameters : CorrectionParameters
         Numbers of the loop.
     """
 
     def __init__(
         self,
-        inverse: Inverse,
-        state: MemoryCurve | None = None,
+        inverse: Inverse[Any],
+        state: Any = None,  # noqa: ANN401
         limits: tuple[float, float] | None = None,
         parameters: CorrectionParameters | None = None,
     ) -> None:
         super().__init__(inverse, state, limits, parameters or CorrectionParameters())
 
-    def _run(self, target: float, reading: Reading) -> Script:  # noqa: ARG002
+    def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
         yield from self._correct(target)
         yield from self._hold(self._poll)

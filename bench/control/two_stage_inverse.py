@@ -6,19 +6,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from bench.control.inverse import Inverse, Reach
-from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, _checks
-from bench.hysteresis.prandtl_ishlinskii import PlayState
+from bench.hysteresis import Inverse, Reach, _checks
+from bench.hysteresis.inverse import around, first_where
 from bench.hysteresis.two_stage import Stage, TwoStage, TwoStageState
 
 # Part of an output range within which a target counts as met.
 _TOLERANCE = 1e-10
-# Part of the output scale that a search by bisection takes for rounding.
-_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -46,123 +43,6 @@ class TwoStageInversion:
     reach: Reach
     imposed: Reach
     state: TwoStageState
-
-
-class _Scalar(Protocol):
-    """The inverse of one stage."""
-
-    def invert(
-        self,
-        state: Any,  # noqa: ANN401 - each operator has its own
-        present: float,
-        target: float,
-        bounds: tuple[float, float] | None = None,
-    ) -> float:
-        """Return the input nearest to the present one that meets a target, or else comes closest.
-
-        The bounds replace the operating range; a saturated operator may leave them aside.
-        """
-        ...
-
-
-class _PreisachInverse:
-    """By walking over quadratic segments."""
-
-    def __init__(self, name: str, operator: Preisach) -> None:
-        self.inverse = Inverse(operator)
-        # With a density of either sign the end points of a move would not tell what the next stage saw.
-        if not self.inverse._monotone:
-            raise ValueError(f"{name}: expected an operator that rises with its input, got a falling part")
-        self.low, self.high = operator.input_range
-        self.range = operator.output_range()
-
-    def invert(
-        self,
-        state: MemoryCurve,
-        present: float,
-        target: float,
-        bounds: tuple[float, float] | None = None,  # noqa: ARG002
-    ) -> float:
-        wanted = min(max(target, self.range[0]), self.range[1])
-        inside = min(max(present, self.low), self.high)
-        found = self.inverse.invert(state.step(inside), wanted).setpoints[-1]
-        # Outside of the operating range nothing moves until the input is back.
-        return present if found == inside else found
-
-
-class _PlayInverse:
-    """By the inverse Prandtl-Ishlinskii operator."""
-
-    def __init__(self, operator: PrandtlIshlinskii) -> None:
-        self.operator, self.inverse = operator, operator.inverse()
-
-    def invert(
-        self, state: PlayState, present: float, target: float, bounds: tuple[float, float] | None = None
-    ) -> float:
-        low, high = _around(present, bounds or self.operator.input_range)
-        if target >= self.operator.step(state, high)[1]:
-            return high
-        if target <= self.operator.step(state, low)[1]:
-            return low
-        found = self.inverse.step(self.operator.inverse_state(state), target)[1]
-        return min(max(found, low), high)
-
-
-class _Bisection:
-    """By bisection, for whatever rises with its input, plateaus included."""
-
-    def __init__(self, name: str, operator: Stage) -> None:
-        self.operator = operator
-        if not isinstance(operator, PrandtlIshlinskii):
-            samples = operator.evaluate(np.linspace(*operator.input_range, 1001))
-            if (np.diff(samples) < -_ROUNDING * np.abs(samples).max()).any():
-                raise ValueError(f"{name}: expected an operator that rises with its input, got a falling part")
-
-    def invert(
-        self,
-        state: Any,  # noqa: ANN401 - each operator has its own
-        present: float,
-        target: float,
-        bounds: tuple[float, float] | None = None,
-    ) -> float:
-        low, high = _around(present, bounds or self.operator.input_range)
-        least, greatest = self.operator.step(state, low)[1], self.operator.step(state, high)[1]
-        tolerance = _ROUNDING * max(abs(least), abs(greatest))
-        wanted = min(max(target, least), greatest)
-        here = self.operator.step(state, present)[1]
-        if abs(wanted - here) <= tolerance:
-            return present
-        sign = 1.0 if wanted > here else -1.0
-        end = high if sign > 0.0 else low
-        return _first(lambda x: sign * (self.operator.step(state, x)[1] - wanted) >= -tolerance, present, end)
-
-
-def _scalar(name: str, operator: Stage) -> _Scalar:
-    if isinstance(operator, Preisach):
-        return _PreisachInverse(name, operator)
-    if isinstance(operator, PrandtlIshlinskii):
-        slopes = [m.slopes.min() for m in (operator.before, operator.after) if m is not None]
-        if min([*slopes, np.cumsum(operator.weights).min()]) > 0.0:
-            return _PlayInverse(operator)
-    return _Bisection(name, operator)
-
-
-def _around(present: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    """Return the bounds, widened to hold the present input: staying must always be possible."""
-    return min(bounds[0], present), max(bounds[1], present)
-
-
-def _first(met: Callable[[float], bool], start: float, end: float) -> float:
-    """Return the number nearest to `start`, on the way to `end`, from which on something is met."""
-    before, after = start, end
-    while True:
-        middle = 0.5 * (before + after)
-        if middle in (before, after):
-            return after
-        if met(middle):
-            after = middle
-        else:
-            before = middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +79,12 @@ class TwoStageInverse:
         _ = self._first, self._second
 
     @cached_property
-    def _first(self) -> _Scalar:
-        return _scalar("first", self.model.first)
+    def _first(self) -> Inverse[Any]:
+        return _rising_inverse("first", self.model.first)
 
     @cached_property
-    def _second(self) -> _Scalar:
-        return _scalar("second", self.model.second)
+    def _second(self) -> Inverse[Any]:
+        return _rising_inverse("second", self.model.second)
 
     @cached_property
     def _tolerances(self) -> tuple[float, float]:
@@ -239,7 +119,7 @@ class TwoStageInverse:
         loaded, _ = self.model.step(state, state.voltage, tension)
         low, high = (self._blocked(state, v) for v in self._voltages(state))
         bounds = tension - high, tension - low
-        argument = self._second.invert(loaded.second, loaded.argument, target, bounds)
+        argument = self._second.nearest_input(loaded.second, loaded.argument, target, bounds)
         voltage = self._voltage(loaded, argument, tension)
         after, reached = self.model.step(loaded, voltage, tension)
         return self._result(after, self._length_flag(reached, target))
@@ -267,8 +147,8 @@ class TwoStageInverse:
         argument, imposed = state.argument, Reach.MET
         if length is not None:
             wanted = _checks.number("length", length)
-            argument = self._second.invert(state.second, state.argument, wanted)
-        voltage = self._first.invert(state.first, state.voltage, target - argument)
+            argument = self._second.nearest_input(state.second, state.argument, wanted)
+        voltage = self._first.nearest_input(state.first, state.voltage, target - argument)
         after, reached = self.model.move(state, voltage, argument)
         if length is not None:
             imposed = self._length_flag(reached, length)
@@ -299,15 +179,15 @@ class TwoStageInverse:
             If a number is not finite.
         """
         target = _checks.number("length", length)
-        argument = self._second.invert(state.second, state.argument, target)
+        argument = self._second.nearest_input(state.second, state.argument, target)
         _, reached = self.model.second.step(state.second, argument)
         if self._length_flag(reached, target) is not Reach.MET:
             # The voltage may take u further than the operating range of the second stage.
             high, low = (self._equilibrium(state, self._blocked(state, v), load) for v in self._voltages(state))
-            argument = self._second.invert(state.second, state.argument, target, (low, high))
+            argument = self._second.nearest_input(state.second, state.argument, target, (low, high))
             _, reached = self.model.second.step(state.second, argument)
         wanted = _checks.number("load", load(reached)) - argument
-        voltage = self._first.invert(state.first, state.voltage, wanted)
+        voltage = self._first.nearest_input(state.first, state.voltage, wanted)
         blocked = self._blocked(state, voltage)
         if abs(blocked - wanted) > self._tolerances[0]:
             argument = self._equilibrium(state, blocked, load)
@@ -336,7 +216,7 @@ class TwoStageInverse:
             If a number is not finite.
         """
         target = _checks.number("length", length)
-        argument = self._second.invert(state.second, state.argument, target)
+        argument = self._second.nearest_input(state.second, state.argument, target)
         after, reached = self.model.move(state, state.voltage if voltage is None else voltage, argument)
         return self._result(after, self._length_flag(reached, target))
 
@@ -362,7 +242,7 @@ class TwoStageInverse:
         """
         argument = state.argument
         if length is not None:
-            argument = self._second.invert(state.second, argument, _checks.number("length", length))
+            argument = self._second.nearest_input(state.second, argument, _checks.number("length", length))
         low, high = self._voltages(state)
         return self._blocked(state, low) + argument, self._blocked(state, high) + argument
 
@@ -389,7 +269,7 @@ class TwoStageInverse:
         # Where u need not move, rounding must not move the voltage either.
         if argument == state.argument:
             return state.voltage
-        return self._first.invert(state.first, state.voltage, force - argument)
+        return self._first.nearest_input(state.first, state.voltage, force - argument)
 
     def _equilibrium(self, state: TwoStageState, blocked: float, load: Callable[[float], float]) -> float:
         """Return u where blocked + u is the load's force at the length H2[u]."""
@@ -398,13 +278,13 @@ class TwoStageInverse:
             force = _checks.number("load", load(self.model.second.step(state.second, u)[1]))
             return blocked + u - force
 
-        low, high = _around(state.argument, self.model.second.input_range)
+        low, high = around(state.argument, self.model.second.input_range)
         # A load that is constant or falling is met somewhere, be it where the second stage is saturated.
         while excess(low) > 0.0:
             low -= high - low
         while excess(high) < 0.0:
             high += high - low
-        return _first(lambda u: excess(u) >= 0.0, low, high)
+        return first_where(lambda u: excess(u) >= 0.0, low, high)
 
     def _length_flag(self, reached: float, target: float) -> Reach:
         return _flag(reached, target, self._tolerances[1])
@@ -418,3 +298,10 @@ def _flag(reached: float, target: float, tolerance: float) -> Reach:
     if math.isclose(reached, target, rel_tol=0.0, abs_tol=tolerance):
         return Reach.MET
     return Reach.TOO_HIGH if target > reached else Reach.TOO_LOW
+
+
+def _rising_inverse(name: str, stage: Stage) -> Inverse[Any]:
+    """Return the inverse of a stage that rises: else the ends of a move would not decide what the next stage saw."""
+    if not stage.rises():
+        raise ValueError(f"{name}: expected an operator that rises with its input, got a falling part")
+    return stage.inverse()

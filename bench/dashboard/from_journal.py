@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ from bench.dashboard.entries import End, Entry, ModelDensity, Tick
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Density
 from bench.journal import Record
-from bench.model_file import FORMAT, is_coupled_model, parse_coupled_model, parse_model
+from bench.results.model_file import is_model, parse_model
 
 
 def rebuild(record: Record, path: Path) -> None:
@@ -38,7 +36,8 @@ def rebuild(record: Record, path: Path) -> None:
     models = [
         ModelDensity(name, density)
         for name, content in record.models().items()
-        for density in _densities(content, f"{record.path}: model {name}")
+        if is_model(content)
+        for density in parse_model(content, f"{record.path}: model {name}").model.densities()
     ]
     try:
         writer = Writer(record.signals, meta, models)
@@ -69,11 +68,3 @@ def _entries(record: Record) -> list[Entry]:
     dated += [((event.t, math.inf, 0), event) for event in record.events()]
     dated.sort(key=lambda entry: entry[0])
     return [entry for _, entry in dated]
-
-
-def _densities(content: object, source: str) -> Iterator[Density]:
-    """Yield the densities of a model's document; none of an unknown one."""
-    if is_coupled_model(content):
-        yield from parse_coupled_model(content, source).model.densities()
-    elif isinstance(content, dict) and content.get("format") == FORMAT:
-        yield from parse_model(content, source).operator.densities()

@@ -56,6 +56,14 @@ def number(name: str, value: Any) -> float:  # noqa: ANN401 - whatever somebody 
     return result
 
 
+def positive(name: str, value: Any) -> float:  # noqa: ANN401
+    """Return `value` as `number` does, > 0."""
+    result = number(name, value)
+    if not result > 0.0:
+        raise ValueError(f"{name}: expected a positive number, got {result}")
+    return result
+
+
 def frozen(array: Floats) -> Floats:
     """Return a read-only copy."""
     copy = array.copy()

@@ -1,107 +1,256 @@
-"""What every hysteresis operator can do."""
+"""The hysteresis operator: the base class of every model from one input to one output."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol, Self, TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.density import Density
+from bench.hysteresis.coverage import Coverage
+from bench.hysteresis.documents import Model
 from bench.hysteresis.regressor import Regressor
+
+if TYPE_CHECKING:
+    from bench.hysteresis.inverse import Inverse, Policy
 
 S = TypeVar("S")
 
+# Samples of the operating range by which the defaults look for extrema and for falling parts.
+_SAMPLES = 1001
 
-class Operator(Protocol[S]):
-    """A model from input to output, immutable apart from a state S that the caller carries along.
 
-    The output is `bias` + regressor @ `coefficients`.
+class Shape(NamedTuple):
+    """Parameters on which the output does not depend linearly: values and bounds, each of shape (n,)."""
+
+    names: tuple[str, ...] = ()
+    values: tuple[float, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+
+
+class Operator(Model, ABC, Generic[S]):
+    """A rate-independent model from input to output, immutable apart from a state S that the caller keeps.
+
+    The output is `bias` + regressor @ `coefficients`. A subclass is a frozen dataclass with a `kind` of its own
+    and at least the fields below. It must define `coefficients`, `with_coefficients`, `initial_state` and `step`;
+    all else has a default that follows from these, and is overridden where something faster or exact is known.
+    A state is a NamedTuple or tuple of numbers, or None; one whose present input is not called `input` overrides
+    `present_input`, one that is not made of numbers `state_to_json` and `state_from_json`.
+
+    Attributes
+    ----------
+    bias : float
+        The constant part of the output, output units.
+    input_range : tuple of float
+        The operating range of the input, input units.
+    input_unit, output_unit : str
+        Units, for labels.
+    memoryless : bool
+        Whether the output depends on the present input alone; the state then is None.
     """
 
+    bias: float
+    input_range: tuple[float, float]
+    input_unit: str
+    output_unit: str
+    memoryless: ClassVar[bool] = False
+
     @property
+    @abstractmethod
     def coefficients(self) -> Floats:
         """The coefficients without the bias, shape (K,)."""
-        ...
 
-    @property
-    def bias(self) -> float:
-        """The constant part of the output, output units."""
-        ...
-
-    @property
-    def input_range(self) -> tuple[float, float]:
-        """The operating range of the input, input units."""
-        ...
-
-    @property
-    def input_unit(self) -> str:
-        """Unit of the input."""
-        ...
-
-    @property
-    def output_unit(self) -> str:
-        """Unit of the output."""
-        ...
-
+    @abstractmethod
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Self:
-        """Return the same operator with other coefficients, shape (K,)."""
-        ...
+        """Return the same operator with other coefficients, shape (K,), and bias.
 
+        Raises
+        ------
+        ValueError
+            If their number is wrong or one is not finite or not possible.
+        """
+
+    @abstractmethod
     def initial_state(self) -> S:
         """Return the state from which identification starts."""
-        ...
+
+    @abstractmethod
+    def step(self, state: S, value: float) -> tuple[S, float]:
+        """Return state and output after the input moved monotonically to `value`.
+
+        Raises
+        ------
+        ValueError
+            If `value` is not finite.
+        """
 
     def evaluate(self, inputs: ArrayLike, state: S | None = None) -> Floats:
-        """Return the outputs of a sequence, shape (N,), from `state` (default: the initial state)."""
-        ...
+        """Return the outputs of a sequence, shape (N,), from `state` (default: the initial state).
 
-    def step(self, state: S, value: float) -> tuple[S, float]:
-        """Return state and output after the input moved monotonically to `value`."""
-        ...
+        Raises
+        ------
+        ValueError
+            If `inputs` is empty, not one-dimensional or not finite.
+        """
+        outputs = []
+        memory = self.initial_state() if state is None else state
+        for value in _checks.samples("inputs", inputs).tolist():
+            memory, output = self.step(memory, value)
+            outputs.append(output)
+        return np.array(outputs)
+
+    def advance(self, state: S, inputs: ArrayLike) -> S:
+        """Return the state after a sequence of inputs, shape (N,); errors as `evaluate`."""
+        for value in _checks.samples("inputs", inputs).tolist():
+            state, _ = self.step(state, value)
+        return state
+
+    def present_input(self, state: S) -> float:
+        """Return the input that a state stands at."""
+        return float(state.input)  # type: ignore[attr-defined]
+
+    def value(self, state: S) -> float:
+        """Return the output of a state."""
+        return self.step(state, self.present_input(state))[1]
+
+    def saturated_state(self, direction: int, value: float | None = None) -> S:
+        """Return the state at an input that was reached from far beyond the other end of the operating range.
+
+        Parameters
+        ----------
+        direction : {-1, 1}
+            Low (-1) or high (1) end of the operating range.
+        value : float or None
+            Input of the state; default that end.
+
+        Raises
+        ------
+        ValueError
+            If `direction` is neither -1 nor 1.
+        """
+        far, end = self._ends(direction)
+        return self.advance(self.initial_state(), [far, end, end if value is None else value])
+
+    def _ends(self, direction: int) -> tuple[float, float]:
+        """Return the end of the operating range that a saturation comes from, and the one that it is at."""
+        if direction not in (-1, 1):
+            raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
+        low, high = self.input_range
+        return (high, low) if direction < 0 else (low, high)
 
     def regressor(self, inputs: ArrayLike, state: S | None = None) -> Regressor:
-        """Return the regressor of a sequence."""
-        ...
+        """Return the matrix R with evaluate(inputs, state) = bias + R @ coefficients; errors as `evaluate`."""
+        units = np.eye(self.coefficients.size)
+        return Regressor.of_columns(
+            np.column_stack([self.with_coefficients(unit, 0.0).evaluate(inputs, state) for unit in units])
+        )
+
+    def nonnegative(self) -> NDArray[np.bool_]:
+        """Return which coefficients must not be negative, shape (K,); by default all."""
+        return np.ones(self.coefficients.size, dtype=bool)
+
+    def shape_parameters(self) -> Shape:
+        """Return the parameters that identification varies beside the coefficients; by default none."""
+        return Shape()
+
+    def with_shape(self, values: Sequence[float]) -> Self:
+        """Return the same operator with other shape parameters, shape (n,)."""
+        if len(values):
+            raise ValueError(f"values: expected none, as a {self.kind} operator has no shape, got {len(values)}")
+        return self
+
+    def shape_starts(self) -> Sequence[Sequence[float]]:
+        """Return the shapes from which their fit starts; the best end is taken. By default the present one."""
+        return [self.shape_parameters().values]
 
     def output_range(self) -> tuple[float, float]:
-        """Return least and greatest output over all reachable states."""
-        ...
+        """Return least and greatest output over all reachable states; by default those of the major loop."""
+        low, high = self.input_range
+        up = np.linspace(low, high, _SAMPLES)
+        outputs = self.evaluate(np.concatenate([up, up[::-1]]), self.saturated_state(-1))
+        return float(outputs.min()), float(outputs.max())
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return the operator's Preisach density, for drawing; nothing if it has none."""
-        ...
+    def rises(self) -> bool:
+        """Return whether the output never falls while the input rises; by default as sampled from the start."""
+        outputs = self.evaluate(np.linspace(*self.input_range, _SAMPLES))
+        return not (np.diff(outputs) < -1e-14 * np.abs(outputs).max()).any()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the operator as a JSON object with a `type`."""
-        ...
+    def inverse(self, policy: Policy = "nearest") -> Inverse[S]:
+        """Return the inverse: numerical by default, by bisection over the pieces on which the output is monotone.
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Return the operator that `to_json` wrote."""
-        ...
+        Parameters
+        ----------
+        policy : {"nearest", "paper"}
+            Which answer is taken where there are several; see `Inverse`.
+        """
+        from bench.hysteresis.inverse import NumericalInverse
+
+        return NumericalInverse(self, policy)
+
+    @property
+    def plane(self) -> tuple[float, float] | None:
+        """The range beyond which no part of the memory remains, input units; None if there is none."""
+        return None
+
+    def unknown_until(self, inputs: ArrayLike) -> int:
+        """Return the first sample from which the inputs, shape (N,), have overwritten all memory they ever do."""
+        if self.memoryless:
+            return 0
+        sequence = _checks.samples("inputs", inputs)
+        top, bottom = np.maximum.accumulate(sequence), np.minimum.accumulate(sequence)
+        low, high = self.plane or (-np.inf, np.inf)
+        # A relay is known once α <= top or β >= bottom: none that will be switched may be left.
+        rising = (top >= min(top[-1], high)) | (bottom <= low)
+        falling = (bottom <= max(bottom[-1], low)) | (top >= high)
+        return int(np.argmax(rising & falling))
+
+    def coverage(self, inputs: ArrayLike, state: S | None = None) -> Coverage | None:  # noqa: ARG002
+        """Return which cells of the plane a sequence sweeps; None for an operator without a plane."""
+        return None
+
+    def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - whatever JSON the operator chooses
+        """Return a state as JSON: by default a list of its numbers, or null."""
+        return None if state is None else list(state)  # type: ignore[call-overload]
+
+    def state_from_json(self, document: Any) -> S:  # noqa: ANN401
+        """Return the state that `state_to_json` wrote.
+
+        Raises
+        ------
+        ValueError
+            If it is no state of this operator.
+        """
+        state: Any = self.initial_state()
+        if state is None:
+            if document is not None:
+                raise ValueError(f"memory: expected none, as a {self.kind} operator keeps none, got {document!r}")
+        elif not isinstance(document, list):
+            raise ValueError(f"memory: expected a list of numbers, got {document!r}")
+        elif len(document) != len(state):
+            raise ValueError(f"memory: expected {len(state)} numbers, got {len(document)}")
+        else:
+            values = [_checks.number("memory", value) for value in document]
+            state = getattr(type(state), "_make", tuple)(values)
+        result: S = state
+        return result
 
 
 def operator_from_json(document: Mapping[str, Any]) -> Operator[Any]:
-    """Return the operator that some operator's `to_json` wrote.
+    """Return the operator that the `to_json` of a registered class wrote.
 
     Raises
     ------
     ValueError
-        If the type is unknown or the object is not what that type expects.
+        If the type is unknown, no operator, or the object is not what that type expects.
     """
-    from bench.hysteresis.polynomial import Polynomial
-    from bench.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-    from bench.hysteresis.preisach import Preisach
+    from bench.hysteresis.models import model_from_json
 
-    kinds: dict[str, type[Preisach] | type[Polynomial] | type[PrandtlIshlinskii]] = {
-        "preisach": Preisach,
-        "polynomial": Polynomial,
-        "prandtl-ishlinskii": PrandtlIshlinskii,
-    }
-    kind = _checks.json_field(document, "type", "operator")
-    if kind not in kinds:
-        raise ValueError(f"operator: expected type {' or '.join(map(repr, kinds))}, got {kind!r}")
-    return kinds[kind].from_json(document)
+    model = model_from_json(document)
+    if not isinstance(model, Operator):
+        raise ValueError(f"operator: expected a model of one input and one output, got the type {document['type']!r}")
+    return model

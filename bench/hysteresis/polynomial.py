@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.density import Density
+from bench.hysteresis.inverse import Policy, TableInverse
+from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
 
 
 @dataclass(frozen=True, eq=False)
-class Polynomial:
+class Polynomial(Operator[None]):
     """A polynomial of the input, as Chebyshev series on the range mapped to [-1, 1].
 
     Parameters
@@ -37,6 +37,8 @@ class Polynomial:
         If the series is empty or not finite, or the range not increasing.
     """
 
+    kind: ClassVar[str] = "polynomial"
+    memoryless: ClassVar[bool] = True
     series: Floats
     input_range: tuple[float, float]
     bias: float = 0.0
@@ -69,6 +71,9 @@ class Polynomial:
     def initial_state(self) -> None:
         """Return None: a polynomial remembers nothing."""
 
+    def advance(self, state: None, inputs: ArrayLike) -> None:
+        """Return None."""
+
     def _mapped(self, inputs: Floats) -> Floats:
         low, high = self.input_range
         return (2.0 * inputs - (low + high)) / (high - low)
@@ -85,14 +90,8 @@ class Polynomial:
     def regressor(self, inputs: ArrayLike, state: None = None) -> Regressor:  # noqa: ARG002
         """Return the columns T1 to Tn."""
         sequence = _checks.samples("inputs", inputs)
-        columns = chebyshev.chebvander(self._mapped(sequence), self.degree)[:, 1:]
-        return Regressor(
-            base=np.empty(0),
-            starts=np.zeros(sequence.size + 1, dtype=np.int64),
-            cells=np.empty(0, dtype=np.int32),
-            changes=np.empty(0),
-            extra=np.ascontiguousarray(columns),
-        )
+        columns = np.asarray(chebyshev.chebvander(self._mapped(sequence), self.degree)[:, 1:], dtype=np.float64)
+        return Regressor.of_columns(columns)
 
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest value on the range: ends and stationary points."""
@@ -104,34 +103,10 @@ class Polynomial:
         values = chebyshev.chebval(points, coefficients)
         return float(values.min()), float(values.max())
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return nothing: the operator has no density on a Preisach plane."""
-        return ()
+    def nonnegative(self) -> NDArray[np.bool_]:
+        """Return False for each coefficient: their signs are free."""
+        return np.zeros(self.degree, dtype=bool)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the polynomial as a JSON object."""
-        return {
-            "type": "polynomial",
-            "series": self.series.tolist(),
-            "input_range": list(self.input_range),
-            "bias": self.bias,
-            "input_unit": self.input_unit,
-            "output_unit": self.output_unit,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Polynomial:
-        """Return the polynomial that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        return cls(
-            _checks.json_field(document, "series", "polynomial"),
-            _checks.json_field(document, "input_range", "polynomial"),
-            _checks.json_field(document, "bias", "polynomial"),
-            document.get("input_unit", ""),
-            document.get("output_unit", ""),
-        )
+    def inverse(self, policy: Policy = "nearest") -> TableInverse:  # noqa: ARG002
+        """Return the look-up table of the polynomial's single-valued inverse."""
+        return TableInverse(self)

@@ -6,15 +6,19 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.density import Density
+from bench.hysteresis.documents import Parts
+from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
+
+if TYPE_CHECKING:
+    from bench.hysteresis.inverse import Inverse, Policy
 
 PlayState: TypeAlias = tuple[float, ...]
 
@@ -120,7 +124,7 @@ class DeadZones:
 
 
 @dataclass(frozen=True, eq=False)
-class PrandtlIshlinskii:
+class PrandtlIshlinskii(Operator[PlayState]):
     """A weighted sum of play operators, with dead zones before or after it where wanted.
 
     With x = before(input - origin), each play keeps a state z = max(x - r, min(x + r, z before)), and
@@ -152,6 +156,11 @@ class PrandtlIshlinskii:
         is negative, a number is not finite, or the range does not increase.
     """
 
+    kind: ClassVar[str] = "prandtl-ishlinskii"
+    parts: ClassVar[Parts] = {
+        "before": DeadZones.from_json,
+        "after": DeadZones.from_json,
+    }
     thresholds: Floats
     weights: Floats
     bias: float = 0.0
@@ -206,8 +215,8 @@ class PrandtlIshlinskii:
         """Return the relaxed state: every play at zero, the input at the origin."""
         return (0.0,) * self.thresholds.size
 
-    def saturated_state(self, direction: int) -> PlayState:
-        """Return the state at the low (-1) or high (1) end of the operating range, entered from far beyond the other.
+    def saturated_state(self, direction: int, value: float | None = None) -> PlayState:
+        """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
 
         Every play then is dragged: at the low end z = x + r, at the high end z = x - r.
 
@@ -216,10 +225,13 @@ class PrandtlIshlinskii:
         ValueError
             If `direction` is neither -1 nor 1.
         """
-        if direction not in (-1, 1):
-            raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
-        end = self._inner(self.input_range[0 if direction < 0 else 1])
-        return tuple([end - direction * r for r in self._lists[0]])
+        _, end = self._ends(direction)
+        x = self._inner(end if value is None else value)
+        return tuple([x - direction * r for r in self._lists[0]])
+
+    def present_input(self, state: PlayState) -> float:
+        """Return the input of a state: where the first play, of threshold 0, stands."""
+        return self.origin + (state[0] if self.before is None else self.before.inverse().value(state[0]))
 
     def _inner(self, value: float) -> float:
         x = value - self.origin
@@ -322,13 +334,7 @@ class PrandtlIshlinskii:
         columns = self._plays(inputs, state)
         if self.after is not None:
             columns = self.after.columns(columns @ self.weights)
-        return Regressor(
-            base=np.empty(0),
-            starts=np.zeros(columns.shape[0] + 1, dtype=np.int64),
-            cells=np.empty(0, dtype=np.int32),
-            changes=np.empty(0),
-            extra=np.ascontiguousarray(columns),
-        )
+        return Regressor.of_columns(columns)
 
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest output that the operating range can produce from the relaxed state.
@@ -354,7 +360,7 @@ class PrandtlIshlinskii:
     def _sums(self) -> Floats:
         return np.asarray(np.cumsum(self.weights))
 
-    def inverse(self) -> PrandtlIshlinskii:
+    def inverse_operator(self) -> PrandtlIshlinskii:
         """Return the operator that gives the input back: itself a Prandtl-Ishlinskii operator.
 
         Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the
@@ -385,7 +391,7 @@ class PrandtlIshlinskii:
         )
 
     def inverse_state(self, state: PlayState) -> PlayState:
-        """Return the state of `inverse()` that belongs to a state of this operator.
+        """Return the state of `inverse_operator()` that belongs to a state of this operator.
 
         z'_i = W_i z_i + sum over j > i of w_j z_j.
 
@@ -399,46 +405,14 @@ class PrandtlIshlinskii:
         beyond = np.append(np.cumsum(weighted[:0:-1])[::-1], 0.0)
         return tuple((self._sums * z + beyond).tolist())
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return nothing: the operator has no density on a Preisach plane."""
-        return ()
+    def rises(self) -> bool:
+        """Return True: running sums of the weights and slopes of the dead zones are not negative."""
+        return True
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the operator as a JSON object."""
-        return {
-            "type": "prandtl-ishlinskii",
-            "thresholds": self.thresholds.tolist(),
-            "weights": self.weights.tolist(),
-            "bias": self.bias,
-            "origin": self.origin,
-            "before": None if self.before is None else self.before.to_json(),
-            "after": None if self.after is None else self.after.to_json(),
-            "input_range": list(self.input_range),
-            "input_unit": self.input_unit,
-            "output_unit": self.output_unit,
-        }
+    def inverse(self, policy: Policy = "nearest") -> Inverse[PlayState]:
+        """Return the exact inverse, or the numerical one if the operator has a plateau."""
+        from bench.hysteresis.inverse import NumericalInverse, PlayInverse
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> PrandtlIshlinskii:
-        """Return the operator that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        kind = "prandtl-ishlinskii"
-        thresholds = _checks.json_field(document, "thresholds", kind)
-        maps = [document.get(key) for key in ("before", "after")]
-        before, after = (None if m is None else DeadZones.from_json(m) for m in maps)
-        return cls(
-            thresholds,
-            _checks.json_field(document, "weights", kind),
-            _checks.json_field(document, "bias", kind),
-            document.get("origin", 0.0),
-            before,
-            after,
-            document.get("input_range"),  # type: ignore[arg-type]
-            document.get("input_unit", ""),
-            document.get("output_unit", ""),
-        )
+        slopes = [zones.slopes.min() for zones in (self.before, self.after) if zones is not None]
+        exact = min([*slopes, self._sums.min()]) > 0.0
+        return PlayInverse(self) if exact else NumericalInverse(self, policy)

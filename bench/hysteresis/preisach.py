@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.coverage import Coverage
 from bench.hysteresis.density import Density
+from bench.hysteresis.documents import Parts
 from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import Reversible, reversible_from_json
+
+if TYPE_CHECKING:
+    from bench.hysteresis.inverse import Policy, PreisachInverse
 
 
 class Segment(NamedTuple):
@@ -50,7 +55,7 @@ class Lattice:
 
 
 @dataclass(frozen=True, eq=False)
-class Preisach:
+class Preisach(Operator[MemoryCurve]):
     """A weighted superposition of hysterons, plus a bias and an optional reversible part.
 
     output = bias + sum over cells of density * (2 on-area - area) + reversible(input): Zhang et al. 2013,
@@ -82,6 +87,8 @@ class Preisach:
         operating range does not contain the plane.
     """
 
+    kind: ClassVar[str] = "preisach"
+    parts: ClassVar[Parts] = {"reversible": reversible_from_json}
     levels: Floats
     density: Floats
     bias: float = 0.0
@@ -164,10 +171,6 @@ class Preisach:
         matrix[np.tril_indices(self.order)] = self.density
         return matrix
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return the density, for drawing."""
-        return (Density("", self.levels, self.density_matrix(), self.input_unit, self.output_unit),)
-
     @cached_property
     def lattice(self) -> Lattice:
         """The tables of prefix sums that the compiled loops read."""
@@ -202,6 +205,15 @@ class Preisach:
         """Return negative saturation: every hysteron off, the input at the low end of the operating range."""
         return MemoryCurve.from_negative_saturation(self.input_range[0])
 
+    def saturated_state(self, direction: int, value: float | None = None) -> MemoryCurve:
+        """Return the memory after saturation at the low (-1) or high (1) end; see `Operator.saturated_state`."""
+        _, end = self._ends(direction)
+        return MemoryCurve((), end if value is None else value, -1 if direction < 0 else 1)
+
+    def advance(self, state: MemoryCurve, inputs: ArrayLike) -> MemoryCurve:
+        """Return the memory after a sequence of inputs, shape (N,)."""
+        return state.advance(inputs)
+
     def _pieces(self, state: MemoryCurve | None) -> tuple[Floats, Floats, float]:
         memory = self.initial_state() if state is None else state
         left, height, present = memory.staircase(float(self.levels[0]), float(self.levels[-1]))
@@ -228,41 +240,18 @@ class Preisach:
         ValueError
             If `inputs` is empty, not one-dimensional or not finite.
         """
-        from bench.hysteresis import _kernels
-
-        t = self.lattice
-        return np.asarray(
-            _kernels.evaluate(
-                _checks.samples("inputs", inputs),
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.below,
-                t.offset,
-                t.breaks,
-                t.quadratics,
-                *self._pieces(state),
-            )
-        )
+        return self._outputs(_checks.samples("inputs", inputs), state)
 
     def value(self, state: MemoryCurve) -> float:
         """Return the output of a state, in a time proportional to its corners."""
+        return float(self._outputs(np.array([state.input]), state)[0])
+
+    def _outputs(self, inputs: Floats, state: MemoryCurve | None) -> Floats:
         from bench.hysteresis import _kernels
 
         t = self.lattice
-        return float(
-            _kernels.evaluate(
-                np.array([state.input]),
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.below,
-                t.offset,
-                t.breaks,
-                t.quadratics,
-                *self._pieces(state),
-            )[0]
-        )
+        tables = t.levels, t.inverse_step, t.table, t.below, t.offset, t.breaks, t.quadratics
+        return np.asarray(_kernels.evaluate(inputs, *tables, *self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
         """Return memory and output after the input moved monotonically to `value`.
@@ -409,38 +398,62 @@ class Preisach:
                     greatest = max(greatest, float((c + x * (b + x * a)).max()))
         return greatest + offset
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the operator as a JSON object."""
-        return {
-            "type": "preisach",
-            "levels": self.levels.tolist(),
-            "density": self.density.tolist(),
-            "bias": self.bias,
-            "reversible": None if self.reversible is None else self.reversible.to_json(),
-            "input_range": list(self.input_range),
-            "input_unit": self.input_unit,
-            "output_unit": self.output_unit,
-        }
+    def rises(self) -> bool:
+        """Return whether the output can only rise with the input, with every memory."""
+        slopes = [0.0]
+        if self.reversible is not None:
+            breaks, quadratics = self.reversible.pieces()
+            low, high = self.input_range
+            bounds = [low, *np.clip(breaks, low, high).tolist(), high]
+            for (_, b, a), ends in zip(quadratics, pairwise(bounds), strict=True):
+                slopes += [b + 2.0 * a * end for end in ends]
+        return bool((self.density >= 0.0).all() and min(slopes) >= 0.0)
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Preisach:
-        """Return the operator that `to_json` wrote.
+    def inverse(self, policy: Policy = "nearest") -> PreisachInverse:
+        """Return the exact inverse."""
+        from bench.hysteresis.inverse import PreisachInverse
+
+        return PreisachInverse(self, policy)
+
+    @property
+    def plane(self) -> tuple[float, float]:
+        """The range of the levels."""
+        return float(self.levels[0]), float(self.levels[-1])
+
+    def nonnegative(self) -> NDArray[np.bool_]:
+        """Return True for the density, and for the reversible part what it says, shape (K + q,)."""
+        signs = np.ones(self.coefficients.size, dtype=bool)
+        signs[self.density.size :] = self.reversible is not None and self.reversible.nonnegative
+        return signs
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return the density on its plane."""
+        return (Density("", self.levels, self.density_matrix(), self.input_unit, self.output_unit),)
+
+    def coverage(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Coverage:
+        """Return which cells of the plane a sequence of inputs sweeps.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (N,)
+            The sequence. The move to the first input does not count: nothing was measured before it.
+        state : MemoryCurve or None
+            Memory before the first input; default negative saturation.
 
         Raises
         ------
         ValueError
-            If a key is missing or wrong.
+            If `inputs` is empty, not one-dimensional or not finite.
         """
-        term = document.get("reversible") if isinstance(document, Mapping) else None
-        return cls(
-            _checks.json_field(document, "levels", "preisach"),
-            _checks.json_field(document, "density", "preisach"),
-            _checks.json_field(document, "bias", "preisach"),
-            None if term is None else reversible_from_json(term),
-            document.get("input_range"),  # type: ignore[arg-type]
-            document.get("input_unit", ""),
-            document.get("output_unit", ""),
-        )
+        return Coverage.of(self.regressor(inputs, state), self.levels)
+
+    def state_to_json(self, state: MemoryCurve) -> dict[str, Any]:
+        """Return the memory curve as a JSON object."""
+        return state.to_json()
+
+    def state_from_json(self, document: Any) -> MemoryCurve:  # noqa: ANN401
+        """Return the memory curve that `state_to_json` wrote; see `MemoryCurve.from_json`."""
+        return MemoryCurve.from_json(document)
 
 
 def uniform_levels(low: float, high: float, intervals: int) -> Floats:

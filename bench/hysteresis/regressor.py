@@ -38,6 +38,17 @@ class Regressor:
     changes: Floats
     extra: Floats
 
+    @classmethod
+    def of_columns(cls, columns: Floats) -> Regressor:
+        """Return a regressor of dense columns alone, shape (N, q)."""
+        return cls(
+            base=np.empty(0),
+            starts=np.zeros(columns.shape[0] + 1, dtype=np.int64),
+            cells=np.empty(0, dtype=np.int32),
+            changes=np.empty(0),
+            extra=np.ascontiguousarray(columns),
+        )
+
     @property
     def shape(self) -> tuple[int, int]:
         """Samples and coefficients."""

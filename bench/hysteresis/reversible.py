@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.documents import Document
 
 
 class Reversible(Protocol):
@@ -44,7 +45,7 @@ class Reversible(Protocol):
 
 
 @dataclass(frozen=True)
-class QuadraticTerm:
+class QuadraticTerm(Document):
     """The reversible term linear (u - origin) + quadratic (u - origin)².
 
     Parameters
@@ -62,6 +63,7 @@ class QuadraticTerm:
         If a number is not finite.
     """
 
+    kind: ClassVar[str] = "quadratic"
     linear: float = 0.0
     quadratic: float | None = None
     origin: float = 0.0
@@ -99,13 +101,9 @@ class QuadraticTerm:
         a, b, u0 = self.quadratic or 0.0, self.linear, self.origin
         return np.empty(0), np.array([[a * u0 * u0 - b * u0, b - 2.0 * a * u0, a]])
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the term as a JSON object."""
-        return {"type": "quadratic", "linear": self.linear, "quadratic": self.quadratic, "origin": self.origin}
-
 
 @dataclass(frozen=True)
-class PolynomialTerm:
+class PolynomialTerm(Document):
     """A reversible term that follows a polynomial of the input, quadratic from knot to knot.
 
     The term is sum over k of series_k T_k(x), with x the input mapped to [-1, 1] and T_k the Chebyshev polynomials,
@@ -128,6 +126,7 @@ class PolynomialTerm:
         If a number is not finite, there is no coefficient, low >= high, or knots < 1.
     """
 
+    kind: ClassVar[str] = "polynomial"
     series: tuple[float, ...]
     low: float
     high: float
@@ -173,11 +172,6 @@ class PolynomialTerm:
         )
         return self._knots()[0], quadratics
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the term as a JSON object."""
-        series = list(self.series)
-        return {"type": "polynomial", "series": series, "low": self.low, "high": self.high, "knots": self.knots}
-
     def _knots(self) -> tuple[Floats, Floats]:
         """Return the inner knots, and all of them."""
         knots = np.linspace(self.low, self.high, self.knots + 1)
@@ -196,7 +190,7 @@ class PolynomialTerm:
 
 
 @dataclass(frozen=True)
-class ThermalExpansion:
+class ThermalExpansion(Document):
     """The thermal term of a film whose phase fraction θ is a ramp: -[k0 (1 - θ) + k1 θ] (T - reference).
 
     θ = clip((T - low) / (high - low), 0, 1): Zhang et al. 2013, eqs. 6, 7 and 11.
@@ -216,6 +210,7 @@ class ThermalExpansion:
         If a number is not finite or low >= high.
     """
 
+    kind: ClassVar[str] = "thermal-expansion"
     k0: float = 0.0
     k1: float = 0.0
     low: float = 30.0
@@ -259,17 +254,6 @@ class ThermalExpansion:
         middle = [(k0 - q * self.low) * t0, q * (t0 + self.low) - k0, -q]
         return np.array([self.low, self.high]), np.array([[k0 * t0, -k0, 0.0], middle, [k1 * t0, -k1, 0.0]])
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the term as a JSON object."""
-        return {
-            "type": "thermal-expansion",
-            "k0": self.k0,
-            "k1": self.k1,
-            "low": self.low,
-            "high": self.high,
-            "reference": self.reference,
-        }
-
 
 def reversible_from_json(document: Mapping[str, Any]) -> Reversible:
     """Return the term that `to_json` wrote.
@@ -281,11 +265,7 @@ def reversible_from_json(document: Mapping[str, Any]) -> Reversible:
     """
     kind = _checks.json_field(document, "type", "reversible")
     fields = {key: value for key, value in document.items() if key != "type"}
-    terms: dict[str, type[QuadraticTerm] | type[PolynomialTerm] | type[ThermalExpansion]] = {
-        "quadratic": QuadraticTerm,
-        "polynomial": PolynomialTerm,
-        "thermal-expansion": ThermalExpansion,
-    }
+    terms = {term.kind: term for term in (QuadraticTerm, PolynomialTerm, ThermalExpansion)}
     if kind not in terms:
         raise ValueError(f"reversible: expected type {' or '.join(map(repr, terms))}, got {kind!r}")
     try:

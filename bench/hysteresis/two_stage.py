@@ -10,9 +10,10 @@ elongated.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,56 +21,82 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.density import Density
-from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.documents import Model, Parts
 from bench.hysteresis.operator import Operator, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
-from bench.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 
 S = TypeVar("S")
 Stage: TypeAlias = Operator[Any]
 
 
-class Coupled(Protocol[S]):
-    """A model from voltage and force to length, immutable apart from a state S that the caller carries along."""
+class Coupled(Model, ABC, Generic[S]):
+    """A model from voltage and force to length, immutable apart from a state S that the caller carries along.
+
+    Attributes
+    ----------
+    pretension : float
+        Force during a reset, force units.
+    """
+
+    pretension: float
 
     @property
+    @abstractmethod
+    def operators(self) -> Mapping[str, Stage]:
+        """The operators by the names that Zhang and Yip 2017 give them."""
+
+    @property
+    @abstractmethod
     def voltage_unit(self) -> str:
         """Unit of the voltage."""
-        ...
 
     @property
+    @abstractmethod
     def force_unit(self) -> str:
         """Unit of the force."""
-        ...
 
     @property
+    @abstractmethod
     def length_unit(self) -> str:
         """Unit of the length."""
-        ...
 
+    @abstractmethod
     def initial_state(self) -> S:
-        """Return the state after a reset: heated to the high end of the voltage, cooled to its low end."""
-        ...
+        """Return the state after a reset under the pretension: heated to the high end of the voltage, then cooled."""
 
+    @abstractmethod
     def step(self, state: S, voltage: float, force: float) -> tuple[S, float]:
-        """Return state and length after force and voltage moved monotonically to new values, force first."""
-        ...
+        """Return state and length after both inputs moved monotonically to new values, force first.
 
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+
+    @abstractmethod
     def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> Floats:
-        """Return the lengths of a sequence, shape (N,), from `state` (default: the initial state)."""
-        ...
+        """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
 
+        Raises
+        ------
+        ValueError
+            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
+        """
+
+    @abstractmethod
     def advance(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> S:
-        """Return the state after a sequence."""
-        ...
+        """Return the state after a sequence; arguments and errors as `evaluate`."""
 
     def densities(self) -> tuple[Density, ...]:
-        """Return the densities of the stages that have one, for drawing."""
-        ...
+        """Return the densities of the operators that have one, titled by their names."""
+        return tuple(
+            replace(density, title=name, measured=name not in self._arguments)
+            for name, operator in self.operators.items()
+            for density in operator.densities()
+        )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object with a `type`."""
-        ...
+    _arguments: ClassVar[tuple[str, ...]] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +127,7 @@ class TwoStageState:
 
 
 @dataclass(frozen=True, eq=False)
-class TwoStage:
+class TwoStage(Coupled[TwoStageState]):
     """The two-stage model: length = H2[force - H1[voltage]] (Zhang and Yip 2017, eq. 6).
 
     H1 is the force over the voltage at resting length (eqs. 3 and 5). Both should rise with their input
@@ -128,6 +155,9 @@ class TwoStage:
         If the units of H1's output and H2's input differ or the pretension is not finite.
     """
 
+    kind: ClassVar[str] = "two-stage"
+    parts: ClassVar[Parts] = {"first": operator_from_json, "second": operator_from_json}
+    _arguments: ClassVar[tuple[str, ...]] = ("H2",)
     first: Stage
     second: Stage
     pretension: float = 0.0
@@ -135,6 +165,11 @@ class TwoStage:
     def __post_init__(self) -> None:
         _agree("second", self.second.input_unit, self.first.output_unit)
         object.__setattr__(self, "pretension", _checks.number("pretension", self.pretension))
+
+    @property
+    def operators(self) -> Mapping[str, Stage]:
+        """The operators by their names in Zhang and Yip 2017."""
+        return {"H1": self.first, "H2": self.second}
 
     @property
     def voltage_unit(self) -> str:
@@ -301,34 +336,6 @@ class TwoStage:
         second = _advanced(self.second, before.second, path[:-1])
         return self._arrived(float(v[-1]), float(f[-1]), first, second, float(blocked[-1]), float(path[-1]))[0]
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return the densities of the stages that have one, for drawing."""
-        return _densities("H1", self.first) + _densities("H2", self.second, measured=False)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        return {
-            "type": "two-stage",
-            "first": self.first.to_json(),
-            "second": self.second.to_json(),
-            "pretension": self.pretension,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> TwoStage:
-        """Return the model that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        return cls(
-            operator_from_json(_checks.json_field(document, "first", "two-stage")),
-            operator_from_json(_checks.json_field(document, "second", "two-stage")),
-            document.get("pretension", 0.0),
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class SummedState:
@@ -341,7 +348,7 @@ class SummedState:
 
 
 @dataclass(frozen=True, eq=False)
-class Summed:
+class Summed(Coupled[SummedState]):
     """The model to compare with: length = H3[force] - H4[voltage] (Zhang and Yip 2017, eq. 8).
 
     The loop over the voltage has the same shape at every force. The order of moves does not matter.
@@ -361,6 +368,11 @@ class Summed:
         If the units of the two outputs differ or the pretension is not finite.
     """
 
+    kind: ClassVar[str] = "summed"
+    parts: ClassVar[Parts] = {
+        "by_force": operator_from_json,
+        "by_voltage": operator_from_json,
+    }
     by_force: Stage
     by_voltage: Stage
     pretension: float = 0.0
@@ -368,6 +380,11 @@ class Summed:
     def __post_init__(self) -> None:
         _agree("by_voltage", self.by_voltage.output_unit, self.by_force.output_unit)
         object.__setattr__(self, "pretension", _checks.number("pretension", self.pretension))
+
+    @property
+    def operators(self) -> Mapping[str, Stage]:
+        """The operators by their names in Zhang and Yip 2017."""
+        return {"H3": self.by_force, "H4": self.by_voltage}
 
     @property
     def voltage_unit(self) -> str:
@@ -394,38 +411,20 @@ class Summed:
         return SummedState(low, self.pretension, by_force, by_voltage)
 
     def step(self, state: SummedState, voltage: float, force: float) -> tuple[SummedState, float]:
-        """Return state and length after both inputs moved monotonically to new values.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
+        """Return state and length after both inputs moved monotonically to new values; see `Coupled.step`."""
         v, f = _checks.number("voltage", voltage), _checks.number("force", force)
         by_force, elongation = self.by_force.step(state.by_force, f)
         by_voltage, contraction = self.by_voltage.step(state.by_voltage, v)
         return SummedState(v, f, by_force, by_voltage), elongation - contraction
 
     def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: SummedState | None = None) -> Floats:
-        """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
-
-        Raises
-        ------
-        ValueError
-            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
-        """
+        """Return the lengths of a sequence; see `Coupled.evaluate`."""
         before = self.initial_state() if state is None else state
         v, f = _pair(voltages, forces)
         return self.by_force.evaluate(f, before.by_force) - self.by_voltage.evaluate(v, before.by_voltage)
 
     def advance(self, voltages: ArrayLike, forces: ArrayLike, state: SummedState | None = None) -> SummedState:
-        """Return the state after a sequence.
-
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
-        """
+        """Return the state after a sequence; see `Coupled.advance`."""
         before = self.initial_state() if state is None else state
         v, f = _pair(voltages, forces)
         return SummedState(
@@ -435,37 +434,9 @@ class Summed:
             _advanced(self.by_voltage, before.by_voltage, v),
         )
 
-    def densities(self) -> tuple[Density, ...]:
-        """Return the densities of the stages that have one, for drawing."""
-        return _densities("H3", self.by_force) + _densities("H4", self.by_voltage)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        return {
-            "type": "summed",
-            "by_force": self.by_force.to_json(),
-            "by_voltage": self.by_voltage.to_json(),
-            "pretension": self.pretension,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Summed:
-        """Return the model that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        return cls(
-            operator_from_json(_checks.json_field(document, "by_force", "summed")),
-            operator_from_json(_checks.json_field(document, "by_voltage", "summed")),
-            document.get("pretension", 0.0),
-        )
-
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class Linear(Coupled[TwoStageState]):
     """The model to compare with: length = H5[force - slope * voltage - offset] (Zhang and Yip 2017, eq. 9).
 
     It is the two-stage model with a straight line as first stage, see `two_stage`.
@@ -491,6 +462,9 @@ class Linear:
         If the slope is negative, a number is not finite or the range does not increase.
     """
 
+    kind: ClassVar[str] = "linear"
+    parts: ClassVar[Parts] = {"operator": operator_from_json}
+    _arguments: ClassVar[tuple[str, ...]] = ("H5",)
     slope: float
     offset: float
     operator: Stage
@@ -518,6 +492,11 @@ class Linear:
         object.__setattr__(self, "pretension", self.two_stage.pretension)
 
     @property
+    def operators(self) -> Mapping[str, Stage]:
+        """The operators by their names in Zhang and Yip 2017."""
+        return {"H5": self.operator}
+
+    @property
     def force_unit(self) -> str:
         """Unit of the force."""
         return self.operator.input_unit
@@ -532,91 +511,16 @@ class Linear:
         return self.two_stage.initial_state()
 
     def step(self, state: TwoStageState, voltage: float, force: float) -> tuple[TwoStageState, float]:
-        """Return state and length after both inputs moved monotonically to new values, force first.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
+        """Return state and length after both inputs moved monotonically to new values; see `Coupled.step`."""
         return self.two_stage.step(state, voltage, force)
 
     def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None) -> Floats:
-        """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
-
-        Raises
-        ------
-        ValueError
-            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
-        """
+        """Return the lengths of a sequence; see `Coupled.evaluate`."""
         return self.two_stage.evaluate(voltages, forces, state)
 
     def advance(self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None) -> TwoStageState:
-        """Return the state after a sequence.
-
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
-        """
+        """Return the state after a sequence; see `Coupled.advance`."""
         return self.two_stage.advance(voltages, forces, state)
-
-    def densities(self) -> tuple[Density, ...]:
-        """Return the densities of the stages that have one, for drawing."""
-        return _densities("H5", self.operator, measured=False)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        return {
-            "type": "linear",
-            "slope": self.slope,
-            "offset": self.offset,
-            "operator": self.operator.to_json(),
-            "input_range": list(self.input_range),
-            "pretension": self.pretension,
-            "voltage_unit": self.voltage_unit,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> Linear:
-        """Return the model that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        return cls(
-            _checks.json_field(document, "slope", "linear"),
-            _checks.json_field(document, "offset", "linear"),
-            operator_from_json(_checks.json_field(document, "operator", "linear")),
-            _checks.json_field(document, "input_range", "linear"),
-            document.get("pretension", 0.0),
-            document.get("voltage_unit", ""),
-        )
-
-
-def coupled_from_json(document: Mapping[str, Any]) -> TwoStage | Summed | Linear:
-    """Return the model among voltage, force and length that its `to_json` wrote.
-
-    Raises
-    ------
-    ValueError
-        If the type is unknown or the object is not what that type expects.
-    """
-    kinds: dict[str, type[TwoStage] | type[Summed] | type[Linear]] = {
-        "two-stage": TwoStage,
-        "summed": Summed,
-        "linear": Linear,
-    }
-    kind = _checks.json_field(document, "type", "coupled model")
-    if kind not in kinds:
-        raise ValueError(f"coupled model: expected type {' or '.join(map(repr, kinds))}, got {kind!r}")
-    return kinds[kind].from_json(document)
-
-
-def _densities(title: str, stage: Stage, *, measured: bool = True) -> tuple[Density, ...]:
-    return tuple(replace(density, title=title, measured=measured) for density in stage.densities())
 
 
 def _agree(name: str, unit: str, other: str) -> None:
@@ -641,11 +545,5 @@ def _interleaved(blocked: Floats, forces: Floats, together: bool) -> Floats:
 
 
 def _advanced(stage: Stage, state: Any, inputs: Floats) -> Any:  # noqa: ANN401 - each operator has its own state
-    """Return an operator's state after a sequence, compiled where the operator can."""
-    if isinstance(state, MemoryCurve):
-        return state.advance(inputs) if inputs.size else state
-    if isinstance(stage, PrandtlIshlinskii):
-        return stage.advance(state, inputs) if inputs.size else state
-    for value in inputs.tolist():
-        state, _ = stage.step(state, value)
-    return state
+    """Return an operator's state after a sequence, which may be empty."""
+    return stage.advance(state, inputs) if inputs.size else state

@@ -1,6 +1,8 @@
 """Identification of hysteresis operators: excitation, constrained least squares, error measures."""
 
 from bench.hysteresis.regressor import Regressor
+from bench.identification.by_name import Identification, Initial, identify
+from bench.identification.cross_validation import CrossValidation, Trial, cross_validate
 from bench.identification.design import (
     Assessment,
     assess,
@@ -9,8 +11,7 @@ from bench.identification.design import (
     laboratory_time,
 )
 from bench.identification.excitation import damped_oscillation, ramps, random_validation
-from bench.identification.identify import MODELS, Identification, Initial, ModelSpec, identify
-from bench.identification.inspection import Coverage, check_data, measure_coverage
+from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
 from bench.identification.measures import Comparison, Errors, compare, measure_errors
 from bench.identification.two_stage import (
@@ -23,21 +24,17 @@ from bench.identification.two_stage import (
     predict_series,
     voltage_steps,
 )
-from bench.identification.validation import CrossValidation, Trial, cross_validate
 
 __all__ = [
-    "MODELS",
     "Assessment",
     "Certificate",
     "Comparison",
     "CoupledIdentification",
-    "Coverage",
     "CrossValidation",
     "Errors",
     "Fit",
     "Identification",
     "Initial",
-    "ModelSpec",
     "Regressor",
     "Series",
     "Trial",
@@ -55,7 +52,6 @@ __all__ = [
     "identify_summed",
     "identify_two_stage",
     "laboratory_time",
-    "measure_coverage",
     "measure_errors",
     "measure_series",
     "predict_series",

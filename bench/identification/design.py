@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import MemoryCurve, Preisach, _checks
 from bench.hysteresis._checks import Floats
-from bench.identification.inspection import measure_coverage
 
 
 def first_order_reversals(
@@ -214,7 +213,7 @@ def assess(
     from scipy.linalg import svdvals
 
     time = laboratory_time(inputs, dwell, rate)
-    coverage = measure_coverage(operator, inputs, state)
+    coverage = operator.coverage(inputs, state)
     matrix = operator.regressor(inputs, state).dense()
     matrix -= matrix.mean(axis=0)
     norms = np.linalg.norm(matrix, axis=0)

@@ -22,26 +22,26 @@ Complexes: TypeAlias = NDArray[np.complex128]
 
 # Points per period, and per time constant, at which a step response is searched for its peak and settling.
 _RESOLUTION = 40
-# A resonance must stand out of the median of the spectrum by this factor to be taken for one.
+# Least ratio of a resonance to the median of the spectrum.
 _PROMINENCE = 10.0
 # A pole of greater relative standard uncertainty counts as not identified.
 _UNKNOWN = 0.25
-# Fewest samples after the step, and how far about the first that differ the delay is searched, in samples.
+# Fewest samples after the step, and range of the search for the delay about the first that differ, in samples.
 _LEAST = 50
 _EARLIER, _LATER = 4, 2
 
 
 @dataclass(frozen=True)
 class StepMeasures:
-    """What a unit step does.
+    """Response to a unit step.
 
     Parameters
     ----------
     final : float
         Value in the end, output per input units.
     peak, peak_time : float
-        Value farthest in the direction of the final one, same units, and its time, s; infinite if that is the
-        final value itself.
+        Extreme value in the direction of the final one, same units, and its time, s; infinite if it is the final
+        value itself.
     overshoot : float
         (peak - final) / final.
     settling_time : float
@@ -88,10 +88,8 @@ class ThirdOrder:
 
     def __post_init__(self) -> None:
         for name in ("gain", "real_pole", "frequency", "damping"):
-            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        for name in ("real_pole", "frequency", "damping"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+            check = _checks.number if name == "gain" else _checks.positive
+            object.__setattr__(self, name, check(name, getattr(self, name)))
         if not self.damping < 1.0:
             raise ValueError(f"damping: expected less than 1, got {self.damping}; the pair of poles is complex")
         if self.gain == 0.0:
@@ -198,39 +196,6 @@ class ThirdOrder:
         first = int(np.argmax(below))
         return math.exp(brentq(excess, grid[first - 1], grid[first]))
 
-    def discretise(self, dt: float) -> tuple[Floats, Floats, Floats]:
-        """Return A, B and C of the exact discrete system for inputs held over dt.
-
-        State x[k+1] = A x[k] + B u[k], output y[k] = C x[k]; the states are those of the modes.
-
-        Parameters
-        ----------
-        dt : float
-            Time step, s, > 0.
-
-        Returns
-        -------
-        tuple of ndarray, shapes (3, 3), (3,) and (3,)
-
-        Raises
-        ------
-        ValueError
-            If dt is not positive.
-        """
-        factors, inputs, residues = self._held(dt)
-        system = np.zeros((3, 3))
-        system[0, 0] = factors[0].real
-        system[1:, 1:] = [[factors[1].real, -factors[1].imag], [factors[1].imag, factors[1].real]]
-        output = np.array([residues[0].real, 2.0 * residues[1].real, -2.0 * residues[1].imag])
-        return system, np.array([inputs[0].real, inputs[1].real, inputs[1].imag]), output
-
-    def _held(self, dt: float) -> tuple[Complexes, Complexes, Complexes]:
-        """Return decay, input and residue of the two modes for inputs held over dt, shape (2,) each."""
-        if not _checks.number("dt", dt) > 0.0:
-            raise ValueError(f"dt: expected a positive number, got {dt}")
-        poles, residues = self._modes
-        return np.exp(poles * dt), np.expm1(poles * dt) / poles, residues
-
     def simulate(self, inputs: ArrayLike, dt: float) -> Floats:
         """Return the outputs to inputs that are held for dt each, from rest, exactly.
 
@@ -254,7 +219,8 @@ class ThirdOrder:
         from scipy.signal import lfilter
 
         u = _checks.samples("inputs", inputs)
-        factors, entries, residues = self._held(dt)
+        poles, residues = self._modes
+        factors, entries = np.exp(poles * _checks.positive("dt", dt)), np.expm1(poles * dt) / poles
         real, pair = (
             np.asarray(residues[k] * lfilter([0.0, entries[k]], [1.0, -factors[k]], u)).real for k in range(2)
         )
@@ -320,8 +286,8 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
     frequency is that of the highest peak of the tail's spectrum, the damping that of the tail's decay, the real
     pole the best on a grid of rates that the sampling can see, and the delay that of the first samples that differ.
 
-    Within a sample, a delay and the zeros do much the same to the response; below some 20 samples per period of
-    the resonance noise moves one against the other. The poles do not depend on that.
+    Within a sample, a delay and the zeros act alike on the response; below some 20 samples per period of the
+    resonance, noise trades one for the other. The poles do not depend on that.
 
     Parameters
     ----------
@@ -343,8 +309,7 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
     u, y = _checks.samples("inputs", inputs), _checks.samples("outputs", outputs)
     if y.size != u.size:
         raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
-    if not _checks.number("dt", dt) > 0.0:
-        raise ValueError(f"dt: expected a positive number, got {dt}")
+    _checks.positive("dt", dt)
     changes = np.flatnonzero(np.diff(u)) + 1
     if changes.size != 1:
         raise ValueError(f"inputs: expected exactly one step, got {changes.size}")
@@ -470,13 +435,13 @@ def _tail(outputs: Floats, dt: float) -> tuple[float, float]:
     parts = np.array_split(np.arange(outputs.size), 8)
     amplitudes = np.array([abs(np.mean(np.hanning(p.size) * demodulated[p])) for p in parts])
     middles = dt * np.array([p.mean() for p in parts])
-    # The squares weigh down what is lost in the noise.
+    # The squares weigh down amplitudes lost in the noise.
     slope = np.polyfit(middles, np.log(np.maximum(amplitudes, 1e-300)), 1, w=amplitudes)[0]
     return frequency, max(-float(slope), 0.1 / (outputs.size * dt))
 
 
 def _onset(outputs: Floats, at: int) -> int:
-    """Return how many samples after the step the outputs begin to differ from those before it."""
+    """Return the number of samples after the step until the outputs differ from those before it."""
     before = outputs[: at + 1]
     change = np.abs(outputs[at:] - before.mean())
     threshold = max(6.0 * float(before.std()), 0.005 * float(change.max()))

@@ -1,92 +1,18 @@
-"""What a measured sequence can tell before anything is fitted: cells swept, and what is odd about the data."""
+"""Checks of a measured sequence before anything is fitted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from bench.hysteresis import MemoryCurve, Preisach, Regressor, _checks
+from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 
 # Part of the samples that may repeat the one before, and part of the range that one step may take.
 _PLATEAU = 0.1
 _JUMP = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class Coverage:
-    """Which cells of the Preisach plane an excitation sweeps.
-
-    Parameters
-    ----------
-    swept : ndarray of bool, shape (K,)
-        Whether any part of the cell was switched after the first sample.
-    never : ndarray of int64, shape (n,)
-        The cells never swept, whose density the data do not tell.
-    centres : ndarray, shape (n, 2)
-        Their centres (β, α), input units; of a diagonal cell that of its triangle.
-    """
-
-    swept: NDArray[np.bool_]
-    never: NDArray[np.int64]
-    centres: Floats
-
-    @property
-    def fraction(self) -> float:
-        """Part of the cells that were swept, 0 to 1."""
-        return float(self.swept.mean())
-
-    def summary(self) -> str:
-        """Return the coverage in a sentence or two."""
-        count = self.swept.size
-        if not self.never.size:
-            return f"all {count} cells swept"
-        (beta0, alpha0), (beta1, alpha1) = self.centres.min(axis=0), self.centres.max(axis=0)
-        return (
-            f"{count - self.never.size} of {count} cells swept ({self.fraction:.0%}); never swept: "
-            f"{self.never.size} with centres β from {beta0:g} to {beta1:g}, α from {alpha0:g} to {alpha1:g}"
-        )
-
-
-def measure_coverage(operator: Preisach, inputs: ArrayLike, state: MemoryCurve | None = None) -> Coverage:
-    """Return which cells of an operator's plane a sequence of inputs sweeps.
-
-    Parameters
-    ----------
-    operator : Preisach
-        Its levels make the cells; its density does not matter.
-    inputs : array_like, shape (N,)
-        The sequence. The move to the first input does not count: nothing was measured before it.
-    state : MemoryCurve or None
-        Memory before the first input; default negative saturation.
-
-    Raises
-    ------
-    ValueError
-        If `inputs` is empty, not one-dimensional or not finite.
-    """
-    swept = swept_cells(operator.regressor(inputs, state))
-    never = np.flatnonzero(~swept)
-    levels = operator.levels
-    i, j = (index[never] for index in np.tril_indices(operator.order))
-    middle, steps = 0.5 * (levels[1:] + levels[:-1]), np.diff(levels)
-    shift = np.where(i == j, steps[i] / 6.0, 0.0)
-    return Coverage(swept, never, np.column_stack([middle[j] - shift, middle[i] + shift]))
-
-
-def swept_cells(regressor: Regressor) -> NDArray[np.bool_]:
-    """Return which sparse columns change after the first sample, shape (K,)."""
-    swept = np.zeros(regressor.base.size, dtype=bool)
-    first = regressor.starts[1]
-    cells = regressor.cells[first:]
-    # A rectangle may end within rounding of a cell's border.
-    largest = np.zeros(regressor.base.size)
-    np.maximum.at(largest, cells, np.abs(regressor.changes[first:]))
-    swept[largest > 1e-12 * largest.max(initial=0.0)] = True
-    return swept
 
 
 def check_data(
@@ -117,7 +43,7 @@ def check_data(
         raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
     span = float(np.ptp(u))
     if span == 0.0:
-        return [f"the input is {u[0]:g} throughout: it excites nothing"]
+        return [f"the input is {u[0]:g} throughout, so nothing can be identified"]
     found = _plateaus(u, y) + _branches(u, span)
     if plane is not None:
         low, high = _checks.increasing("plane", plane).tolist()
@@ -145,7 +71,7 @@ def _plateaus(u: Floats, y: Floats | None) -> list[str]:
 
 
 def _branches(u: Floats, span: float) -> list[str]:
-    """Tell if the runs in one direction are jumps while the other way is made in steps."""
+    """Return whether branches in one direction are jumps while those in the other are made in steps."""
     steps = np.diff(u[np.append(True, np.diff(u) != 0.0)])
     turns = np.flatnonzero(np.diff(np.sign(steps)) != 0.0) + 1
     edges = np.concatenate([[0], turns, [steps.size]])

@@ -7,16 +7,14 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
+from bench.identification.cell_layout import CellLayout, Flags, Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 # A column whose squared distance from the span of the passive ones falls below this part of its squared norm
 # counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
@@ -138,11 +136,11 @@ def fit(
     ValueError
         If a length does not fit, a number is not finite, a weight is negative, or nothing is left to fit.
     """
-    return fit_on(Layout.of(regressor.base.size), regressor, outputs, nonnegative, weights, skip, smoothing)
+    return fit_cells(CellLayout.of(regressor.base.size), regressor, outputs, nonnegative, weights, skip, smoothing)
 
 
-def fit_on(
-    layout: Layout,
+def fit_cells(
+    layout: CellLayout,
     regressor: Regressor,
     outputs: ArrayLike,
     nonnegative: ArrayLike = True,
@@ -150,7 +148,7 @@ def fit_on(
     skip: int = 0,
     smoothing: float = 0.0,
 ) -> Fit:
-    """Return what `fit` does, for sparse columns that lie in the plane as told."""
+    """Return what `fit` does, for sparse columns whose places in the plane `layout` gives."""
     y, w = _cost(regressor, outputs, weights, skip)
     constrained = np.broadcast_to(np.asarray(nonnegative, dtype=bool), (regressor.shape[1],))
     if not smoothing >= 0.0 or not np.isfinite(smoothing):
@@ -337,7 +335,22 @@ class _Factor:
 
 
 class _ActiveSet:
-    """The working state of one constrained fit, in centred and scaled columns."""
+    """The working state of one constrained fit, in centred and scaled columns.
+
+    With A the centred, weighted columns scaled to unit norm, t the centred outputs and λL the roughness penalty, the
+    cost is |A x - t|² + λ x'Lx, x >= 0 where constrained. Its negative half-gradient is g = A'(t - A x) - λ L x, and
+    optimality (Karush-Kuhn-Tucker) means g = 0 on the passive columns P, g <= 0 on those held at zero.
+
+    1. Start with P = the free columns; with a penalty also the `promising` ones, from a plane of half the order.
+    2. `refine` the passive coefficients by the true residual and compute g; stop if g is within the tolerance.
+    3. Choose the `candidates`: columns with g > 0 near the greatest, of neighbours in the plane only the `crests`.
+       If only columns are left that were found dependent on P (`barred`), lower the threshold of dependence.
+    4. `learn` the rows of the Gram matrix G = A'A + λL of the candidates, and let them `enter` the Cholesky factor
+       U'U = G[P, P]; a column whose pivot falls below the threshold is dependent and is barred.
+    5. `settle`: solve U'U x = (A't)[P]. While constrained coefficients come out negative, they `leave` P, all at
+       once while that raises the `gain` (`bold`), otherwise as far as the step to the first zero allows.
+    6. Go to 2. The factor is updated by appended columns and by rotations, never formed anew from the data.
+    """
 
     def __init__(
         self,
@@ -345,7 +358,7 @@ class _ActiveSet:
         y: Floats,
         w: Floats,
         constrained: Flags,
-        layout: Layout,
+        layout: CellLayout,
         smoothing: float,
         *,
         absolute: bool = False,
@@ -665,93 +678,3 @@ class _ActiveSet:
             converged=kkt <= 1e-10,
         )
         return Fit(coefficients, self.mean - float(self.means @ coefficients), uncertainties, certificate)
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Where the sparse columns of a regressor lie in the Preisach plane.
-
-    Parameters
-    ----------
-    order : int
-        Number of intervals M of the plane, 0 if the columns have no place.
-    cells : ndarray of int64, shape (columns,)
-        Cell of each sparse column. A cell may have a second column, that of its relays which were on before the
-        first sample; its density then is the sum of the two coefficients.
-    layers : ndarray of int64, shape (columns,)
-        0 for the first column of a cell, 1 for the second.
-    """
-
-    order: int
-    cells: Indices
-    layers: Indices
-
-    @classmethod
-    def of(cls, columns: int) -> Layout:
-        """Return the layout of one column a cell, if their number is that of a plane."""
-        order = (round((8 * columns + 1) ** 0.5) - 1) // 2
-        if order * (order + 1) // 2 != columns:
-            order = 0
-        return cls(order, np.arange(columns), np.zeros(columns, dtype=np.int64))
-
-    def grid(self, values: Floats) -> Floats:
-        """Return values by layer, row and column of the plane, with a border; -inf where there is no column."""
-        result = np.full((2, self.order + 2, self.order + 2), -np.inf)
-        result[self._places()] = values
-        return result
-
-    def _places(self) -> tuple[Indices, Indices, Indices]:
-        rows, columns = np.tril_indices(self.order)
-        return self.layers, rows[self.cells] + 1, columns[self.cells] + 1
-
-    def crests(self, g: Floats, threshold: float) -> Indices:
-        """Return the columns of at least a threshold, of neighbouring cells only the best.
-
-        Neighbours are nearly collinear: entering together they would only push each other out again.
-        """
-        if not self.order:
-            return np.flatnonzero(g >= threshold)
-        plane = self.grid(g)
-        inner = plane[:, 1:-1, 1:-1]
-        crest = inner >= threshold
-        for neighbour in (plane[:, :-2, 1:-1], plane[:, 2:, 1:-1], plane[:, 1:-1, :-2], plane[:, 1:-1, 2:]):
-            crest &= inner >= neighbour
-        layer, row, column = self._places()
-        return np.flatnonzero(crest[layer, row - 1, column - 1])
-
-    def coarser(self) -> tuple[Layout, Indices]:
-        """Return the layout of the plane with cells merged two by two, and the column of each column there."""
-        rows, columns = np.tril_indices(self.order)
-        i, j = rows[self.cells] // 2, columns[self.cells] // 2
-        merged, parents = np.unique(np.column_stack([self.layers, i * (i + 1) // 2 + j]), axis=0, return_inverse=True)
-        return Layout((self.order + 1) // 2, merged[:, 1], merged[:, 0]), parents.ravel()
-
-    def around(self, chosen: Flags) -> Flags:
-        """Return the chosen columns and their neighbours in the plane."""
-        plane = self.grid(chosen.astype(np.float64)) > 0.0
-        wide = plane.copy()
-        wide[:, 1:] |= plane[:, :-1]
-        wide[:, :-1] |= plane[:, 1:]
-        wide[:, :, 1:] |= plane[:, :, :-1]
-        wide[:, :, :-1] |= plane[:, :, 1:]
-        return wide[self._places()]
-
-    def roughness(self) -> csr_array:
-        """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""
-        from scipy.sparse import coo_array, csr_array
-
-        rows, columns = np.tril_indices(self.order)
-        index = np.full((self.order + 1, self.order + 1), -1, dtype=np.int64)
-        index[rows, columns] = np.arange(rows.size)
-        here: list[Indices] = []
-        there: list[Indices] = []
-        for i, j in ((rows + 1, columns), (rows - 1, columns), (rows, columns + 1), (rows, columns - 1)):
-            other = index[i, j]
-            inside = np.flatnonzero((other >= 0) & (i >= 0) & (j >= 0))
-            here.append(inside)
-            there.append(other[inside])
-        a, b = np.concatenate(here), np.concatenate(there)
-        data = np.concatenate([np.ones(a.size), -np.ones(a.size)])
-        laplacian = coo_array((data, (np.concatenate([a, a]), np.concatenate([b, a]))), shape=(rows.size, rows.size))
-        spread = csr_array(laplacian)[:, self.cells]
-        return csr_array(spread.T @ spread)

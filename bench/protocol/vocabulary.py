@@ -27,7 +27,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 
-from bench.control.loops import Loop, SampledController
+from bench.control.loops import ControlTask, SampledController
 from bench.devices import Signal
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
 
@@ -135,7 +135,7 @@ class Control(Message):
         Further signals that the controller wants to see.
     """
 
-    task: Loop
+    task: ControlTask
     actuator: str
     drive: str
     response: str

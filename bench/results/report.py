@@ -14,13 +14,13 @@ from rich.table import Table as Columns
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve
+from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table, run_card
-from bench.measurements import header_with_unit, write_csv
-from bench.model_file import ModelFile, is_coupled_model, load_model, parse_model
-from bench.modelling import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.data import header_with_unit, write_csv
 from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
+from bench.results.model_file import ModelFile, load_model, parse_model
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
 from bench.units import format_numbers, with_unit
@@ -288,12 +288,9 @@ def _precision(record: Record, name: str) -> int:
 
 
 def _models_of(record: Record) -> list[ModelFile]:
-    return [
-        parse_model(content, f"{record.path}: model {name}")
-        for name, content in record.models().items()
-        # A coupled model has two inputs; its errors are those of several runs together.
-        if not is_coupled_model(content)
-    ]
+    files = [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
+    # A model of several inputs is not compared: its errors are those of several runs together.
+    return [file for file in files if isinstance(file.model, Operator)]
 
 
 def _headers(record: Record, table: Table) -> list[str]:

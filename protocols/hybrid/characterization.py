@@ -14,11 +14,29 @@ import numpy as np
 
 from bench.control.loops import Playback
 from bench.number_list import NumberList
-from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Step, parameter, protocol
-from protocols.hybrid import BASE, DEFLECTION, TIP
+from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Slots, Step, parameter, protocol
+from protocols.hybrid import FINE, SENSORS, THERMAL
 
-SENSORS = (DEFLECTION, BASE, TIP)
-THERMAL = ("tec", *SENSORS)
+
+def _play(
+    slots: Slots,
+    label: str,
+    rate: float,
+    duration: float,
+    setpoints: dict[str, Callable[[float], float]],
+    limits: tuple[tuple[float, float], ...],
+    sensors: tuple[str, ...] = SENSORS,
+) -> FixedRate:
+    """Return a loop that plays functions of time back on slots, within limits, and reads sensors."""
+    return FixedRate(
+        controller=Playback(*setpoints.values()),
+        rate=rate,
+        duration=duration,
+        inputs=tuple(slots[name].signal for name in sensors),
+        actuators=tuple(slots[name].device for name in setpoints),
+        limits=limits,
+        label=label,
+    )
 
 
 class CurrentSineParameters(ProtocolParameters):
@@ -30,25 +48,25 @@ class CurrentSineParameters(ProtocolParameters):
     rate: float = parameter(0.5, unit="Hz", low=0.01, high=100, help="samples in a second")
 
 
-@protocol(needs=THERMAL, controls=DEFLECTION)
-def current_sine(parameters: CurrentSineParameters) -> Messages:
+@protocol(needs=THERMAL, controls="response")
+def current_sine(parameters: CurrentSineParameters, slots: Slots) -> Messages:
     """Drive the Peltier element by a slow sine, and watch temperatures and deflection.
 
-    As it is, a sine of 0.1 A at 0.001 Hz, for the static characteristics (Rakotondrabe and Ivan 2010, section V-B,
+    By default a sine of 0.1 A at 0.001 Hz, for the static characteristics (Rakotondrabe and Ivan 2010, section V-B,
     Fig. 12); with a small amplitude and several frequencies, for the bandwidth.
     """
+    amplitude = parameters.amplitude
     for frequency in parameters.frequencies:
         if not 0 < frequency <= parameters.rate / 10:
             raise ValueError(f"frequencies: expected more than 0 and at most {parameters.rate / 10:g} Hz")
         yield Phase(f"sine of {frequency:g} Hz")
-        yield FixedRate(
-            controller=Playback(_sine(parameters.amplitude, frequency)),
-            rate=parameters.rate,
-            duration=parameters.periods / frequency,
-            inputs=SENSORS,
-            actuators=("tec",),
-            limits=((-parameters.amplitude, parameters.amplitude),),
-            label=f"{frequency:g} Hz",
+        yield _play(
+            slots,
+            f"{frequency:g} Hz",
+            parameters.rate,
+            parameters.periods / frequency,
+            {"coarse": _sine(amplitude, frequency)},
+            ((-amplitude, amplitude),),
         )
 
 
@@ -61,12 +79,12 @@ class CurrentStepsParameters(ProtocolParameters):
     rate: float = parameter(1.0, unit="Hz", low=0.01, high=100, help="samples in a second")
 
 
-@protocol(needs=THERMAL, controls=DEFLECTION)
-def current_steps(parameters: CurrentStepsParameters) -> Messages:
+@protocol(needs=THERMAL, controls="response")
+def current_steps(parameters: CurrentStepsParameters, slots: Slots) -> Messages:
     """Step the current of the Peltier element, and watch temperatures and deflection.
 
     Steps of 0.1, 0.05 and 0.025 A that cool (Rakotondrabe and Ivan 2010, section V-B, Fig. 13), and one that heats,
-    without which the Joule heat cannot be told from the Seebeck effect.
+    to separate Joule heat and Seebeck effect.
     """
     levels = parameters.levels
     cycle = parameters.on + parameters.off
@@ -76,14 +94,13 @@ def current_steps(parameters: CurrentStepsParameters) -> Messages:
         return levels[min(int(number), len(levels) - 1)] if within < parameters.on else 0.0
 
     yield Phase("steps of the current")
-    yield FixedRate(
-        controller=Playback(current),
-        rate=parameters.rate,
-        duration=len(levels) * cycle,
-        inputs=SENSORS,
-        actuators=("tec",),
-        limits=((min(0.0, *levels), max(0.0, *levels)),),
-        label="current steps",
+    yield _play(
+        slots,
+        "current steps",
+        parameters.rate,
+        len(levels) * cycle,
+        {"coarse": current},
+        ((min(0.0, *levels), max(0.0, *levels)),),
     )
 
 
@@ -97,7 +114,7 @@ class ThermomechanicalParameters(ProtocolParameters):
 
 
 @protocol(needs=THERMAL)
-def thermomechanical(parameters: ThermomechanicalParameters) -> Messages:
+def thermomechanical(parameters: ThermomechanicalParameters, slots: Slots) -> Messages:
     """Measure the static deflection over the temperature of the tip, without voltage.
 
     The current goes down in steps, up, and back (Rakotondrabe and Ivan 2010, section V-C, Fig. 14).
@@ -107,7 +124,7 @@ def thermomechanical(parameters: ThermomechanicalParameters) -> Messages:
     back = np.linspace(parameters.hottest, 0.0, parameters.levels)[1:]
     yield Phase("staircase of the current")
     for current in [*down, *up, *back]:
-        yield Step({"tec": float(current)}, Dwell(parameters.dwell), label="sample")
+        yield Step({slots["coarse"].device: float(current)}, Dwell(parameters.dwell), label="sample")
 
 
 class PiezoLoopsParameters(ProtocolParameters):
@@ -118,9 +135,9 @@ class PiezoLoopsParameters(ProtocolParameters):
     rate: float = parameter(50.0, unit="Hz", low=1, high=1e5, help="samples in a second")
 
 
-@protocol(needs=("piezo", *SENSORS), controls=DEFLECTION)
-def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
-    """Measure the hysteresis of the piezo by a slow sine, with minor loops of smaller and smaller amplitude.
+@protocol(needs=FINE | {name: THERMAL[name] for name in SENSORS}, controls="response")
+def piezo_loops(parameters: PiezoLoopsParameters, slots: Slots) -> Messages:
+    """Measure the hysteresis of the piezo by a slow sine, with minor loops of decreasing amplitude.
 
     Rakotondrabe and Ivan 2010, section V-D, Fig. 15: 40 V, 0.1 Hz.
     """
@@ -132,14 +149,13 @@ def piezo_loops(parameters: PiezoLoopsParameters) -> Messages:
         return amplitudes[cycle] * math.sin(2.0 * math.pi * parameters.frequency * t)
 
     yield Phase("loops of the voltage")
-    yield FixedRate(
-        controller=Playback(voltage),
-        rate=parameters.rate,
-        duration=len(amplitudes) / parameters.frequency,
-        inputs=SENSORS,
-        actuators=("piezo",),
-        limits=((-largest, largest),),
-        label="piezo loops",
+    yield _play(
+        slots,
+        "piezo loops",
+        parameters.rate,
+        len(amplitudes) / parameters.frequency,
+        {"fine": voltage},
+        ((-largest, largest),),
     )
 
 
@@ -152,22 +168,23 @@ class PiezoStepParameters(ProtocolParameters):
     rate: float = parameter(20e3, unit="Hz", low=10, high=1e6, help="samples in a second")
 
 
-@protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
-def piezo_step(parameters: PiezoStepParameters) -> Messages:
+@protocol(needs=FINE, controls="response")
+def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
     """Measure the deflection after a step of the voltage, fast enough for the resonance.
 
-    Rakotondrabe and Ivan 2010, section V-D, Fig. 16: 40 V. Over a network a T7 answers a request or two in a
-    millisecond, so that this rate is for an emulated rig.
+    Rakotondrabe and Ivan 2010, section V-D, Fig. 16: 40 V. The default rate is for an emulated rig: over a network a
+    T7 answers one or two requests in a millisecond.
     """
+    height = parameters.voltage
     yield Phase("step of the voltage")
-    yield FixedRate(
-        controller=Playback(lambda t: parameters.voltage if t >= parameters.rest else 0.0),
-        rate=parameters.rate,
-        duration=parameters.rest + parameters.duration,
-        inputs=(DEFLECTION,),
-        actuators=("piezo",),
-        limits=((min(0.0, parameters.voltage), max(0.0, parameters.voltage)),),
-        label="piezo step",
+    yield _play(
+        slots,
+        "piezo step",
+        parameters.rate,
+        parameters.rest + parameters.duration,
+        {"fine": lambda t: height if t >= parameters.rest else 0.0},
+        ((min(0.0, height), max(0.0, height)),),
+        ("response",),
     )
 
 
@@ -182,24 +199,21 @@ class ExcitationParameters(ProtocolParameters):
     rate: float = parameter(2.0, unit="Hz", low=0.01, high=1000, help="samples in a second")
 
 
-@protocol(needs=("tec", "piezo", *SENSORS), controls=DEFLECTION)
-def hybrid_excitation(parameters: ExcitationParameters) -> Messages:
-    """Drive heat and voltage at once, a sine each, to try a model of the whole on it.
+@protocol(needs=THERMAL | FINE, controls="response")
+def hybrid_excitation(parameters: ExcitationParameters, slots: Slots) -> Messages:
+    """Drive heat and voltage at once, a sine each, to validate a model of the whole.
 
     Rakotondrabe and Ivan 2010, eq. 22, has both parts.
     """
+    p = parameters
     yield Phase("both at once")
-    yield FixedRate(
-        controller=Playback(
-            _sine(parameters.current, parameters.current_frequency),
-            _sine(parameters.voltage, parameters.voltage_frequency),
-        ),
-        rate=parameters.rate,
-        duration=parameters.duration,
-        inputs=SENSORS,
-        actuators=("tec", "piezo"),
-        limits=((-parameters.current, parameters.current), (-parameters.voltage, parameters.voltage)),
-        label="both at once",
+    yield _play(
+        slots,
+        "both at once",
+        p.rate,
+        p.duration,
+        {"coarse": _sine(p.current, p.current_frequency), "fine": _sine(p.voltage, p.voltage_frequency)},
+        ((-p.current, p.current), (-p.voltage, p.voltage)),
     )
 
 

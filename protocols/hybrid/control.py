@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
-from bench import registry
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
-from bench.model_file import load_hybrid_model
+from bench.controllers import ControllerSetup, make_controller
 from bench.number_list import NumberList
-from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
-from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
+from bench.results.model_file import load_model
+from protocols.hybrid import FINE, SENSORS, THERMAL, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -39,28 +40,27 @@ class Parameters(ProtocolParameters):
     frequency: float = parameter(1.0, unit="Hz", low=1e-3, high=20, help="frequency of the sine on a ramp")
     rate: float = parameter(200.0, unit="Hz", low=50, high=1000, help="samples in a second")
     record_rate: float = parameter(50.0, unit="Hz", low=0.01, high=1000, help="recorded samples in a second")
-    witness: bool = parameter(False, unit="", help="whether a sensor `witness` beside the loop is recorded as well")
+    witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=("tec", "piezo", DEFLECTION, BASE, TIP), controls=DEFLECTION)
-def hybrid_control(parameters: Parameters) -> Messages:
+@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response")
+def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     """Make the tip follow a reference by the thermal and the piezo part together.
 
     The thermal part takes the range, the piezo part the accuracy. References are smooth moves from position to
     position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
     a hold at 0.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
     reference, duration = _reference(parameters)
-    controller = registry.load("controllers", f"hybrid.{parameters.controller}")(model, reference, parameters.rate)
+    controller = make_controller("hybrid", parameters.controller, _setup(parameters, reference))
     yield Phase(parameters.controller)
     yield FixedRate(
         controller=controller,
         rate=parameters.rate,
         duration=duration,
-        inputs=(DEFLECTION, BASE, TIP),
-        actuators=("tec", "piezo"),
-        watched=(WITNESS,) if parameters.witness else (),
+        inputs=tuple(slots[name].signal for name in SENSORS),
+        actuators=(slots["coarse"].device, slots["fine"].device),
+        watched=_watched(parameters, slots),
         record_every=max(1, round(parameters.rate / parameters.record_rate)),
         label=parameters.reference,
     )
@@ -74,29 +74,43 @@ class StepParameters(ProtocolParameters):
     rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
     duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")
     rate: float = parameter(20e3, unit="Hz", low=2000, high=1e6, help="samples in a second")
-    witness: bool = parameter(False, unit="", help="whether a sensor `witness` beside the loop is recorded as well")
+    witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=("piezo", DEFLECTION), controls=DEFLECTION)
-def fine_step(parameters: StepParameters) -> Messages:
+@protocol(needs=FINE, may_use=WITNESS, controls="response")
+def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 
     The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
     instruments are called directly.
     """
-    model = load_hybrid_model(Path(parameters.model)).model
-    controller = registry.load("controllers", "hybrid.fine")(
-        model, lambda t: parameters.step if t >= parameters.rest else 0.0, parameters.rate
-    )
+    setup = _setup(parameters, lambda t: parameters.step if t >= parameters.rest else 0.0)
+    controller = make_controller("hybrid-fine", "notch", setup)
     yield Phase("fine step")
     yield FixedRate(
         controller=controller,
         rate=parameters.rate,
         duration=parameters.rest + parameters.duration,
-        inputs=(DEFLECTION,),
-        actuators=("piezo",),
-        watched=(WITNESS,) if parameters.witness else (),
+        inputs=(slots["response"].signal,),
+        actuators=(slots["fine"].device,),
+        watched=_watched(parameters, slots),
         label="fine step",
+    )
+
+
+def _watched(parameters: Parameters | StepParameters, slots: Slots) -> tuple[str, ...]:
+    if not parameters.witness:
+        return ()
+    if "witness" not in slots:
+        raise ValueError("witness: the rig binds no [roles.witness]")
+    return (slots["witness"].signal,)
+
+
+def _setup(parameters: Parameters | StepParameters, reference: Reference) -> ControllerSetup:
+    return ControllerSetup(
+        model=load_model(Path(parameters.model), "hybrid"),
+        limits=(-math.inf, math.inf),
+        options={"reference": reference, "rate": parameters.rate},
     )
 
 

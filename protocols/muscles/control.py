@@ -11,7 +11,6 @@ from bench import registry
 from bench.control.loops import Reaching, ReachTarget
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
-from bench.model_file import load_coupled_model
 from bench.protocol import (
     Control,
     Dwell,
@@ -24,6 +23,7 @@ from bench.protocol import (
     parameter,
     protocol,
 )
+from bench.results.model_file import load_model
 from bench.results.tracking import REACH, READING
 from protocols.muscles.parts import (
     ON_STAGE,
@@ -123,9 +123,7 @@ def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
 
 def _load_model(path: str) -> TwoStage:
     """Read the two-stage model of a muscle, in V, N and m."""
-    model = load_coupled_model(Path(path)).model
-    if not isinstance(model, TwoStage):
-        raise DataError(f"model file {path}: expected a two-stage model, whose inverse is known")
+    model: TwoStage = load_model(Path(path), "two-stage").model
     units = (model.voltage_unit, model.force_unit, model.length_unit)
     if units != ("V", "N", "m"):
         raise DataError(f"model file {path}: expected a model in V, N and m, got {', '.join(map(repr, units))}")

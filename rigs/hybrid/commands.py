@@ -24,7 +24,7 @@ def identify(
     Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
     voltage, third-order dynamics from the fast step.
     """
-    from bench.model_file import HybridFile
+    from bench.results.model_file import ModelFile
     from rigs.hybrid.identification import identify_hybrid
 
     found = identify_hybrid(steps, static, loops, step, plays=plays)
@@ -45,7 +45,9 @@ def identify(
     ]
     print_rows("hybrid", rows)
     if out is not None:
-        HybridFile(found.model, {"sources": [run.name for run in (steps, static, loops, step)]}).save(out)
+        ModelFile(
+            "hybrid", found.model, provenance={"sources": [run.name for run in (steps, static, loops, step)]}
+        ).save(out)
         console.print(f"model: {out}", highlight=False, soft_wrap=True)
     write_json(
         json_file,

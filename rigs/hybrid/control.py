@@ -17,10 +17,12 @@ from typing import Literal, Self
 
 import numpy as np
 
+from bench.control.loops import SampledController
 from bench.control.notch_loop import NotchLoop, NotchLoopParameters
 from bench.control.play_inverse import PlayInverse
 from bench.control.references import Reference
 from bench.control.tracking import Trace, check_positive
+from bench.controllers import ControllerSpec
 from rigs.hybrid.estimates import (
     Bending,
     LowPass,
@@ -295,28 +297,36 @@ class ThermalFeedback(_MidRanging):
         super().__init__(model, reference, p, lambda bending, _: LowPass(bending, p.share(p.period)), piezo=False)
 
 
-def make_hybrid(model: HybridModel, reference: Reference, rate: float) -> HybridController:
-    """Return the mid-ranging controller with the Kalman filter, called at a rate (Hz)."""
-    return HybridController(model, reference, MidRangingParameters.at_rate(rate))
-
-
-def make_low_pass(model: HybridModel, reference: Reference, rate: float) -> HybridController:
-    """Return the mid-ranging controller with the low-pass, called at a rate (Hz)."""
-    return HybridController(model, reference, MidRangingParameters.at_rate(rate), estimator="low-pass")
-
-
-def make_open_loop(model: HybridModel, reference: Reference, rate: float) -> OpenLoopHybrid:
-    """Return the inverse of the model, called at a rate (Hz)."""
-    return OpenLoopHybrid(model, reference, MidRangingParameters.at_rate(rate))
-
-
-def make_thermal_feedback(model: HybridModel, reference: Reference, rate: float) -> ThermalFeedback:
-    """Return the feedback to the thermal part alone, called at a rate (Hz)."""
-    return ThermalFeedback(model, reference, replace(MidRangingParameters.at_rate(rate), gain=_THERMAL_GAIN))
-
-
 def make_fine(model: HybridModel, reference: Reference, rate: float = 20e3, *, integral: float = 300.0) -> NotchLoop:
     """Return the loop of the piezo part alone, at a rate (Hz) that resolves the resonance; integral gain in 1/s."""
     dynamics = model.dynamics
     parameters = NotchLoopParameters(rate=rate, integral=integral, stroke=STROKE)
     return NotchLoop(model.hysteresis, dynamics.frequency, dynamics.damping, reference, parameters)
+
+
+def _spec(summary: str, make: Callable[[HybridModel, Reference, float], SampledController]) -> ControllerSpec:
+    """Return a controller for the registry; options of its setup: `reference` (callable, m) and `rate` (Hz)."""
+    return ControllerSpec(summary, lambda s: make(s.model.model, s.options["reference"], s.options["rate"]))
+
+
+HYBRID = _spec(
+    "mid-ranging of thermal and piezo part, with a Kalman filter",
+    lambda model, reference, rate: HybridController(model, reference, MidRangingParameters.at_rate(rate)),
+)
+HYBRID_LOW_PASS = _spec(
+    "mid-ranging of thermal and piezo part, with a low-pass",
+    lambda model, reference, rate: HybridController(
+        model, reference, MidRangingParameters.at_rate(rate), estimator="low-pass"
+    ),
+)
+OPEN_LOOP = _spec(
+    "the inverse of the model, without the deflection sensor",
+    lambda model, reference, rate: OpenLoopHybrid(model, reference, MidRangingParameters.at_rate(rate)),
+)
+THERMAL_FEEDBACK = _spec(
+    "feedback to the thermal part alone",
+    lambda model, reference, rate: ThermalFeedback(
+        model, reference, replace(MidRangingParameters.at_rate(rate), gain=_THERMAL_GAIN)
+    ),
+)
+NOTCH = _spec("the piezo part alone, with a notch at its resonance", make_fine)

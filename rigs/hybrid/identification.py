@@ -7,7 +7,8 @@ positive current heats.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,15 @@ from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
 from bench.journal import Record, Table
 from bench.protocol import LATENESS
-from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
 Floats = npt.NDArray[np.float64]
+
+DEFLECTION, BASE, TIP, WITNESS = "response", "base", "tip", "witness"
+"""Slots of the runs whose signals are used."""
+CURRENT, VOLTAGE = "coarse_setpoint", "fine_setpoint"
+"""Set-points of their slots."""
 
 REFERENCE = 22.0
 """Reference of the polynomial, °C: the nominal temperature of the room."""
@@ -55,7 +60,7 @@ class HybridIdentification:
     model: HybridModel
     network: NetworkIdentification
     order: OrderChoice
-    polynomial: Identification
+    polynomial: Identification[Polynomial]
     piezo: PiezoIdentification
     dynamics: DynamicsIdentification
 
@@ -80,18 +85,29 @@ class Samples:
         Signals by name; set-points are those sent after the sample was read.
     period : float
         Time between two samples, s.
+    names : mapping of str to str
+        Signal by slot, and by `SLOT_setpoint`.
     """
 
     table: Table
     period: float
+    names: Mapping[str, str] = field(default_factory=dict)
 
-    def __getitem__(self, signal: str) -> Floats:
-        return self.table[signal]
+    def __getitem__(self, name: str) -> Floats:
+        """Return the samples of a slot, of its set-points, or of a signal."""
+        return self.table[self.names.get(name, name)]
 
     @property
     def times(self) -> Floats:
         """Time from the first sample, s."""
         return np.arange(len(self.table), dtype=np.float64) * self.period
+
+
+def signal_names(record: Record) -> dict[str, str]:
+    """Return the signals of a run by slot, and those of set-points by `SLOT_setpoint`."""
+    slots = record.meta.get("slots", {})
+    setpoints = {f"{slot}_setpoint": f"{bound['device']}_setpoint" for slot, bound in slots.items()}
+    return {**{slot: bound["signal"] for slot, bound in slots.items()}, **setpoints}
 
 
 def read_loops(run: Path) -> dict[str, Samples]:
@@ -108,7 +124,7 @@ def read_loops(run: Path) -> dict[str, Samples]:
         if LATENESS.name not in [signal.name for signal in record.signals]:
             raise DataError(f"{run}: has no fast loop")
         labels = {step.step: step.label for step in record.step_records()}
-        ticks = record.telemetry()
+        ticks, names = record.telemetry(), signal_names(record)
     taken = np.isfinite(ticks[LATENESS.name])
     loops = {}
     for step in np.unique(ticks["step"][taken]).astype(int).tolist():
@@ -119,7 +135,7 @@ def read_loops(run: Path) -> dict[str, Samples]:
             raise DataError(f"{run}: has two loops {labels[step]!r}; expected one of each label")
         if len(table) < 2 or np.ptp(steps := np.diff(times)) > 1e-3 * steps.mean():
             raise DataError(f"{run}: the loop {labels[step]!r} left samples out; a model needs all of them")
-        loops[labels[step]] = Samples(table, float(steps.mean()))
+        loops[labels[step]] = Samples(table, float(steps.mean()), names)
     if not loops:
         raise DataError(f"{run}: has no fast loop")
     return loops
@@ -191,17 +207,15 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
     with Record(static) as record:
         if record.status != "completed":
             raise DataError(f"{static}: the run is {record.status}; a model needs a completed one")
-        curve = record.steps()
+        curve, names = record.steps(), signal_names(record)
     fast = read_loop(step)
     try:
         network = identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
-        rises = curve[TIP] - REFERENCE
-        order = choose_order(rises, curve[DEFLECTION])
-        polynomial = identify_polynomial(rises, curve[DEFLECTION], order.order)
+        rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]]
+        order = choose_order(rises, deflections)
+        polynomial = identify_polynomial(rises, deflections, order.order)
         piezo = identify_piezo(read_loop(loops), plays)
         dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
-        if not isinstance(polynomial.model, Polynomial):
-            raise TypeError("expected a polynomial")
         model = HybridModel(network.network, polynomial.model, piezo.operator, dynamics.model, REFERENCE)
     except ValueError as error:
         raise DataError(f"the hybrid cannot be identified: {error}") from error
@@ -223,8 +237,6 @@ def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
         found = identify_pi(applied, deflections - drift, plays=plays, maximum=float(np.abs(applied).max()))
         rest = found.residuals - found.residuals.mean()
         drift = drift + columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
-    if not isinstance(found.model, PrandtlIshlinskii):
-        raise TypeError("expected a Prandtl-Ishlinskii operator")
     return PiezoIdentification(found.model, found.errors, applied, deflections - drift)
 
 

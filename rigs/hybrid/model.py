@@ -7,17 +7,17 @@ micro-actuator", IEEE Transactions on Robotics 26(6), 2010, eqs. 18 to 22; here 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Polynomial, PrandtlIshlinskii, _checks
+from bench.hysteresis import Model, ModelSpec, Operator, Polynomial, PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.documents import Parts
+from bench.identification.by_name import Identification, Initial, identify
 from bench.identification.dynamics import ThirdOrder
-from bench.identification.identify import Identification, Initial, identify
 from rigs.hybrid.network import NODES, ThermalNetwork
 
 # Allowed use of a part beyond the range that it was fitted on, as a share of that range.
@@ -58,7 +58,7 @@ class HybridResponse:
 
 
 @dataclass(frozen=True, eq=False)
-class HybridModel:
+class HybridModel(Model):
     """From current and voltage to the deflection of the tip (Rakotondrabe and Ivan 2010, eq. 22, corrected).
 
     deflection = p(T_L - T_r) - p(0) + D(s)/D(0) (P(U) - its bias)
@@ -89,6 +89,13 @@ class HybridModel:
         If the range of the polynomial does not contain 0 K, or the reference is not a number.
     """
 
+    kind: ClassVar[str] = "hybrid"
+    parts: ClassVar[Parts] = {
+        "network": ThermalNetwork.from_json,
+        "polynomial": Polynomial.from_json,
+        "hysteresis": PrandtlIshlinskii.from_json,
+        "dynamics": ThirdOrder.from_json,
+    }
     network: ThermalNetwork
     polynomial: Polynomial
     hysteresis: PrandtlIshlinskii
@@ -151,35 +158,6 @@ class HybridModel:
         """
         return self.network.bandwidth("tip", current, ambient)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        return {
-            "type": "hybrid",
-            "network": self.network.to_json(),
-            "polynomial": self.polynomial.to_json(),
-            "hysteresis": self.hysteresis.to_json(),
-            "dynamics": self.dynamics.to_json(),
-            "reference": self.reference,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> HybridModel:
-        """Return the model that `to_json` wrote.
-
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
-        """
-        kind = "hybrid model"
-        return cls(
-            ThermalNetwork.from_json(_checks.json_field(document, "network", kind)),
-            Polynomial.from_json(_checks.json_field(document, "polynomial", kind)),
-            PrandtlIshlinskii.from_json(_checks.json_field(document, "hysteresis", kind)),
-            ThirdOrder.from_json(_checks.json_field(document, "dynamics", kind)),
-            _checks.json_field(document, "reference", kind),
-        )
-
 
 @dataclass(frozen=True)
 class OrderChoice:
@@ -233,7 +211,9 @@ def choose_order(
     return OrderChoice(order, rms)
 
 
-def identify_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int | None = None) -> Identification:
+def identify_polynomial(
+    rises: ArrayLike, deflections: ArrayLike, order: int | None = None
+) -> Identification[Polynomial]:
     """Return the thermomechanical polynomial that fits best (Rakotondrabe and Ivan 2010, eqs. 18 and 19).
 
     The offset is free, as a sensor has its own zero; `HybridModel` subtracts it.
@@ -253,12 +233,11 @@ def identify_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int | N
         If a sequence is wrong, there are too few samples, or the rises do not extend to 0 K.
     """
     found = _fit_polynomial(rises, deflections, choose_order(rises, deflections).order if order is None else order)
-    assert isinstance(found.model, Polynomial)
     _check_contains_rest(found.model)
     return found
 
 
-def _fit_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int) -> Identification:
+def _fit_polynomial(rises: ArrayLike, deflections: ArrayLike, order: int) -> Identification[Polynomial]:
     levels = np.unique(_checks.samples("rises", rises)).size
     if levels <= order:
         raise ValueError(f"rises: expected more than {order} different values for order {order}, got {levels}")
@@ -272,7 +251,7 @@ def identify_pi(
     plays: int = 15,
     maximum: float | None = None,
     initial: Initial | None = None,
-) -> Identification:
+) -> Identification[PrandtlIshlinskii]:
     """Return the Prandtl-Ishlinskii operator that fits the quasi-static piezo deflection best.
 
     Plays with thresholds i maximum / plays, weights not negative, and a free offset (Rakotondrabe and Ivan 2010,
@@ -318,7 +297,7 @@ def identify_pi(
     return found
 
 
-def _check_contains_rest(polynomial: Polynomial) -> None:
+def _check_contains_rest(polynomial: Operator[Any]) -> None:
     low, high = polynomial.input_range
     span = _BEYOND * (high - low)
     if not low - span <= 0.0 <= high + span:
@@ -334,3 +313,6 @@ def _check_range(name: str, values: Floats, span: tuple[float, float], unit: str
             f"{name}: expected {low:g} to {high:g} {unit}, the range of the {part}, "
             f"got {least:g} to {greatest:g} {unit}"
         )
+
+
+HYBRID = ModelSpec("thermo-piezoelectric cantilever: network, polynomial, plays and dynamics", HybridModel)

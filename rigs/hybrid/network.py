@@ -43,18 +43,10 @@ ABSOLUTE_ZERO = -273.15
 _BLOCK_END, _BLOCK_FRONT, _BASE, _TIP = range(4)
 
 
-def positive(name: str, value: float) -> float:
-    """Return a value as a finite float > 0, or raise ValueError."""
-    number = _checks.number(name, value)
-    if not number > 0.0:
-        raise ValueError(f"{name}: expected a positive number, got {number}")
-    return number
-
-
 def check_fields(settings: Any, *free: str) -> None:  # noqa: ANN401 - a dataclass
     """Check that every field of a dataclass is a positive number; those named `free` may have either sign."""
     for each in fields(settings):
-        check = _checks.number if each.name in free else positive
+        check = _checks.number if each.name in free else _checks.positive
         object.__setattr__(settings, each.name, check(each.name, getattr(settings, each.name)))
 
 
@@ -316,7 +308,7 @@ class ThermalNetwork:
             If a shape is wrong, a number is not finite, or dt is not positive.
         """
         i = _checks.samples("currents", currents)
-        step = positive("dt", dt)
+        step = _checks.positive("dt", dt)
         air = _ambients(ambient, i.size)
         result = np.empty((i.size, 4))
         now = np.full(4, air[0]) if start is None else _nodes("start", start)

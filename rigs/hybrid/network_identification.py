@@ -13,7 +13,7 @@ from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.measures import Errors, measure_errors
 from rigs.hybrid.design import Design
-from rigs.hybrid.network import NODES, ThermalNetwork, positive
+from rigs.hybrid.network import NODES, ThermalNetwork
 
 FREE_PARAMETERS: tuple[str, ...] = (
     "seebeck",
@@ -57,8 +57,6 @@ class NetworkIdentification:
         Condition number of the Jacobian with its columns scaled to unit norm.
     gradient : float
         Greatest cosine between the residuals and a column of the Jacobian; 0 is exact optimality.
-    evaluations : int
-        Number of simulations, those for derivatives not counted.
     """
 
     network: ThermalNetwork
@@ -69,7 +67,6 @@ class NetworkIdentification:
     tip: Errors
     condition: float
     gradient: float
-    evaluations: int
 
 
 def identify_network(
@@ -121,7 +118,7 @@ def identify_network(
         measured.append(_checks.samples(name, values))
         if measured[-1].size != i.size:
             raise ValueError(f"{name}: expected {i.size} values, one for each current, got {measured[-1].size}")
-    step = positive("dt", dt)
+    step = _checks.positive("dt", dt)
     known = {each.name for each in fields(ThermalNetwork)}
     if not free or not set(free) <= known or len(set(free)) != len(free):
         raise ValueError(f"free: expected different ones of {', '.join(sorted(known))}, got {', '.join(free)}")
@@ -184,5 +181,4 @@ def identify_network(
         tip=errors[1],
         condition=condition,
         gradient=float(np.abs(scaled.T @ fit).max() / length) if length else 0.0,
-        evaluations=int(found.nfev),
     )

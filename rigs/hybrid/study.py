@@ -17,19 +17,25 @@ import numpy.typing as npt
 from bench.campaign import Campaign, ResultTable, Study, StudyResult
 from bench.identification import measure_errors
 from bench.journal import Record
-from bench.model_file import HybridFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
+from bench.results.model_file import ModelFile
 from bench.runs import RunResult
-from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE, WITNESS
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
+    BASE,
+    CURRENT,
+    DEFLECTION,
     REFERENCE,
+    TIP,
+    VOLTAGE,
+    WITNESS,
     HybridIdentification,
     Samples,
     bandwidth_of,
     identify_hybrid,
     read_loop,
     read_loops,
+    signal_names,
     sine_at,
 )
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
@@ -231,7 +237,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     sources = [run.folder for run in (runs.steps, runs.static, runs.loops, runs.step)]
     found = identify_hybrid(*sources)
     model = campaign.folder / "hybrid.json"
-    HybridFile(found.model, {"sources": [folder.name for folder in sources]}).save(model)
+    ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
 
     # Only the hybrid controller needs long holds.
     tracked = {
@@ -401,8 +407,8 @@ def _panels(found: HybridIdentification, runs: _Runs) -> Iterator[_Panel]:
     yield _Panel("figure-12-static-temperature", "current / A", warmth, compared(around, around[CURRENT], second))
     yield _Panel("figure-13-temperature-steps", "time / s", warmth, compared(stepped, stepped.times))
     with Record(runs.static.folder) as record:
-        curve = record.steps()
-    rises = curve[TIP] - REFERENCE
+        curve, names = record.steps(), signal_names(record)
+    rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]] * 1e6
     ordered = np.sort(rises)
     by_heat, by_voltage = SENSITIVITIES
     yield _Panel(
@@ -410,7 +416,7 @@ def _panels(found: HybridIdentification, runs: _Runs) -> Iterator[_Panel]:
         "temperature of the tip less 22 °C / K",
         bending,
         [
-            Curve("measured", rises, curve[DEFLECTION] * 1e6),
+            Curve("measured", rises, deflections),
             Curve("linear, from geometry", ordered, by_heat * ordered * 1e6),
             Curve(f"polynomial, order {found.order.order}", ordered, found.model.polynomial.evaluate(ordered) * 1e6),
         ],

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from bench.campaign import Campaign, ResultTable
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
-from bench.model_file import CoupledFile
 from bench.results.figures import Curve, plot_panels
+from bench.results.model_file import ModelFile
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -84,7 +84,7 @@ class Characterization:
 
     def keep_model(self, campaign: Campaign) -> None:
         """Put the two-stage model into the record of every run of a campaign, for the view of its densities."""
-        content = CoupledFile("two-stage", self.models["two-stage"].model).to_json()
+        content = ModelFile("two-stage", self.models["two-stage"].model).to_json()
         for run in campaign.runs:
             add_model(run.folder, "two-stage", 0.0, content)
 

@@ -26,12 +26,12 @@ from typing import ClassVar, Protocol
 
 from bench.control.baselines import saturation
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.inverse import Reach
 from bench.control.loops import SHORTEST_WAIT
-from bench.control.tracking import Actuator, Command, Trace, check_positive, widened
+from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState, _checks
+from bench.hysteresis.inverse import Reach
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,7 +367,7 @@ class _Modelled(MuscleController):
     ) -> None:
         self._parameters = p = parameters or InverseControlParameters()
         model = task.inverse.model
-        super().__init__(Actuator(model.first.input_range, limits).limits, p.period, p.duration)
+        super().__init__(ControllerBase(model.first.input_range, limits).limits, p.period, p.duration)
         self._task = task
         self._state = model.initial_state() if state is None else state
         self._lag = ThermalLag(p.time_constant, self._state.voltage**2)
@@ -538,7 +538,7 @@ class MuscleProportionalIntegral(MuscleController):
     """
 
     def __init__(self, limits: tuple[float, float], parameters: ProportionalIntegralParameters) -> None:
-        super().__init__(Actuator(limits).limits, parameters.period, parameters.duration)
+        super().__init__(ControllerBase(limits).limits, parameters.period, parameters.duration)
         self._parameters = parameters
         self._error: float | None = None
         self._started = False

@@ -26,7 +26,7 @@ from bench.identification.two_stage import (
     identify_two_stage,
 )
 from bench.journal import Record
-from bench.model_file import CoupledFile
+from bench.results.model_file import ModelFile
 from protocols.muscles.parts import SAMPLE
 
 Floats = npt.NDArray[np.float64]
@@ -133,12 +133,12 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         raise DataError(f"model {name} cannot be identified: {error}") from error
 
 
-def muscle_file(name: ModelName, found: CoupledIdentification[Any], sources: Sequence[Path]) -> CoupledFile:
+def muscle_file(name: ModelName, found: CoupledIdentification[Any], sources: Sequence[Path]) -> ModelFile:
     """Return the model file of an identification; `sources` are the runs that it comes from."""
-    return CoupledFile(
+    return ModelFile(
         name,
         found.model,
-        {
+        provenance={
             "sources": [source.name for source in sources],
             "errors": {kind: errors_json(errors) for kind, errors in found.errors.items()},
             "kkt": {stage: certificate.kkt_residual for stage, certificate in found.certificates.items()},

@@ -19,8 +19,8 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.modelling import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
+from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.runs import RunResult
 
@@ -54,7 +54,9 @@ class PaperModel(NamedTuple):
 
 
 MODELS = {
-    "nonmonotonic": PaperModel("proposed model", PROPOSED, {"levels": 20, "plane": (30.0, 70.0)}, 46.8, 108.1),
+    "nonmonotonic": PaperModel(
+        "proposed model", PROPOSED, {"levels": 20, "plane": (30.0, 70.0), "reference": 20.0}, 46.8, 108.1
+    ),
     "signed": PaperModel("signed Preisach", "preisach-signed", {"levels": 20, "plane": (21.0, 84.0)}, 80.3, 108.8),
     "polynomial": PaperModel("polynomial, degree 12", "polynomial", {"degree": 12}, 483.0, 478.1),
 }

@@ -14,6 +14,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import FILE_NAME, Record
+from bench.results.model_file import load_model
 
 FAST = ["--rig", "vo2", "--clock", "virtual"]
 # On the clock of a busy machine: neither the watchdog of the output nor a late answer ends the run.
@@ -361,7 +362,7 @@ class TestIdentifyAndPredict:
             )
             assert code == 0
             results.append(json.loads((tmp_path / "r.json").read_text()))
-            operator = json.loads((tmp_path / "m.json").read_text())["operator"]
+            operator = json.loads((tmp_path / "m.json").read_text())["model"]
             assert (operator["input_unit"], operator["output_unit"]) == ("°C", "1/m")
         assert results[0] == results[1]
 
@@ -373,7 +374,10 @@ class TestIdentifyAndPredict:
             (lambda text: replace_cell(text, 7, "nan"), ["row 7", "voltage", "finite"]),
             (lambda text: replace_cell(text, 9, ""), ["row 9", "voltage", "empty"]),
             (lambda text: "\n".join(text.splitlines()[:5]) + "\n", ["4 rows", "10"]),
-            (lambda text: re.sub(r"(?m)^-?[0-9.e-]+,", "1.5,", text), ["voltage", "1.5", "excites nothing"]),
+            (
+                lambda text: re.sub(r"(?m)^-?[0-9.e-]+,", "1.5,", text),
+                ["voltage", "1.5", "nothing can be identified"],
+            ),
             (lambda _: "", ["empty"]),
         ],
         ids=["column", "text", "nan", "empty cell", "few rows", "constant", "empty file"],
@@ -415,8 +419,8 @@ class TestIdentifyAndPredict:
         [
             (lambda model: {**model, "version": 99}, "version 99"),
             (lambda model: {**model, "format": "other"}, "not a model file"),
-            (lambda model: {key: value for key, value in model.items() if key != "operator"}, "operator"),
-            (lambda model: {**model, "operator": {**model["operator"], "density": [1.0]}}, "density"),
+            (lambda model: {key: value for key, value in model.items() if key != "model"}, "model"),
+            (lambda model: {**model, "model": {**model["model"], "density": [1.0]}}, "density"),
             (lambda _: [], "not a model file"),
         ],
     )
@@ -486,18 +490,21 @@ class TestTheCoreOnTheCommandLine:
         assert code == 0, err
         assert json.loads((tmp_path / "inverse.json").read_text())["largest_residual"] < 1e-9
 
-    def test_a_model_with_plateaus_is_not_inverted(self, bench, tmp_path):
-        write_loop(tmp_path / "loop.csv")
+    def test_a_model_with_plateaus_is_inverted_numerically(self, bench, tmp_path):
+        _, outputs = write_loop(tmp_path / "loop.csv")
         self.identify(bench, tmp_path, "plays", "--model", "prandtl-ishlinskii")
         model = json.loads((tmp_path / "plays.json").read_text())
-        model["operator"]["weights"][0] = 0.0
+        model["model"]["weights"][0] = 0.0
         (tmp_path / "plays.json").write_text(json.dumps(model))
         code, _, err = bench(
             "invert", tmp_path / "plays.json", tmp_path / "loop.csv", "--column", "displacement", "--out",
-            tmp_path / "inverse.csv",
+            tmp_path / "inverse.csv", "--json", tmp_path / "inverse.json",
         )  # fmt: skip
-        assert code == 3
-        assert "no inverse" in err
+        assert code == 0, err
+        inverted = json.loads((tmp_path / "inverse.json").read_text())
+        low, high = load_model(tmp_path / "plays.json").operator.output_range()
+        assert inverted["met"] == np.count_nonzero((low <= outputs) & (outputs <= high)) > 300
+        assert inverted["largest_residual"] < 1e-9
 
     def test_models_are_compared_raw_and_rezeroed(self, bench, tmp_path):
         inputs, outputs = write_loop(tmp_path / "loop.csv")
@@ -587,7 +594,7 @@ class TestIdentifyMuscle:
             assert 0 < errors["average"] <= errors["rms"] < 20
             assert f"{kind} average {errors['average']:.2f} %, RMS {errors['rms']:.2f} %" in text
         model = json.loads((tmp_path / "model.json").read_text())
-        assert model["format"] == "bench-coupled-model"
+        assert (model["format"], model["kind"]) == ("bench-model", "two-stage")
         assert model["provenance"]["sources"] == [Path(muscle_runs[kind]).name for kind in self.KINDS]
         assert all(residual < 1e-10 for residual in model["provenance"]["kkt"].values())
 
@@ -637,7 +644,7 @@ class TestIdentifyMuscle:
         )  # fmt: skip
         assert code == 3
         assert err.count("error:") == 1
-        assert "is not a model file" in re.sub(r"\s+", " ", err)
+        assert "is of the kind two-stage; expected one of one input" in re.sub(r"\s+", " ", err)
 
 
 class TestReportAndExport:
@@ -757,7 +764,7 @@ class TestIdentifyHybrid:
         for name in ("seebeck", "electrical_resistance", "real pole", "frequency", "damping"):
             assert name in text
         model = json.loads((tmp_path / "model.json").read_text())
-        assert model["format"] == "bench-hybrid-model"
+        assert (model["format"], model["kind"]) == ("bench-model", "hybrid")
         assert model["provenance"]["sources"] == [Path(hybrid_runs[part]).name for part in self.PARTS]
         assert model["model"]["dynamics"]["frequency"] == result["poles_rad_s"]["resonance"]
 
@@ -809,7 +816,7 @@ class TestIdentifyHybrid:
         )  # fmt: skip
         assert code == 3
         assert err.count("error:") == 1
-        assert "is not a model file" in re.sub(r"\s+", " ", err)
+        assert "is of the kind hybrid; expected one of one input" in re.sub(r"\s+", " ", err)
 
 
 class TestHelpOfTheHybrid:

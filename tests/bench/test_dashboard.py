@@ -33,8 +33,8 @@ from bench.hysteresis import (
 )
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.layout import DashboardLayout, XYPlot
-from bench.model_file import CoupledFile, ModelFile
 from bench.protocol import TRACES
+from bench.results.model_file import ModelFile
 from bench.settling import Settled
 
 
@@ -373,7 +373,7 @@ def rebuilt(run_folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def muscle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    models = {"two-stage": CoupledFile("two-stage", make_wire()).to_json()}
+    models = {"two-stage": ModelFile("two-stage", make_wire()).to_json()}
     return keep_muscle_journal(tmp_path_factory.mktemp("runs") / "run", models)
 
 
@@ -534,7 +534,7 @@ def test_both_densities_of_a_two_stage_model_are_drawn(muscle: Path) -> None:
 def test_stages_that_have_a_density_are_drawn(
     tmp_path: Path, model: TwoStage | Summed | Linear, planes: dict[str, str]
 ) -> None:
-    path = keep_muscle_journal(tmp_path / "run", {"wire": CoupledFile("wire", model).to_json()})
+    path = keep_muscle_journal(tmp_path / "run", {"wire": ModelFile("wire", model).to_json()})
     found = read(path)
     titles = {origin: found[origin + "/legend/title"]["labels"][0][1] for origin in planes}
     assert titles == planes
@@ -547,7 +547,7 @@ def test_stages_that_have_a_density_are_drawn(
 def test_the_force_of_a_stage_is_never_taken_for_the_measured_one(tmp_path: Path) -> None:
     first, second = MUSCLE_LAYOUT.plots["loops.1."], MUSCLE_LAYOUT.plots[""]
     layout = MUSCLE_LAYOUT.model_copy(update={"plane": (0.0, 12.0), "loops": (second,), **first.model_dump()})
-    path = keep_muscle_journal(tmp_path / "run", {"wire": CoupledFile("wire", make_wire()).to_json()}, layout)
+    path = keep_muscle_journal(tmp_path / "run", {"wire": ModelFile("wire", make_wire()).to_json()}, layout)
     found = read(path)
     assert "/plane/density" not in found
     assert found["/plane/axes/titles"]["labels"] == [["β [N]", "α [N]"]]
@@ -570,14 +570,14 @@ def test_an_operator_over_another_signal_has_its_own_plane(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("document", [{"format": "bench-other-model", "version": 1}, {}, [1, 2], "text", None])
 def test_other_models_are_left_out(tmp_path: Path, document: object) -> None:
-    models = {"two-stage": CoupledFile("two-stage", make_wire()).to_json(), "other": document}
+    models = {"two-stage": ModelFile("two-stage", make_wire()).to_json(), "other": document}
     found = read(keep_muscle_journal(tmp_path / "run", models))
     assert found["/plane/legend/title"]["labels"] == [["two-stage", "density H1 [N/V²]"]]
     assert found["/planes/H2/legend/title"]["labels"] == [["two-stage", "density H2 [µm/N²]"]]
 
 
 def test_a_damaged_model_is_named(tmp_path: Path) -> None:
-    document = CoupledFile("two-stage", make_wire()).to_json()
+    document = ModelFile("two-stage", make_wire()).to_json()
     with pytest.raises(DataError, match="model two-stage is damaged: key 'model' is missing"):
         keep_muscle_journal(tmp_path / "run", {"two-stage": {k: v for k, v in document.items() if k != "model"}})
     assert not (tmp_path / "run" / "rebuilt.rrd").exists()

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.journal import FILE_NAME, Journal, StepRecord
-from bench.measurements import Columns, check_excitation, read_columns, split_unit, write_csv
+from bench.results.data import Columns, check_excitation, read_columns, split_unit, write_csv
 from bench.settling import Settled
 
 
@@ -220,7 +220,9 @@ class TestExcitation:
         assert check_excitation(self.columns(range(20)), "force") == []
 
     def test_constant(self):
-        with pytest.raises(DataError, match=r"data\.csv: column force is 3 in all 20 rows; it excites nothing"):
+        with pytest.raises(
+            DataError, match=r"data\.csv: column force is 3 in all 20 rows, so nothing can be identified"
+        ):
             check_excitation(self.columns([3.0] * 20), "force")
 
     def test_plateaus_are_odd_though_usable(self):

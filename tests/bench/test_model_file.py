@@ -20,21 +20,7 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.model_file import (
-    COUPLED_FORMAT,
-    FORMAT,
-    HYBRID_FORMAT,
-    VERSION,
-    CoupledFile,
-    HybridFile,
-    ModelFile,
-    is_coupled_model,
-    load_coupled_model,
-    load_hybrid_model,
-    load_model,
-    parse_coupled_model,
-    parse_model,
-)
+from bench.results.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
@@ -122,12 +108,12 @@ class TestUnusable:
         with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
             parse_model(document, "m.json")
 
-    @pytest.mark.parametrize("version", [0, 2, "1", None, [1]])
+    @pytest.mark.parametrize("version", [0, 3, "1", None, [1]])
     def test_another_version(self, version):
-        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
+        with pytest.raises(DataError, match=f"has version .*; this bench reads versions 1 and {VERSION}"):
             parse_model({**content(), "version": version}, "m.json")
 
-    @pytest.mark.parametrize("key", ["name", "operator", "memory", "provenance"])
+    @pytest.mark.parametrize("key", ["name", "kind", "model", "memory", "provenance"])
     def test_a_missing_key_is_named(self, key):
         document = content()
         del document[key]
@@ -137,29 +123,29 @@ class TestUnusable:
     @pytest.mark.parametrize(
         ("path", "value"),
         [
-            (("operator",), None),
-            (("operator",), []),
-            (("operator", "type"), "magic"),
-            (("operator", "type"), ["preisach"]),
-            (("operator", "levels"), [30.0, 20.0]),
-            (("operator", "levels"), "abc"),
-            (("operator", "density"), [1.0]),
-            (("operator", "density"), [math.nan] * 10),
-            (("operator", "density"), [10**400] * 10),
-            (("operator", "bias"), "much"),
-            (("operator", "bias"), math.inf),
-            (("operator", "bias"), 10**400),
-            (("operator", "bias"), None),
-            (("operator", "input_range"), [1.0]),
-            (("operator", "input_range"), "ab"),
-            (("operator", "input_unit"), 5),
-            (("operator", "output_unit"), ["1/m"]),
-            (("operator", "reversible"), 5),
-            (("operator", "reversible"), {"type": "magic"}),
-            (("operator", "reversible", "k0"), "2.8"),
-            (("operator", "reversible", "k0"), None),
-            (("operator", "reversible", "low"), 80.0),
-            (("operator", "reversible", "extra"), 1.0),
+            (("model",), None),
+            (("model",), []),
+            (("model", "type"), "magic"),
+            (("model", "type"), ["preisach"]),
+            (("model", "levels"), [30.0, 20.0]),
+            (("model", "levels"), "abc"),
+            (("model", "density"), [1.0]),
+            (("model", "density"), [math.nan] * 10),
+            (("model", "density"), [10**400] * 10),
+            (("model", "bias"), "much"),
+            (("model", "bias"), math.inf),
+            (("model", "bias"), 10**400),
+            (("model", "bias"), None),
+            (("model", "input_range"), [1.0]),
+            (("model", "input_range"), "ab"),
+            (("model", "input_unit"), 5),
+            (("model", "output_unit"), ["1/m"]),
+            (("model", "reversible"), 5),
+            (("model", "reversible"), {"type": "magic"}),
+            (("model", "reversible", "k0"), "2.8"),
+            (("model", "reversible", "k0"), None),
+            (("model", "reversible", "low"), 80.0),
+            (("model", "reversible", "extra"), 1.0),
             (("memory",), []),
             (("memory",), False),
             (("memory", "extrema"), [1.0, 2.0, 3.0]),
@@ -256,8 +242,8 @@ class TestCoupled:
     @pytest.mark.parametrize("name", list(COUPLED))
     def test_round_trip(self, tmp_path, name):
         path = tmp_path / "model.json"
-        CoupledFile(name, COUPLED[name], {"source": "runs"}).save(path)
-        loaded = load_coupled_model(path)
+        ModelFile(name, COUPLED[name], provenance={"source": "runs"}).save(path)
+        loaded = load_model(path)
         assert loaded.name == name
         assert loaded.provenance["source"] == "runs"
         assert type(loaded.model) is type(COUPLED[name])
@@ -266,15 +252,11 @@ class TestCoupled:
             loaded.model.evaluate(voltages, forces), COUPLED[name].evaluate(voltages, forces)
         )
         assert loaded.to_json() == json.loads(path.read_text(encoding="utf-8"))
-        assert is_coupled_model(loaded.to_json())
+        assert loaded.to_json()["kind"] == name
 
-    def test_neither_kind_passes_for_the_other(self):
-        coupled = CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
-        assert not is_coupled_model(content())
-        with pytest.raises(DataError, match=f"its `format` is not '{FORMAT}'"):
-            parse_model(coupled, "m.json")
-        with pytest.raises(DataError, match=f"its `format` is not '{COUPLED_FORMAT}'"):
-            parse_coupled_model(content(), "m.json")
+    def test_has_no_operator(self):
+        with pytest.raises(DataError, match="model two-stage is of the kind two-stage; expected one of one input"):
+            _ = ModelFile("two-stage", COUPLED["two-stage"]).operator
 
     @pytest.mark.parametrize(
         "change",
@@ -288,16 +270,16 @@ class TestCoupled:
         ],
     )
     def test_damaged(self, change):
-        document = {**CoupledFile("two-stage", COUPLED["two-stage"]).to_json(), **change}
+        document = {**ModelFile("two-stage", COUPLED["two-stage"]).to_json(), **change}
         with pytest.raises(DataError, match=r"m\.json"):
-            parse_coupled_model(document, "m.json")
+            parse_model(document, "m.json")
 
     @pytest.mark.parametrize("key", ["name", "model", "provenance"])
     def test_a_missing_key(self, key):
-        document = CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
+        document = ModelFile("two-stage", COUPLED["two-stage"]).to_json()
         del document[key]
         with pytest.raises(DataError, match=f"key '{key}' is missing"):
-            parse_coupled_model(document, "m.json")
+            parse_model(document, "m.json")
 
 
 HYBRID = HybridModel(
@@ -316,7 +298,7 @@ def hybrid_file(tmp_path):
     """Write the content of the file of a hybrid model, with values at some paths replaced or taken away."""
 
     def write(changes=(), missing=()):
-        document = json.loads(json.dumps(HybridFile(HYBRID, {"sources": ["a", "b"]}).to_json()))
+        document = json.loads(json.dumps(ModelFile("hybrid", HYBRID, provenance={"sources": ["a", "b"]}).to_json()))
         for path, value in changes:
             *parents, key = path
             node = document
@@ -338,18 +320,18 @@ def hybrid_file(tmp_path):
 class TestHybrid:
     def test_round_trip(self, tmp_path):
         path = tmp_path / "model.json"
-        HybridFile(HYBRID, {"sources": ["µ", "b"], "rms": 0.1 + 0.2}).save(path)
-        loaded = load_hybrid_model(path)
+        ModelFile("hybrid", HYBRID, provenance={"sources": ["µ", "b"], "rms": 0.1 + 0.2}).save(path)
+        loaded = load_model(path)
         assert loaded.provenance["sources"] == ["µ", "b"]
         assert loaded.provenance["rms"] == 0.1 + 0.2
         assert loaded.provenance["bench"]
         assert loaded.to_json() == json.loads(path.read_text(encoding="utf-8"))
-        assert loaded.to_json()["format"] == HYBRID_FORMAT
+        assert loaded.to_json()["kind"] == "hybrid"
         assert loaded.to_json()["name"] == "hybrid"
 
     def test_what_was_loaded_simulates_the_same(self, tmp_path):
-        HybridFile(HYBRID).save(tmp_path / "model.json")
-        model = load_hybrid_model(tmp_path / "model.json").model
+        ModelFile("hybrid", HYBRID).save(tmp_path / "model.json")
+        model = load_model(tmp_path / "model.json").model
         assert (model.reference, model.network, model.dynamics) == (21.5, HYBRID.network, PUBLISHED_DYNAMICS)
         assert model.bandwidth() == HYBRID.bandwidth()
         t = np.arange(200.0)
@@ -361,39 +343,37 @@ class TestHybrid:
             )
 
     def test_saving_what_was_loaded_gives_the_same_file(self, tmp_path):
-        HybridFile(HYBRID).save(tmp_path / "a.json")
-        load_hybrid_model(tmp_path / "a.json").save(tmp_path / "b.json")
+        ModelFile("hybrid", HYBRID).save(tmp_path / "a.json")
+        load_model(tmp_path / "a.json").save(tmp_path / "b.json")
         assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
 
     def test_saving_where_it_cannot(self, tmp_path):
         with pytest.raises(DataError, match="cannot be written"):
-            HybridFile(HYBRID).save(tmp_path / "absent" / "m.json")
+            ModelFile("hybrid", HYBRID).save(tmp_path / "absent" / "m.json")
 
     def test_no_kind_passes_for_another(self, tmp_path):
-        hybrid, coupled = HybridFile(HYBRID).to_json(), CoupledFile("two-stage", COUPLED["two-stage"]).to_json()
-        assert not is_coupled_model(hybrid)
-        for parse, format_ in ((parse_model, FORMAT), (parse_coupled_model, COUPLED_FORMAT)):
-            with pytest.raises(DataError, match=f"its `format` is not '{format_}'"):
-                parse(hybrid, "m.json")
-        for document in (content(), coupled, [], None, "x"):
-            (tmp_path / "m.json").write_text(json.dumps(document))
-            with pytest.raises(
-                DataError, match=rf"m\.json is not a model file: its `format` is not '{HYBRID_FORMAT}'"
-            ):
-                load_hybrid_model(tmp_path / "m.json")
+        path = tmp_path / "m.json"
+        for document, kind in ((content(), "preisach"), (ModelFile("x", COUPLED["summed"]).to_json(), "summed")):
+            path.write_text(json.dumps(document))
+            with pytest.raises(DataError, match=rf"m\.json: expected a model of the kind 'hybrid', got '{kind}'"):
+                load_model(path, "hybrid")
+        for document in ([], None, "x", {"format": "other"}, {"format": ["bench-model"]}):
+            path.write_text(json.dumps(document))
+            with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
+                load_model(path, "hybrid")
 
     def test_no_file_and_no_json(self, tmp_path):
         with pytest.raises(DataError, match=r"absent\.json cannot be read: No such file"):
-            load_hybrid_model(tmp_path / "absent.json")
+            load_model(tmp_path / "absent.json")
         for text in (b"", b"{", b"\xff\xfe", b"[" * 100_000):
             (tmp_path / "m.json").write_bytes(text)
             with pytest.raises(DataError, match=r"m\.json"):
-                load_hybrid_model(tmp_path / "m.json")
+                load_model(tmp_path / "m.json")
 
-    @pytest.mark.parametrize("version", [0, 2, "1", None])
+    @pytest.mark.parametrize("version", [0, 3, "1", None])
     def test_another_version(self, hybrid_file, version):
-        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
-            load_hybrid_model(hybrid_file([(("version",), version)]))
+        with pytest.raises(DataError, match=f"has version .*; this bench reads versions 1 and {VERSION}"):
+            load_model(hybrid_file([(("version",), version)]))
 
     @pytest.mark.parametrize(
         "path",
@@ -409,7 +389,7 @@ class TestHybrid:
     )
     def test_a_missing_key_is_named(self, hybrid_file, path):
         with pytest.raises(DataError, match=rf"m\.json is damaged: .*{path[-1]}"):
-            load_hybrid_model(hybrid_file(missing=[path]))
+            load_model(hybrid_file(missing=[path]))
 
     @pytest.mark.parametrize(
         ("path", "value"),
@@ -440,13 +420,13 @@ class TestHybrid:
     )
     def test_wrong_values(self, hybrid_file, path, value):
         with pytest.raises(DataError, match=r"m\.json is damaged: "):
-            load_hybrid_model(hybrid_file([(path, value)]))
+            load_model(hybrid_file([(path, value)]))
 
 
 @settings(max_examples=300, deadline=None)
 @given(data=st.data())
 def test_any_mutation_of_a_hybrid_model_is_usable_or_a_data_error(tmp_path_factory, data):
-    document = json.loads(json.dumps(HybridFile(HYBRID).to_json()))
+    document = json.loads(json.dumps(ModelFile("hybrid", HYBRID).to_json()))
     *parents, key = data.draw(st.sampled_from(list(_paths(document))))
     node = document
     for part in parents:
@@ -458,10 +438,67 @@ def test_any_mutation_of_a_hybrid_model_is_usable_or_a_data_error(tmp_path_facto
     path = tmp_path_factory.getbasetemp() / "mutated-hybrid.json"
     path.write_text(json.dumps(document), encoding="utf-8")
     try:
-        file = load_hybrid_model(path)
+        file = load_model(path)
     except DataError as error:
         assert "mutated-hybrid.json" in str(error)  # noqa: PT017 - either way is right
         return
     with np.errstate(over="ignore", invalid="ignore"):
         assert file.model.thermal_deflection([0.0]).shape == (1,)
     json.dumps(file.to_json())
+
+
+def version_1(document, format_):
+    """The same model as a file of version 1."""
+    former = {key: value for key, value in document.items() if key not in ("kind", "model", "memory")}
+    former |= {"format": format_, "version": 1}
+    if format_ == FORMAT:
+        return {**former, "operator": document["model"], "memory": document["memory"]}
+    return {**former, "model": document["model"]}
+
+
+@pytest.mark.parametrize(
+    ("file", "format_"),
+    [
+        *(
+            (ModelFile(name, model, None if name == "polynomial" else MEMORY), FORMAT)
+            for name, model in MODELS.items()
+        ),
+        (ModelFile("plays", HYBRID.hysteresis, (1.0, 2.0, 3.0, 4.0)), FORMAT),
+        *((ModelFile(name, model), "bench-coupled-model") for name, model in COUPLED.items()),
+        (ModelFile("hybrid", HYBRID), "bench-hybrid-model"),
+    ],
+)
+def test_files_of_version_1_are_read(file, format_):
+    document = version_1(json.loads(json.dumps(file.to_json())), format_)
+    again = parse_model(document, "m.json")
+    assert again.to_json() == file.to_json()
+    assert again.memory == file.memory
+    del document["operator" if format_ == FORMAT else "model"]
+    with pytest.raises(DataError, match=r"m\.json is damaged: key '\w+' is missing"):
+        parse_model(document, "m.json")
+
+
+class TestUnregistered:
+    def test_is_refused_when_it_is_saved(self, tmp_path):
+        class Other(Polynomial):
+            kind = "other"
+
+        with pytest.raises(DataError, match=r"m\.json is not written.*Other.*register it.*bench\.models"):
+            ModelFile("other", Other([1.0], (0.0, 1.0))).save(tmp_path / "m.json")
+        assert not list(tmp_path.iterdir())
+
+    def test_is_refused_although_its_kind_is_that_of_another(self, tmp_path):
+        class Other(Polynomial):
+            pass
+
+        with pytest.raises(DataError, match=r"not the class registered for the kind 'polynomial'"):
+            ModelFile("other", Other([1.0], (0.0, 1.0))).save(tmp_path / "m.json")
+
+    def test_an_unknown_kind_is_named(self):
+        document = content() | {"kind": "spline", "model": {"type": "spline"}}
+        with pytest.raises(DataError, match=r"expected a model of the kind .*got 'spline'; other kinds"):
+            parse_model(document, "m.json")
+
+    def test_kind_and_type_must_agree(self):
+        with pytest.raises(DataError, match="kind: expected 'preisach', the type of the model, got 'polynomial'"):
+            parse_model(content() | {"kind": "polynomial"}, "m.json")

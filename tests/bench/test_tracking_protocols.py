@@ -13,7 +13,7 @@ from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_le
 from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
-from bench.model_file import ModelFile
+from bench.results.model_file import ModelFile
 from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
@@ -57,7 +57,7 @@ def models(operator, tmp_path_factory):
     ModelFile("preisach-nonmonotonic", operator, operator.initial_state().advance(inputs)).save(paths["preisach"])
     ModelFile("polynomial", fitted, None).save(paths["polynomial"])
     other = json.loads(paths["preisach"].read_text())
-    other["operator"]["output_unit"] = "µm"
+    other["model"]["output_unit"] = "µm"
     paths["micrometres"] = folder / "micrometres.json"
     paths["micrometres"].write_text(json.dumps(other))
     wide = Preisach(uniform_levels(10.0, 70.0, 20), operator.density, input_unit="°C", output_unit="1/m")

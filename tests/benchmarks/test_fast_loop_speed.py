@@ -12,7 +12,6 @@ from bench.protocol import FixedRate, ProtocolParameters, protocol
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import trace_signals
-from protocols.hybrid import DEFLECTION
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
@@ -21,6 +20,7 @@ pytestmark = pytest.mark.benchmark
 
 RATE, COUNT = 20e3, 20_000
 STEP = 5e-6
+DEFLECTION = "displacement_position"
 
 
 class Nothing(ProtocolParameters):

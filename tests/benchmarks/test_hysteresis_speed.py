@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 from bench.control.adaptation import Adapter
-from bench.control.inverse import Inverse
 from bench.hysteresis import PrandtlIshlinskii, Preisach, ThermalExpansion, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import damped_oscillation
 
 pytestmark = pytest.mark.benchmark
@@ -102,7 +102,7 @@ def test_inverse(capsys):
     rows = []
     for order in (20, 50, 100, 200):
         operator = film(order)
-        inverse = Inverse(operator)
+        inverse = PreisachInverse(operator)
         least, greatest = operator.output_range()
         t = np.arange(100_000)
         middle, reach = 0.5 * (least + greatest), 0.45 * (greatest - least)
@@ -145,7 +145,7 @@ def by_whole_model(operator, state, target, value, output):
     step = 0.5 * error / (change[:cells] @ change[:cells] + 1.0) * change[:cells]
     coefficients[:cells] = np.maximum(0.0, coefficients[:cells] + step)
     other = operator.with_coefficients(coefficients, operator.bias)
-    return other, Inverse(other).invert(state.step(value), target)
+    return other, PreisachInverse(other).invert(state.step(value), target)
 
 
 def test_adaptation(capsys):
@@ -194,7 +194,7 @@ def test_plays(capsys):
     operator = PrandtlIshlinskii(thresholds, np.exp(-np.arange(15) / 5.0) / 50.0, input_range=(-40.0, 40.0))
     inputs = 40.0 * np.sin(np.arange(100_000) / 300.0)
     forward = median_of(lambda: operator.evaluate(inputs)) / inputs.size
-    outputs, inverse = operator.evaluate(inputs), operator.inverse()
+    outputs, inverse = operator.evaluate(inputs), operator.inverse_operator()
     backward = median_of(lambda: inverse.evaluate(outputs)) / inputs.size
     worst = np.abs(inverse.evaluate(outputs) - inputs).max()
     slow = median_of(lambda: by_play_loop(operator, inputs[:5000]), 3) / 5000

@@ -37,7 +37,9 @@ def models():
         plant.regulate(float(setpoint))
         plant.advance(8.0)
         readings.append(plant.curvature + READING_NOISE * rng.standard_normal())
-    film = identify("preisach-nonmonotonic", setpoints, readings, input_range=OPERATING).model
+    film = identify(
+        "preisach-nonmonotonic", setpoints, readings, input_range=OPERATING, plane=(30, 70), reference=20
+    ).model
     polynomial = identify("polynomial", setpoints, readings, input_range=OPERATING).model
     return Models(film, polynomial)
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.control.adaptation import Adapter
-from bench.control.inverse import Inverse
 from bench.hysteresis import MemoryCurve, Preisach, QuadraticTerm, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse
 
 
 def plant(order=20, seed=0, term=None, bias=0.3):
@@ -75,7 +75,7 @@ def test_equals_the_definition(seed, uneven, noise):
         assert adapter.model.lattice.offset == pytest.approx(fresh.offset, abs=1e-9)
         assert adapter.model.value(state) == pytest.approx(expected.value(state), abs=1e-9)
         target = rng.normal()
-        found, wanted = adapter.inverse.invert(state, target), Inverse(expected).invert(state, target)
+        found, wanted = adapter.inverse.invert(state, target), PreisachInverse(expected).invert(state, target)
         assert found.outputs == pytest.approx(wanted.outputs, abs=1e-8)
         assert found.reach == wanted.reach
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.control.inverse import Inverse
 from bench.control.references import (
     AddedSine,
     SmoothMoves,
@@ -17,6 +16,7 @@ from bench.control.references import (
     tracking_targets,
 )
 from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse
 
 MICRO, NANO = 1e-6, 1e-9
 SPEED = 3 * MICRO
@@ -78,14 +78,14 @@ class TestFastestSlope:
         levels = uniform_levels(0.0, 10.0, 4)
         line = Preisach(levels, np.zeros(10), 0.0, QuadraticTerm(2.0))
         times = np.linspace(0.0, 4.0, 401)
-        slope = fastest_slope(Inverse(line), times, 5.0 + 4.0 * np.sin(times))
+        slope = fastest_slope(PreisachInverse(line), times, 5.0 + 4.0 * np.sin(times))
         assert slope.rate == pytest.approx(2.0, rel=1e-3)
         assert slope.time == pytest.approx(0.0, abs=0.02) or slope.time == pytest.approx(math.pi, abs=0.02)
         assert slope.within(2.1)
         assert not slope.within(1.9)
 
     def test_a_plate_follows_slow_sines_and_not_fast_ones(self, models):
-        inverse = Inverse(models.film)
+        inverse = PreisachInverse(models.film)
         rates = []
         for period in (200.0, 60.0, 2.0):
             times = np.arange(0.0, 5.0 * period, period / 400.0)
@@ -100,11 +100,11 @@ class TestFastestSlope:
 
     def test_references_that_cannot_be_met(self, models):
         with pytest.raises(ValueError, match=r"reference: expected values within .* got 2000 at 1 s"):
-            fastest_slope(Inverse(models.film), [0.0, 1.0, 2.0], [100.0, 2000.0, 100.0])
+            fastest_slope(PreisachInverse(models.film), [0.0, 1.0, 2.0], [100.0, 2000.0, 100.0])
         with pytest.raises(ValueError, match="one for each time"):
-            fastest_slope(Inverse(models.film), [0.0, 1.0, 2.0], [100.0, 200.0])
+            fastest_slope(PreisachInverse(models.film), [0.0, 1.0, 2.0], [100.0, 200.0])
         with pytest.raises(ValueError, match="times"):
-            fastest_slope(Inverse(models.film), [0.0, 2.0, 1.0], [100.0, 200.0, 100.0])
+            fastest_slope(PreisachInverse(models.film), [0.0, 2.0, 1.0], [100.0, 200.0, 100.0])
 
 
 def test_smooth_moves_visit_the_positions():

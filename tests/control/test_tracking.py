@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
-from bench.control.inverse import Inverse, Reach
 from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
 from bench.control.references import modulated_sine, tracking_targets
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse, Reach
 
 LOW, HIGH = 21.0, 84.0
 NARROW = (45.0, 66.0)
@@ -24,7 +24,7 @@ WITH_MEMORY = ["open", "closed", "latched", "open-follower", "closed-follower"]
 
 
 def make(name, models, limits=(LOW, HIGH), **options):
-    inverse = Inverse(models.film)
+    inverse = PreisachInverse(models.film)
     makers = {
         "open": lambda: OpenLoopInverse(inverse, limits=limits, **options),
         "closed": lambda: ClosedLoopInverse(inverse, limits=limits, **options),
@@ -88,7 +88,7 @@ class TestGoals:
     @pytest.mark.parametrize("seed", SEEDS)
     @pytest.mark.parametrize("policy", ["nearest", "paper"])
     def test_open_loop(self, models, laboratory, seed, policy):
-        controller = OpenLoopInverse(Inverse(models.film, policy))
+        controller = OpenLoopInverse(PreisachInverse(models.film, policy))
         greatest, rms, _, _ = self.run(laboratory, controller, seed)
         assert greatest <= 90.0
         assert rms <= 42.0
@@ -212,7 +212,7 @@ class TestMemory:
 
     def test_goes_on_from_a_given_state(self, models):
         state = MemoryCurve.from_positive_saturation(84.0).step(60.0)
-        controller = ClosedLoopInverse(Inverse(models.film), state)
+        controller = ClosedLoopInverse(PreisachInverse(models.film), state)
         controller.aim(900.0, 0.0, 59.0, 1200.0)
         assert controller.state == state.step(59.0)
 
@@ -323,7 +323,7 @@ class TestReach:
         controller = make(name, models)
         actuator.reach(controller, 500.0)
         target = models.film.output_range()[1] - 1.0
-        found = Inverse(models.film).invert(actuator.state, target)
+        found = PreisachInverse(models.film).invert(actuator.state, target)
         assert len(found.setpoints) == 2
         commands = actuator.reach(controller, target)
         setpoints = [a.setpoint for a, b in pairwise([*commands, commands[-1]]) if a.setpoint != b.setpoint or b is a]
@@ -426,7 +426,7 @@ class TestLatched:
     @pytest.mark.parametrize("target", [100.0, 900.0, 1500.0])
     def test_locks_where_the_output_hardly_answers(self, models, target):
         model = with_wide_loops(models.film)
-        actuator, controller = IdealActuator(model), Latched(Inverse(model))
+        actuator, controller = IdealActuator(model), Latched(PreisachInverse(model))
         actuator.disturbance = 20.0
         actuator.reach(controller, target)
         assert controller.locked
@@ -476,7 +476,7 @@ class TestLatched:
     def test_needs_a_reversible_part(self):
         levels = uniform_levels(0.0, 1.0, 4)
         with pytest.raises(ValueError, match="reversible"):
-            Latched(Inverse(Preisach(levels, np.ones(10))))
+            Latched(PreisachInverse(Preisach(levels, np.ones(10))))
         assert reversible_slope(Preisach(levels, np.ones(10)), 0.5) == 0.0
 
     def test_slope_behind_a_reversal(self, models):
@@ -536,7 +536,7 @@ class TestLookUp:
         with pytest.raises(ValueError, match="wait"):
             LookUp(models.polynomial, wait=0.0)
         with pytest.raises(ValueError, match="wait"):
-            OpenLoopInverse(Inverse(models.film), wait=math.inf)
+            OpenLoopInverse(PreisachInverse(models.film), wait=math.inf)
         with pytest.raises(ValueError, match="gain"):
             IntegralParameters(gain=0.0)
 

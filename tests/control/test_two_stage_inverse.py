@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.control.inverse import Reach
 from bench.control.two_stage_inverse import TwoStageInverse
 from bench.hysteresis import (
     DeadZones,
@@ -20,6 +19,7 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
+from bench.hysteresis.inverse import Reach
 
 
 def preisach(low, high, least, greatest, seed, order=20, zeros=0.85):

@@ -72,7 +72,7 @@ def test_equals_the_definition(inputs, seed, after, before):
 def test_inverse_gives_the_input_back_from_any_state(history, inputs, seed, after, before):
     operator = actuator(seed, after, before, origin=-2.0)
     start = operator.advance(operator.initial_state(), history)
-    inverse = operator.inverse()
+    inverse = operator.inverse_operator()
     outputs = operator.evaluate(inputs, start)
     scale = 40.0 if after or before else 1.0
     np.testing.assert_allclose(inverse.evaluate(outputs, operator.inverse_state(start)), inputs, atol=1e-12 * scale)
@@ -83,13 +83,13 @@ def test_operator_meets_what_the_inverse_asks_for(history, targets, seed):
     operator = actuator(seed)
     start = operator.advance(operator.initial_state(), history)
     wanted = np.array(targets) / 5.0
-    inputs = operator.inverse().evaluate(wanted, operator.inverse_state(start))
+    inputs = operator.inverse_operator().evaluate(wanted, operator.inverse_state(start))
     np.testing.assert_allclose(operator.evaluate(inputs, start), wanted, atol=1e-12)
 
 
 def test_inverse_of_the_inverse_is_the_operator():
     operator = actuator(3, after=True, before=True)
-    twice = operator.inverse().inverse()
+    twice = operator.inverse_operator().inverse_operator()
     np.testing.assert_allclose(twice.thresholds, operator.thresholds, atol=1e-12)
     np.testing.assert_allclose(twice.weights, operator.weights, atol=1e-14)
     np.testing.assert_allclose(twice.after.slopes, operator.after.slopes)
@@ -101,7 +101,7 @@ def test_inverse_of_the_inverse_is_the_operator():
 def test_output_range_bounds_every_walk_and_is_reached(seed, after, inverted):
     operator = actuator(seed, after)
     if inverted:
-        operator = operator.inverse()
+        operator = operator.inverse_operator()
     rng = np.random.default_rng(seed)
     low, high = operator.input_range
     least, greatest = operator.output_range()
@@ -157,7 +157,7 @@ def test_dead_zones():
         (lambda: PrandtlIshlinskii([0.0, 1.0], [1.0]), "weights: expected 2 values"),
         (lambda: PrandtlIshlinskii([0.0, 1.0], [1.0, -2.0]), "weights: expected running sums >= 0"),
         (lambda: PrandtlIshlinskii([0.0, 1.0], [1.0, math.nan]), "weights"),
-        (lambda: PrandtlIshlinskii([0.0, 1.0], [0.0, 1.0]).inverse(), "weights: expected running sums > 0"),
+        (lambda: PrandtlIshlinskii([0.0, 1.0], [0.0, 1.0]).inverse_operator(), "weights: expected running sums > 0"),
         (lambda: PrandtlIshlinskii([0.0], [1.0], input_range=(1.0, 1.0)), "input_range"),
         (lambda: PrandtlIshlinskii([0.0], [1.0], origin=math.inf), "origin"),
         (lambda: DeadZones([0.0], [1.0]), "slopes: expected 2"),

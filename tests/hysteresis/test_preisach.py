@@ -290,7 +290,7 @@ def test_density_matrix_and_areas():
         (lambda: make().regressor([1.0]).transpose_product([1.0, 2.0]), "residuals: expected 1"),
         (lambda: uniform_levels(1.0, 0.0, 3), "low, high"),
         (lambda: uniform_levels(0.0, 1.0, 0), "intervals"),
-        (lambda: operator_from_json({"type": "spline"}), "operator: expected type"),
+        (lambda: operator_from_json({"type": "spline"}), "expected a model of the kind .*got 'spline'"),
         (lambda: operator_from_json({"type": "preisach"}), "levels"),
         (lambda: ThermalExpansion(low=70.0, high=30.0), "low"),
         (lambda: QuadraticTerm(math.nan), "linear"),

@@ -122,7 +122,9 @@ def test_design_reaches_the_oscillation_in_half_the_time_on_the_film(seed):
     design = covering_sequence(uniform_levels(30.0, 70.0, 40), span, per_cell=2)
     assert laboratory_time(design, 8.0) <= 0.5 * laboratory_time(oscillation, 8.0)
     models = [
-        identify("preisach-nonmonotonic", inputs, measure(inputs, seed), input_range=span).model
+        identify(
+            "preisach-nonmonotonic", inputs, measure(inputs, seed), input_range=span, plane=(30, 70), reference=20
+        ).model
         for inputs in (oscillation, design)
     ]
     errors = []

@@ -125,17 +125,6 @@ def test_simulation_of_held_inputs_is_exact():
     assert PUBLISHED_DYNAMICS.simulate(inputs, dt) == pytest.approx(expected, abs=1e-9)
 
 
-def test_discrete_state_space_equals_the_simulation():
-    rng = np.random.default_rng(1)
-    inputs, dt = rng.normal(size=300), 5e-5
-    matrix, column, row = PUBLISHED_DYNAMICS.discretise(dt)
-    state, outputs = np.zeros(3), []
-    for u in inputs:
-        outputs.append(row @ state)
-        state = matrix @ state + column * u
-    assert PUBLISHED_DYNAMICS.simulate(inputs, dt) == pytest.approx(outputs, abs=1e-12)
-
-
 @pytest.mark.parametrize("rate", [5e3, 1e4, 2e4])
 @pytest.mark.parametrize("seed", range(4))
 def test_poles_from_a_noisy_step(rate, seed):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
-from bench.identification import check_data, cross_validate, fit, identify, measure_coverage, ramps
-from bench.identification.identify import prepare
+from bench.identification import check_data, cross_validate, fit, identify, ramps
+from bench.identification.by_name import set_up_problem
 
 
 def plane(order=4):
@@ -17,7 +17,7 @@ def plane(order=4):
 
 def test_cells_never_swept_are_listed_with_their_centres():
     # From -1 to 0 and back: only cells with α below 0 are swept.
-    found = measure_coverage(plane(), [-1.0, -0.5, 0.0, -0.5, -1.0])
+    found = plane().coverage([-1.0, -0.5, 0.0, -0.5, -1.0])
     assert found.never.tolist() == [3, 4, 5, 6, 7, 8, 9]
     np.testing.assert_allclose(found.centres[0], [-0.75, 0.25])
     # The centre of mass of the triangle 0 <= β <= α <= 0.5.
@@ -29,13 +29,13 @@ def test_cells_never_swept_are_listed_with_their_centres():
 
 
 def test_full_coverage_and_the_first_move():
-    whole = measure_coverage(plane(), [-1.0, 1.0])
+    whole = plane().coverage([-1.0, 1.0])
     assert not whole.never.size
     assert whole.centres.shape == (0, 2)
     assert whole.summary() == "all 10 cells swept"
     # What the specimen did before the first reading was not measured.
-    assert measure_coverage(plane(), [1.0]).fraction == 0.0
-    assert measure_coverage(plane(), [0.0, 1.0], MemoryCurve.from_positive_saturation(0.0)).fraction < 1.0
+    assert plane().coverage([1.0]).fraction == 0.0
+    assert plane().coverage([0.0, 1.0], MemoryCurve.from_positive_saturation(0.0)).fraction < 1.0
 
 
 def test_unobtrusive_data_raise_no_warning():
@@ -109,7 +109,7 @@ def test_each_fold_is_predicted_without_it():
     _, inputs, outputs = noisy(order=4)
     table = cross_validate("preisach", inputs, outputs, levels=(3, 4), folds=3, blocks=6, skip=10)
     assert [trial.levels for trial in table.trials] == [3, 4]
-    problem = prepare("preisach", inputs, outputs, None, 10, 0.0, None, {"levels": 4})
+    problem = set_up_problem("preisach", inputs, outputs, None, 10, 0.0, None, {"levels": 4})
     block = np.arange(inputs.size - 10) * 6 // (inputs.size - 10)
     squares = np.empty(inputs.size - 10)
     for fold in range(3):
@@ -175,7 +175,7 @@ def test_plays_are_identified():
     assert found.model.bias == pytest.approx(0.4)
     assert found.certificate.kkt_residual < 1e-10
     assert found.model.input_unit == "V"
-    back = found.model.inverse().evaluate(outputs, found.model.inverse_state(found.initial_state))
+    back = found.model.inverse_operator().evaluate(outputs, found.model.inverse_state(found.initial_state))
     np.testing.assert_allclose(back, inputs, atol=1e-6)
 
 
@@ -194,7 +194,7 @@ def test_dead_zones_catch_saturation_and_asymmetry():
     fresh = rng.uniform(-20.0, 20.0, 300)
     error = found.model.evaluate(fresh) - operator.evaluate(fresh)
     assert np.sqrt(np.mean(error**2)) < 0.004 * np.ptp(outputs)
-    inverse = found.model.inverse()
+    inverse = found.model.inverse_operator()
     back = inverse.evaluate(found.model.evaluate(fresh), found.model.inverse_state(found.initial_state))
     np.testing.assert_allclose(back, fresh, atol=1e-9)
 

@@ -9,7 +9,7 @@ from bench.cli import main
 from bench.identification import measure_errors
 from bench.identification.two_stage import measure_series
 from bench.journal import Record
-from bench.model_file import load_coupled_model
+from bench.results.model_file import load_model
 from bench.results.tracking import target_results
 from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 
@@ -97,8 +97,8 @@ def every_run_is_complete_and_says_what_the_tables_say(campaign):
 
 def the_saved_model_is_that_of_the_tables(campaign):
     folder = Path(campaign["folder"])
-    assert {load_coupled_model(folder / f"{name}.json").name for name in MODELS} == set(MODELS)
-    model = load_coupled_model(folder / "two-stage.json").model
+    assert {load_model(folder / f"{name}.json").name for name in MODELS} == set(MODELS)
+    model = load_model(folder / "two-stage.json").model
     runs = {protocol: next(folder.glob(f"sma-{protocol}-*")) for protocol in SAMPLES}
     resting = read_resting(runs["force-voltage"])
     errors = {

@@ -13,8 +13,12 @@ from bench.hysteresis import PrandtlIshlinskii
 from bench.journal import FILE_NAME, Record, Table
 from bench.protocol import find_protocol
 from bench.runs import Run, carry_out
-from protocols.hybrid import BASE, CURRENT, DEFLECTION, TIP, VOLTAGE
 from rigs.hybrid.identification import (
+    BASE,
+    CURRENT,
+    DEFLECTION,
+    TIP,
+    VOLTAGE,
     Samples,
     bandwidth_of,
     identify_hybrid,

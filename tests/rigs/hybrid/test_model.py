@@ -166,7 +166,7 @@ def test_json():
     inputs = np.full(20, 0.05), loop(30.0, 1, 20), 0.3
     assert (again.simulate(*inputs).deflections == hybrid.simulate(*inputs).deflections).all()
     del document["dynamics"]
-    with pytest.raises(ValueError, match="hybrid model: expected the key 'dynamics'"):
+    with pytest.raises(ValueError, match="hybrid: expected the key 'dynamics'"):
         HybridModel.from_json(document)
 
 
@@ -246,7 +246,7 @@ def test_memory_before_the_first_sample():
     targets=st.lists(st.floats(-9.0, 9.0), min_size=1, max_size=20),
 )
 def test_composition_with_the_inverse_from_any_start(seed, start, targets):
-    forward, inverse = fitted(), fitted().inverse()
+    forward, inverse = fitted(), fitted().inverse_operator()
     state = forward.advance(forward.initial_state(), start) if start else forward.initial_state()
     back = forward.inverse_state(state)
     for target in MICRO * np.array(targets):

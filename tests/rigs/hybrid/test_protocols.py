@@ -4,24 +4,23 @@ import io
 import json
 import math
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from bench.cli import main
 from bench.clock import VirtualClock
 from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
-from bench.model_file import HybridFile
 from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
+from bench.results.model_file import ModelFile
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
-from protocols.hybrid import BASE, DEFLECTION, TIP, WITNESS
 from protocols.hybrid.control import REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
 from rigs.hybrid.design import Design
@@ -30,23 +29,12 @@ from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
 WIRED, DIRECT = "hybrid", "hybrid-direct"
+DEFLECTION, BASE, TIP = "displacement_position", "base_temperature", "tip_temperature"
+WITNESS = "witness_position"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
 SENSORS = {DEFLECTION, BASE, TIP}
 LIMITS = {"tec": 0.15, "piezo": 40.0}
 MICRO = 1e-6
-
-
-@pytest.fixture
-def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 def assignments(option, values):
@@ -68,9 +56,9 @@ def made_up_model():
 def files(tmp_path_factory):
     """Model files that can and cannot be used, by name."""
     folder = tmp_path_factory.mktemp("models")
-    HybridFile(made_up_model()).save(folder / "hybrid.json")
+    ModelFile("hybrid", made_up_model()).save(folder / "hybrid.json")
     content = json.loads((folder / "hybrid.json").read_text())
-    (folder / "other.json").write_text(json.dumps({**content, "format": "bench-model"}))
+    ModelFile("polynomial", made_up_model().polynomial).save(folder / "other.json")
     del content["model"]["dynamics"]
     (folder / "damaged.json").write_text(json.dumps(content))
     return {path.stem: path for path in folder.iterdir()} | {"none": folder / "none.json"}
@@ -81,14 +69,20 @@ def parsed(protocol, settings):
     return definition, definition.parse({key: str(value) for key, value in settings.items()})
 
 
-def planned(protocol, **settings):
-    return plan(*parsed(protocol, settings))
+@cache
+def slots_of(protocol, rig=WIRED):
+    with Rig(load_rig(rig), VirtualClock(), 1) as connected:
+        return connected.slots(find_protocol(protocol))
+
+
+def planned(protocol, rig=WIRED, **settings):
+    return plan(*parsed(protocol, settings), slots_of(protocol, rig))
 
 
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
     definition, parameters = parsed(protocol, settings)
-    messages, found, reading = definition.generator(parameters), [], None
+    messages, found, reading = definition.start(parameters, slots_of(protocol)), [], None
     while True:
         try:
             message = messages.send(reading)
@@ -147,19 +141,19 @@ class TestPlan:
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         definition, parameters = parsed(protocol, settings)
         with Rig(load_rig(rig), VirtualClock(), 1) as connected:
-            check_before_moving(connected, definition, plan(definition, parameters))
-            assert definition.controls in ("", DEFLECTION)
+            slots = connected.slots(definition)
+            check_before_moving(connected, definition, plan(definition, parameters, slots))
+            assert definition.controlled(slots) in ("", DEFLECTION)
 
     @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
     def test_a_witness_only_where_there_is_one(self, files, protocol):
-        definition, parameters = parsed(protocol, {"model": files["hybrid"], "witness": True})
-        expected = plan(definition, parameters)
+        settings = {"model": files["hybrid"], "witness": True}
+        expected = planned(protocol, DIRECT, **settings)
         assert WITNESS in expected.watched
         with Rig(load_rig(DIRECT), VirtualClock(), 1) as rig:
-            check_before_moving(rig, definition, expected)
-        words = f"needs {WITNESS}, which rig hybrid does not have"
-        with Rig(load_rig(WIRED), VirtualClock(), 1) as rig, pytest.raises(ConfigurationError, match=words):
-            check_before_moving(rig, definition, expected)
+            check_before_moving(rig, find_protocol(protocol), expected)
+        with pytest.raises(ConfigurationError, match=r"witness: the rig binds no \[roles\.witness\]"):
+            planned(protocol, WIRED, **settings)
 
     def test_durations_follow_the_settings(self, files):
         assert planned("current-sine", frequencies="0.01, 0.05", periods=3).seconds == pytest.approx(300.0 + 60.0)
@@ -374,7 +368,7 @@ class TestRefused:
         [
             ("none", "cannot be read: No such file"),
             ("damaged", "damaged"),
-            ("other", "is not a model file: its `format` is not 'bench-hybrid-model'"),
+            ("other", "expected a model of the kind 'hybrid', got 'polynomial'"),
         ],
     )
     def test_a_model_that_cannot_be_used(self, files, protocol, name, words):
@@ -401,10 +395,9 @@ def flat(text):
 
 
 def record(folder, protocol, rig, **settings):
-    definition, parameters = parsed(protocol, settings)
     run = Run(
-        protocol=definition,
-        settings=parameters.model_dump(),
+        protocol=find_protocol(protocol),
+        settings={key: str(value) for key, value in settings.items()},
         rig=rig,
         folder=folder,
         seed=1,

@@ -8,9 +8,8 @@ import pytest
 
 from bench.cli import main
 from bench.journal import Record
-from bench.model_file import load_hybrid_model
-from protocols.hybrid import CURRENT, DEFLECTION, VOLTAGE, WITNESS
-from rigs.hybrid.identification import read_loop
+from bench.results.model_file import load_model
+from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
 
 RUNS = {
@@ -163,7 +162,7 @@ def the_tables_say_what_the_runs_say(campaign):
 
 def the_saved_model_simulates(campaign):
     folder = Path(campaign["folder"])
-    file = load_hybrid_model(folder / "hybrid.json")
+    file = load_model(folder / "hybrid.json")
     assert [source.rpartition("-2")[0] for source in file.provenance["sources"]] == [
         "hybrid-current-steps", "hybrid-thermomechanical", "hybrid-piezo-loops", "hybrid-piezo-step",
     ]  # fmt: skip

@@ -12,8 +12,8 @@ from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
-from bench.model_file import CoupledFile, ModelFile
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
+from bench.results.model_file import ModelFile
 from bench.results.tracking import target_results
 from bench.rig import Rig
 from bench.rig_file import load_rig
@@ -116,8 +116,8 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     models = made_up_models()
     for name, model in models.items():
-        CoupledFile(name, model).save(folder / f"{name}.json")
-    CoupledFile("two-stage", made_up_models("mm", 1e3)["two-stage"]).save(folder / "millimetres.json")
+        ModelFile(name, model).save(folder / f"{name}.json")
+    ModelFile("two-stage", made_up_models("mm", 1e3)["two-stage"]).save(folder / "millimetres.json")
     ModelFile("preisach", models["two-stage"].first, None).save(folder / "operator.json")
     damaged = json.loads((folder / "two-stage.json").read_text())
     del damaged["model"]["first"]
@@ -279,9 +279,9 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("name", "words"),
         [
-            ("summed", "expected a two-stage model"),
-            ("linear", "expected a two-stage model"),
-            ("operator", "its `format` is not 'bench-coupled-model'"),
+            ("summed", "expected a model of the kind 'two-stage'"),
+            ("linear", "expected a model of the kind 'two-stage'"),
+            ("operator", "expected a model of the kind 'two-stage', got 'preisach'"),
             ("millimetres", "expected a model in V, N and m, got 'V', 'N', 'mm'"),
             ("damaged", "damaged"),
             ("none", "cannot be read"),

@@ -11,24 +11,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.control.baselines import LookUp
-from bench.control.inverse import Inverse, Reach
-from bench.controllers import Policy
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import (
-    MemoryCurve,
+    Coverage,
     Operator,
-    Polynomial,
-    PrandtlIshlinskii,
+    Policy,
     Preisach,
+    Reach,
     ThermalExpansion,
+    find_model,
+    identifiable_models,
     uniform_levels,
 )
 from bench.identification import (
-    MODELS,
     Assessment,
     Comparison,
-    Coverage,
     CrossValidation,
     Errors,
     Identification,
@@ -39,10 +36,9 @@ from bench.identification import (
     damped_oscillation,
     first_order_reversals,
     identify,
-    measure_coverage,
 )
-from bench.measurements import FEWEST_ROWS, check_excitation, read_columns
-from bench.model_file import ModelFile, load_model
+from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
 
@@ -72,7 +68,7 @@ class IdentifiedFile:
     """
 
     file: ModelFile
-    identification: Identification
+    identification: Identification[Any]
     warnings: tuple[str, ...]
     inputs: Floats
     outputs: Floats
@@ -87,7 +83,7 @@ class IdentifiedFile:
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
-            "levels": operator.order if isinstance(operator, Preisach) else None,
+            "levels": densities[0].levels.size - 1 if (densities := operator.densities()) else None,
             **errors_json(found.errors),
             "kkt": certificate.kkt_residual,
             "converged": certificate.converged,
@@ -100,6 +96,7 @@ class IdentifiedFile:
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
+            **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
 
@@ -121,14 +118,10 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    levels: int | None = None,
-    degree: int | None = None,
-    plane: tuple[float, float] | None = None,
-    reversible: str | None = None,
     smoothing: float = 0.0,
     skip: int = 0,
-    initial: str | None = None,
     cross_validated: bool = False,
+    **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
     """Identify a model from a CSV file or a run.
 
@@ -137,20 +130,17 @@ def identify_file(
     path : Path
         CSV file with a header, or the folder of a run.
     input_column, output_column : str
-        What drives and what answers.
+        Columns of the model's input and output.
     model : str
-        A key of `bench.identification.MODELS`.
-    levels, degree, plane, reversible : optional
-        Options of the model, where it has them; None leaves the model's own default.
+        Name of an entry of `bench.models`.
     smoothing : float
         Weight of the roughness penalty.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
-    initial : str, optional
-        What is known of the memory at the first row: `negative` or `positive` saturation, or unknown, and then
-        `skip` the rows that it could reach or `estimate` it; None leaves the model's own default.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
+    **options
+        `initial` and the options of the model, as in `identify`; None leaves the model's own default.
 
     Raises
     ------
@@ -159,8 +149,11 @@ def identify_file(
     ConfigurationError
         If an option is wrong or does not belong to the model.
     """
-    if model not in MODELS:
-        raise ConfigurationError(f"there is no model {model!r}; there are: {', '.join(MODELS)}")
+    try:
+        find_model(model)
+    except ValueError:
+        known = ", ".join(identifiable_models())
+        raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
     if skip < 0:
         raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
     columns = read_columns(path, (input_column, output_column), at_least=FEWEST_ROWS)
@@ -168,31 +161,23 @@ def identify_file(
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
-    given = {"levels": levels, "degree": degree, "plane": plane, "reversible": reversible}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in options.items() if value is not None}
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
-    if initial is not None:
-        options["initial"] = initial
     trials: CrossValidation | None = None
     try:
         if cross_validated:
             others = {name: value for name, value in options.items() if name != "levels"}
-            orders = None if levels is None else [levels]
+            orders = [options["levels"]] if "levels" in options else None
             trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
             smoothing = trials.best.smoothing
         found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
-    coverage: Coverage | None = None
-    memory: MemoryCurve | tuple[float, ...] | None = None
-    if isinstance(found.model, Preisach):
-        memory = found.initial_state.advance(inputs)
-        coverage = measure_coverage(found.model, inputs, found.initial_state)
-    elif isinstance(found.model, PrandtlIshlinskii):
-        memory = found.model.advance(found.initial_state, inputs)
+    memory = found.model.advance(found.initial_state, inputs)
+    coverage = found.model.coverage(inputs, found.initial_state)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -204,6 +189,12 @@ def identify_file(
     }
     file = ModelFile(model, found.model, memory, provenance)
     return IdentifiedFile(file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials)
+
+
+def _shape(operator: Operator[Any]) -> dict[str, float]:
+    """Return the shape parameters by name; none of an operator that is linear in all it has."""
+    shape = operator.shape_parameters()
+    return dict(zip(shape.names, shape.values, strict=True))
 
 
 def _largest(uncertainties: Floats) -> float | None:
@@ -265,57 +256,26 @@ def invert_targets(
     Parameters
     ----------
     model : ModelFile
-        Any model: Preisach and Prandtl-Ishlinskii models are inverted exactly with their memory, a polynomial by
-        its look-up table.
+        Any model of one input: Preisach and Prandtl-Ishlinskii models are inverted exactly with their memory, a
+        polynomial by its look-up table, others numerically.
     targets : ndarray, shape (N,)
         Output units, finite.
     policy : {"nearest", "paper"}
-        Which answer is taken where a Preisach model has several.
+        Which answer is taken where there are several.
     continue_memory : bool
-        Start from the memory that the model file keeps rather than from negative saturation.
+        Start from the memory that the model file keeps rather than from the model's initial state.
 
     Raises
     ------
     DataError
-        If this kind of model has no inverse.
+        If it is a model of several inputs.
     """
-    operator = model.operator
-    if isinstance(operator, Preisach):
-        start = model.memory if continue_memory and isinstance(model.memory, MemoryCurve) else None
-        found = Inverse(operator, policy).follow(targets, start)
-        setpoints, passing, predicted = found.setpoints, found.saturating, found.outputs
-        reached = [
-            Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW
-            for met, target, output in zip(found.met.tolist(), targets.tolist(), predicted.tolist(), strict=True)
-        ]
-    elif isinstance(operator, PrandtlIshlinskii):
-        state = operator.initial_state()
-        if continue_memory and isinstance(model.memory, tuple):
-            state = model.memory
-        low, high = operator.output_range()
-        reachable = np.clip(targets, low, high)
-        try:
-            inverse = operator.inverse()
-        except ValueError as error:
-            raise DataError(f"model {model.name} has a plateau, so it has no inverse: {error}") from None
-        setpoints = inverse.evaluate(reachable, operator.inverse_state(state))
-        passing = np.full(targets.size, np.nan)
-        predicted = operator.evaluate(setpoints, state)
-        reached = [
-            Reach.TOO_HIGH if target > high else Reach.TOO_LOW if target < low else Reach.MET
-            for target in targets.tolist()
-        ]
-    elif isinstance(operator, Polynomial):
-        table = LookUp(operator)
-        answers = [table.look_up(target) for target in targets.tolist()]
-        setpoints = np.array([setpoint for setpoint, _ in answers])
-        passing = np.full(targets.size, np.nan)
-        predicted = operator.evaluate(setpoints)
-        reached = [reach for _, reach in answers]
-    else:
-        raise DataError(f"models of the kind {model.name} cannot be inverted")
-    flags = tuple(reach.value for reach in reached)
-    return InvertedTargets(targets, setpoints, passing, predicted, flags)
+    found = model.operator.inverse(policy).follow(targets, model.memory if continue_memory else None)
+    flags = tuple(
+        (Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
+        for met, target, output in zip(found.met.tolist(), targets.tolist(), found.outputs.tolist(), strict=True)
+    )
+    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags)
 
 
 def check_unit(expected: str, unit: str, column: str) -> None:
@@ -347,7 +307,9 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     found, operator = identified.identification, identified.file.operator
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate = found.errors, found.certificate
+    shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
     return (
+        *([("shape", shape)] if shape else []),
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
@@ -445,7 +407,7 @@ def assess_designs(
     low, high = operating
     try:
         grid = uniform_levels(*plane, levels)
-        # The thermal term stands for any reversible part whose two slopes are to be found as well.
+        # The term stands for any reversible part of two coefficients.
         operator = Preisach(
             grid,
             np.zeros(levels * (levels + 1) // 2),

@@ -82,7 +82,8 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
     values = columns.values[name]
     if np.ptp(values) == 0.0:
         raise DataError(
-            f"{columns.source}: column {name} is {values[0]:g} in all {values.size} rows; it excites nothing"
+            f"{columns.source}: column {name} is {values[0]:g} in all {values.size} rows, so "
+            "nothing can be identified"
         )
     repeated = int(np.count_nonzero(np.diff(values) == 0.0))
     if repeated > _LONGEST_PLATEAU * values.size:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.identification.identify import Initial, prepare
+from bench.identification.by_name import Initial, set_up_problem
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def cross_validate(
     trials = []
     for order in levels if levels is not None else [None]:
         chosen = options if order is None else {**options, "levels": order}
-        problem = prepare(model_name, inputs, outputs, weights, skip, max(smoothing), initial, chosen)
+        problem = set_up_problem(model_name, inputs, outputs, weights, skip, max(smoothing), initial, chosen)
         used = problem.outputs.size - problem.skip
         if used < blocks:
             raise ValueError(f"blocks: expected at most {used}, one for each sample used, got {blocks}")

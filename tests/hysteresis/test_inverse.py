@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.control.inverse import Inverse, Reach
 from bench.hysteresis import MemoryCurve, PolynomialTerm, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse, Reach
 
 LOW, HIGH = 21.0, 84.0
 
@@ -80,7 +80,7 @@ def targets_for(rng, operator, state):
 def test_1000_random_states_against_a_dense_scan(make):
     rng = np.random.default_rng(1)
     # Coarse and fine planes, most of whose cells are empty.
-    inverses = [Inverse(make(order)) for order in (5, 12, 20, 50)]
+    inverses = [PreisachInverse(make(order)) for order in (5, 12, 20, 50)]
     compared = 0
     for i in range(1000):
         inverse = inverses[i % len(inverses)]
@@ -122,7 +122,7 @@ def test_paper_policy_goes_towards_the_target(seed, outside):
     here = operator.value(state)
     minus, plus = operator.evaluate([30.0, 70.0])
     target = rng.uniform(minus, plus)
-    found = Inverse(operator, "paper").invert(state, target)
+    found = PreisachInverse(operator, "paper").invert(state, target)
     assert operator.value(found.state) == pytest.approx(target, abs=1e-9)
     direction = 1 if target > here else -1
     expected = first_crossing(operator, state, direction, target)
@@ -134,7 +134,7 @@ def test_paper_policy_goes_towards_the_target(seed, outside):
 @pytest.mark.parametrize("order", [1, 3, 20])
 def test_unreachable_targets_are_clamped_and_flagged(order, policy):
     operator = film(order, zeros=0.0)
-    inverse = Inverse(operator, policy)
+    inverse = PreisachInverse(operator, policy)
     rng = np.random.default_rng(2)
     least, greatest = operator.output_range()
     for _ in range(50):
@@ -153,9 +153,9 @@ def test_monotone_operator_clamps_at_the_end_of_its_range():
     operator = plain(zeros=0.0)
     state = MemoryCurve.from_negative_saturation(0.4)
     least, greatest = operator.output_range()
-    found = Inverse(operator).invert(state, greatest + 1.0)
+    found = PreisachInverse(operator).invert(state, greatest + 1.0)
     assert (found.reach, found.outputs[-1]) == (Reach.TOO_HIGH, pytest.approx(greatest))
-    found = Inverse(operator).invert(state, least - 1.0)
+    found = PreisachInverse(operator).invert(state, least - 1.0)
     assert (found.reach, found.outputs[-1]) == (Reach.TOO_LOW, pytest.approx(least))
 
 
@@ -165,7 +165,7 @@ def test_plateau_answers_with_the_nearest_point():
     density = np.zeros(10)
     density[6] = 1.0
     operator = Preisach(levels, density)
-    inverse = Inverse(operator)
+    inverse = PreisachInverse(operator)
     state = MemoryCurve.from_negative_saturation(0.4)
     here = operator.value(state)
     assert inverse.invert(state, here).setpoints == (0.4,)
@@ -181,19 +181,19 @@ def test_plateau_answers_with_the_nearest_point():
 def test_flat_operator_meets_its_only_value():
     operator = Preisach(uniform_levels(0.0, 1.0, 3), np.zeros(6), 2.0)
     state = MemoryCurve.from_negative_saturation(0.3)
-    assert Inverse(operator).invert(state, 2.0).setpoints == (0.3,)
-    assert Inverse(operator).invert(state, 3.0).reach is Reach.TOO_HIGH
-    assert Inverse(operator).invert(state, 1.0).reach is Reach.TOO_LOW
+    assert PreisachInverse(operator).invert(state, 2.0).setpoints == (0.3,)
+    assert PreisachInverse(operator).invert(state, 3.0).reach is Reach.TOO_HIGH
+    assert PreisachInverse(operator).invert(state, 1.0).reach is Reach.TOO_LOW
 
 
 def test_small_move_against_the_target_where_reversal_raises_the_output():
     operator = film()
     state = MemoryCurve.from_negative_saturation(63.0)
     target = operator.value(state) + 2.0
-    nearest = Inverse(operator).invert(state, target)
+    nearest = PreisachInverse(operator).invert(state, target)
     locked = operator.segment(state, -1)
     assert locked.linear > 0.0
-    up = Inverse(operator, "paper").invert(state, target)
+    up = PreisachInverse(operator, "paper").invert(state, target)
     assert up.setpoints[0] > 63.0
     assert abs(nearest.setpoints[0] - 63.0) <= abs(up.setpoints[0] - 63.0)
 
@@ -203,7 +203,7 @@ def test_two_setpoints_above_positive_saturation():
     _, plus = operator.evaluate([30.0, 70.0])
     _, greatest = operator.output_range()
     state = MemoryCurve.from_negative_saturation(45.0).step(40.0)
-    found = Inverse(operator).invert(state, 0.5 * (plus + greatest))
+    found = PreisachInverse(operator).invert(state, 0.5 * (plus + greatest))
     assert len(found.setpoints) == 2
     assert found.setpoints[0] == 70.0
     assert found.outputs[0] == pytest.approx(plus)
@@ -221,7 +221,7 @@ def test_sequence_equals_single_inversions(seed, kind):
         "polynomial": lambda: plain(seed=seed, term=PolynomialTerm((0.3, -0.2, 0.4), 0.0, 1.0, 16)),
         "signed": lambda: plain(seed=seed, signed=True),
     }[kind]()
-    inverse = Inverse(operator, "paper" if seed % 2 else "nearest")
+    inverse = PreisachInverse(operator, "paper" if seed % 2 else "nearest")
     least, greatest = operator.output_range()
     margin = 0.1 * (greatest - least)
     targets = rng.uniform(least - margin, greatest + margin, 40)
@@ -245,7 +245,7 @@ def test_signed_density_meets_what_either_direction_or_a_major_branch_meets(seed
     operator = plain(6, seed=seed, signed=True)
     state = random_state(rng, *operator.input_range)
     target = rng.uniform(*operator.output_range())
-    found = Inverse(operator).invert(state, target)
+    found = PreisachInverse(operator).invert(state, target)
     if found.reach is Reach.MET:
         assert operator.value(found.state) == pytest.approx(target, abs=1e-9)
     else:
@@ -257,7 +257,7 @@ def test_tracks_what_forward_evaluation_made():
     rng = np.random.default_rng(8)
     inputs = rng.uniform(LOW, HIGH, 300)
     outputs = operator.evaluate(inputs)
-    following = Inverse(operator).follow(outputs)
+    following = PreisachInverse(operator).follow(outputs)
     assert following.met.all()
     path = np.column_stack([following.saturating, following.setpoints]).ravel()
     path = path[~np.isnan(path)]
@@ -267,10 +267,10 @@ def test_tracks_what_forward_evaluation_made():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Inverse(plain(), "fast"), "policy: expected 'nearest' or 'paper'"),
-        (lambda: Inverse(plain()).invert(plain().initial_state(), math.nan), "target: expected a finite"),
-        (lambda: Inverse(plain()).follow([]), "targets: expected at least one"),
-        (lambda: Inverse(plain()).follow([math.inf]), "targets: expected finite"),
+        (lambda: PreisachInverse(plain(), "fast"), "policy: expected 'nearest' or 'paper'"),
+        (lambda: PreisachInverse(plain()).invert(plain().initial_state(), math.nan), "target: expected a finite"),
+        (lambda: PreisachInverse(plain()).follow([]), "targets: expected at least one"),
+        (lambda: PreisachInverse(plain()).follow([math.inf]), "targets: expected finite"),
     ],
 )
 def test_wrong_input_is_named(make, message):

@@ -1,0 +1,107 @@
+"""Where the sparse columns of a regressor lie in the Preisach plane: neighbours, coarser planes, roughness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.hysteresis._checks import Floats
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class CellLayout:
+    """The cell of each sparse column of a regressor.
+
+    Parameters
+    ----------
+    order : int
+        Number of intervals M of the plane, 0 if the columns have no place.
+    cells : ndarray of int64, shape (columns,)
+        Cell of each sparse column. A cell may have a second column, that of its relays which were on before the
+        first sample; its density then is the sum of the two coefficients.
+    layers : ndarray of int64, shape (columns,)
+        0 for the first column of a cell, 1 for the second.
+    """
+
+    order: int
+    cells: Indices
+    layers: Indices
+
+    @classmethod
+    def of(cls, columns: int) -> CellLayout:
+        """Return the layout of one column a cell, if their number is that of a plane."""
+        order = (round((8 * columns + 1) ** 0.5) - 1) // 2
+        if order * (order + 1) // 2 != columns:
+            order = 0
+        return cls(order, np.arange(columns), np.zeros(columns, dtype=np.int64))
+
+    def grid(self, values: Floats) -> Floats:
+        """Return values by layer, row and column of the plane, with a border; -inf where there is no column."""
+        result = np.full((2, self.order + 2, self.order + 2), -np.inf)
+        result[self._places()] = values
+        return result
+
+    def _places(self) -> tuple[Indices, Indices, Indices]:
+        rows, columns = np.tril_indices(self.order)
+        return self.layers, rows[self.cells] + 1, columns[self.cells] + 1
+
+    def crests(self, g: Floats, threshold: float) -> Indices:
+        """Return the columns of at least a threshold, of neighbouring cells only the best.
+
+        Neighbours are nearly collinear: entering together they would only push each other out again.
+        """
+        if not self.order:
+            return np.flatnonzero(g >= threshold)
+        plane = self.grid(g)
+        inner = plane[:, 1:-1, 1:-1]
+        crest = inner >= threshold
+        for neighbour in (plane[:, :-2, 1:-1], plane[:, 2:, 1:-1], plane[:, 1:-1, :-2], plane[:, 1:-1, 2:]):
+            crest &= inner >= neighbour
+        layer, row, column = self._places()
+        return np.flatnonzero(crest[layer, row - 1, column - 1])
+
+    def coarser(self) -> tuple[CellLayout, Indices]:
+        """Return the layout of the plane with cells merged two by two, and the column of each column there."""
+        rows, columns = np.tril_indices(self.order)
+        i, j = rows[self.cells] // 2, columns[self.cells] // 2
+        merged, parents = np.unique(np.column_stack([self.layers, i * (i + 1) // 2 + j]), axis=0, return_inverse=True)
+        return CellLayout((self.order + 1) // 2, merged[:, 1], merged[:, 0]), parents.ravel()
+
+    def around(self, chosen: Flags) -> Flags:
+        """Return the chosen columns and their neighbours in the plane."""
+        plane = self.grid(chosen.astype(np.float64)) > 0.0
+        wide = plane.copy()
+        wide[:, 1:] |= plane[:, :-1]
+        wide[:, :-1] |= plane[:, 1:]
+        wide[:, :, 1:] |= plane[:, :, :-1]
+        wide[:, :, :-1] |= plane[:, :, 1:]
+        return wide[self._places()]
+
+    def roughness(self) -> csr_array:
+        """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""
+        from scipy.sparse import coo_array, csr_array
+
+        rows, columns = np.tril_indices(self.order)
+        index = np.full((self.order + 1, self.order + 1), -1, dtype=np.int64)
+        index[rows, columns] = np.arange(rows.size)
+        here: list[Indices] = []
+        there: list[Indices] = []
+        for i, j in ((rows + 1, columns), (rows - 1, columns), (rows, columns + 1), (rows, columns - 1)):
+            other = index[i, j]
+            inside = np.flatnonzero((other >= 0) & (i >= 0) & (j >= 0))
+            here.append(inside)
+            there.append(other[inside])
+        a, b = np.concatenate(here), np.concatenate(there)
+        data = np.concatenate([np.ones(a.size), -np.ones(a.size)])
+        laplacian = coo_array((data, (np.concatenate([a, a]), np.concatenate([b, a]))), shape=(rows.size, rows.size))
+        spread = csr_array(laplacian)[:, self.cells]
+        return csr_array(spread.T @ spread)

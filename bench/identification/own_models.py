@@ -1,0 +1,216 @@
+"""The bench's own models of one input and one output, as entries of `bench.models`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import (
+    DeadZones,
+    Linear,
+    ModelSpec,
+    Polynomial,
+    PolynomialTerm,
+    PrandtlIshlinskii,
+    Preisach,
+    QuadraticTerm,
+    Reversible,
+    Summed,
+    ThermalExpansion,
+    TwoStage,
+    _checks,
+    uniform_levels,
+)
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.prandtl_ishlinskii import PlayState
+from bench.identification.initial_memory import estimate_memory
+from bench.identification.least_squares import fit
+
+ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic", "polynomial"]
+
+# Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
+_LEAST_SLOPE = 0.02
+
+
+def _lattice(levels: int | ArrayLike, plane: tuple[float, float]) -> Floats:
+    if isinstance(levels, int | np.integer):
+        return uniform_levels(*plane, int(levels))
+    return _checks.increasing("levels", levels)
+
+
+def _operating(inputs: Floats, plane: tuple[float, float], given: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the operating range: what was given, else what the inputs and the plane span."""
+    if given is not None:
+        return given
+    return min(float(inputs.min()), plane[0]), max(float(inputs.max()), plane[1])
+
+
+def _input_span(inputs: Floats, name: str) -> tuple[float, float]:
+    low, high = float(inputs.min()), float(inputs.max())
+    if low == high:
+        raise ValueError(f"inputs: constant at {low}; give {name} or inputs that vary")
+    return low, high
+
+
+def _preisach(
+    inputs: Floats,
+    *,
+    levels: int | ArrayLike = 20,
+    plane: tuple[float, float] | None = None,
+    reversible: ReversibleKind = "none",
+    degree: int | None = None,
+    input_range: tuple[float, float] | None = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> Preisach:
+    if plane is None and isinstance(levels, int | np.integer):
+        plane = _input_span(inputs, "plane")
+    lattice = _lattice(levels, plane or (0.0, 0.0))
+    middle = 0.5 * float(lattice[0] + lattice[-1])
+    span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
+    if degree is not None and reversible != "polynomial":
+        raise ValueError(f"degree: belongs to the reversible part 'polynomial', not to {reversible!r}")
+    if degree is not None and degree < 1:
+        raise ValueError(f"degree: expected at least 1, got {degree}")
+    terms: dict[str, Reversible | None] = {
+        "none": None,
+        "linear": QuadraticTerm(origin=middle),
+        "quadratic": QuadraticTerm(quadratic=0.0, origin=middle),
+        "polynomial": PolynomialTerm((0.0,) * (5 if degree is None else degree), *span),
+    }
+    if reversible not in terms:
+        raise ValueError(f"reversible: expected one of {', '.join(terms)}, got {reversible!r}")
+    return Preisach(
+        lattice,
+        np.zeros(lattice.size * (lattice.size - 1) // 2),
+        reversible=terms[reversible],
+        input_range=span,
+        input_unit=input_unit,
+        output_unit=output_unit,
+    )
+
+
+def _nonmonotonic(
+    inputs: Floats,
+    *,
+    levels: int | ArrayLike = 20,
+    plane: tuple[float, float] | None = None,
+    reference: float | None = None,
+    input_range: tuple[float, float] | None = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> Preisach:
+    plain = _preisach(
+        inputs,
+        levels=levels,
+        plane=plane,
+        input_range=input_range,
+        input_unit=input_unit,
+        output_unit=output_unit,
+    )
+    zero = plain.input_range[0] if reference is None else reference
+    return replace(plain, reversible=ThermalExpansion(low=plain.plane[0], high=plain.plane[1], reference=zero))
+
+
+def _polynomial(
+    inputs: Floats,
+    *,
+    degree: int = 12,
+    input_range: tuple[float, float] | None = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> Polynomial:
+    if degree < 1:
+        raise ValueError(f"degree: expected at least 1, got {degree}")
+    span = _input_span(inputs, "input_range") if input_range is None else input_range
+    return Polynomial(np.zeros(degree), span, input_unit=input_unit, output_unit=output_unit)
+
+
+def _prandtl_ishlinskii(
+    inputs: Floats,
+    *,
+    plays: int = 15,
+    maximum: float | None = None,
+    origin: float = 0.0,
+    dead_zones: int = 0,
+    input_range: tuple[float, float] | None = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> PrandtlIshlinskii:
+    if plays < 1:
+        raise ValueError(f"plays: expected at least 1, got {plays}")
+    if isinstance(dead_zones, bool) or not isinstance(dead_zones, int) or dead_zones < 0:
+        raise ValueError(f"dead_zones: expected an integer >= 0, got {dead_zones!r}")
+    low, high = _input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
+    if high <= low:
+        raise ValueError(f"maximum: expected a positive number, got {maximum}")
+    return PrandtlIshlinskii(
+        0.5 * (high - low) * np.arange(plays) / plays,
+        np.zeros(plays),
+        origin=origin,
+        # Where they lie is for the outputs to say.
+        after=DeadZones(np.arange(float(dead_zones)), np.ones(dead_zones + 1)) if dead_zones else None,
+        input_range=_operating(inputs, (np.inf, -np.inf), input_range),
+        input_unit=input_unit,
+        output_unit=output_unit,
+    )
+
+
+def _fit_dead_zones(
+    template: PrandtlIshlinskii,
+    inputs: Floats,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    state: PlayState,
+) -> PrandtlIshlinskii:
+    """Return the operator with play weights, and dead zones whose slopes are still to be fitted, if it has any.
+
+    After Kuhnen 2003: the error is taken between the plays and the dead zones, plays(u) - S⁻¹(y), which is
+    linear in the play weights and the slopes of S⁻¹ together. The slope of the interval that holds the median
+    output is 1: a factor can be moved from the plays to the dead zones.
+    """
+    if template.after is None:
+        return template
+    count = template.after.thresholds.size
+    middle = float(np.median(outputs))
+    edges = np.linspace(outputs.min(), outputs.max(), count + 2)[1:-1] - middle
+    if not (np.diff(edges, prepend=-np.inf) > 0.0).all():
+        raise ValueError("outputs: constant; dead zones need outputs that vary")
+    shares = DeadZones(edges, np.ones(count + 1)).columns(outputs - middle)
+    reference = int(np.searchsorted(edges, 0.0))
+    others = np.delete(np.arange(count + 1), reference)
+    plain = replace(template, after=None).regressor(inputs, state)
+    joint = replace(plain, extra=np.ascontiguousarray(np.column_stack([plain.extra, -shares[:, others]])))
+    target = shares[:, reference] + _LEAST_SLOPE * shares[:, others].sum(axis=1)
+    found = fit(joint, target, weights=weights, skip=skip)
+    slopes = np.ones(count + 1)
+    slopes[others] = _LEAST_SLOPE + found.coefficients[plain.shape[1] :]
+    to_plays = DeadZones(edges, slopes)
+    after = DeadZones(to_plays(edges) - found.bias, 1.0 / slopes)
+    return replace(template, weights=found.coefficients[: plain.shape[1]], after=after)
+
+
+PREISACH = ModelSpec(
+    "Preisach operator with a nonnegative density", Preisach, _preisach, estimate_state=estimate_memory
+)
+PREISACH_SIGNED = ModelSpec("Preisach operator with a density of either sign", Preisach, _preisach, constrained=False)
+PREISACH_NONMONOTONIC = ModelSpec(
+    "nonnegative Preisach operator and a quadratic thermal term, for non-monotonic hysteresis",
+    Preisach,
+    _nonmonotonic,
+    estimate_state=estimate_memory,
+)
+PRANDTL_ISHLINSKII = ModelSpec(
+    "Prandtl-Ishlinskii operator with nonnegative weights, and dead zones on request",
+    PrandtlIshlinskii,
+    _prandtl_ishlinskii,
+    refine=_fit_dead_zones,
+)
+POLYNOMIAL = ModelSpec("single-valued polynomial, without memory", Polynomial, _polynomial, constrained=False)
+TWO_STAGE = ModelSpec("one operator inside another: length = H2[force - H1[voltage]]", TwoStage)
+SUMMED = ModelSpec("the difference of two operators: length = H3[force] - H4[voltage]", Summed)
+LINEAR = ModelSpec("an operator behind a straight line: length = H5[force - a voltage - F0]", Linear)

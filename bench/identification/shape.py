@@ -1,0 +1,88 @@
+"""Fit of the shape parameters of an operator by variable projection.
+
+Parameters p on which the output depends nonlinearly are varied by bounded nonlinear least squares. For each p the
+coefficients x and the bias b follow from the constrained linear problem, so that the residual depends on p alone:
+r(p) = y - b(p) - R(p) x(p) (Golub and Pereyra, Inverse Problems 19(2), R1-R26, 2003).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bench.hysteresis import Operator, Regressor
+from bench.hysteresis._checks import Floats
+from bench.identification.least_squares import Fit, fit, fit_minimum_norm
+
+# Relative change of parameters, cost and gradient at which the search ends.
+_TOLERANCE = 1e-10
+# Relative step of the differences: a constrained linear fit is exact to about 1e-12.
+_STEP = 1e-6
+
+
+def fit_operator(
+    constrained: bool,
+    operator: Operator[Any],
+    regressor: Regressor,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    smoothing: float,
+) -> Fit:
+    """Return the coefficients of an operator: with its signs if constrained, else of the least norm."""
+    if not constrained:
+        return fit_minimum_norm(regressor, outputs, weights=weights, skip=skip)
+    signs = operator.nonnegative()
+    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, smoothing=smoothing)
+
+
+def fit_shape(
+    template: Operator[Any],
+    constrained: bool,
+    start: Callable[[Operator[Any]], Any],
+    inputs: Floats,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    smoothing: float,
+) -> Operator[Any]:
+    """Return the operator with the shape parameters that fit best; the operator itself if it has none.
+
+    Parameters
+    ----------
+    template : Operator
+        With the bounds of its shape parameters, and the values to start from.
+    constrained : bool
+        Whether the signs of the coefficients are constrained.
+    start : callable
+        Takes an operator; returns its state before the first sample.
+    inputs, outputs, weights : ndarray, shape (N,)
+        The measured sequence and the weight of each sample.
+    skip : int
+        Number of first samples left out of the cost.
+    smoothing : float
+        Weight of the roughness penalty.
+    """
+    from scipy.optimize import least_squares
+
+    shape = template.shape_parameters()
+    if not shape.names:
+        return template
+    low, high = np.array(shape.low), np.array(shape.high)
+    roots = np.sqrt(weights[skip:])
+
+    def residuals(values: Floats) -> Floats:
+        operator = template.with_shape(values.tolist())
+        regressor = operator.regressor(inputs, start(operator))
+        found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
+        return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
+
+    options: dict[str, Any] = {"ftol": _TOLERANCE, "xtol": _TOLERANCE, "gtol": _TOLERANCE, "diff_step": _STEP}
+    ends = [
+        least_squares(residuals, np.clip(values, low, high), bounds=(low, high), x_scale="jac", **options)
+        for values in template.shape_starts()
+    ]
+    # Of equal costs the first is taken, so that the result does not depend on rounding alone.
+    return template.with_shape(min(ends, key=lambda end: end.cost).x.tolist())

@@ -1,0 +1,181 @@
+"""Model files: an identified model as versioned JSON, with its units and where it comes from.
+
+A file of version 2 is an object with these keys:
+
+`format`, `version`
+    `bench-model` and 2.
+`name`
+    Under which name the model was identified, such as `preisach-nonmonotonic`.
+`kind`
+    The class of the model: the `kind` of a class that an entry of `bench.models` names.
+`model`
+    The model as it writes itself: its `type` (the kind), coefficients, ranges and units.
+`memory`
+    The state of an operator at the end of the data from which it was identified; null for a model without memory
+    or of several inputs.
+`provenance`
+    `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
+
+Version 1 had three formats, which are still read: `bench-model`, with `operator` in place of `kind` and `model`, and
+`bench-coupled-model` and `bench-hybrid-model`, without `kind` and `memory`.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.errors import DataError
+from bench.hysteresis import Operator, model_class, model_from_json
+
+FORMAT = "bench-model"
+VERSION = 2
+_FORMER_FORMATS = {FORMAT: "operator", "bench-coupled-model": "model", "bench-hybrid-model": "model"}
+"""The formats of version 1, and the key of the model in each."""
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """The content of a model file.
+
+    Attributes
+    ----------
+    name : str
+        Under which name the model was identified.
+    model : object
+        The model itself, of a registered class.
+    memory : object
+        State of an operator at the end of the data from which it was identified; None for other models.
+    provenance : mapping
+        Where it comes from.
+    """
+
+    name: str
+    model: Any
+    memory: Any = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def operator(self) -> Operator[Any]:
+        """The model, if it is one of one input and one output.
+
+        Raises
+        ------
+        DataError
+            If it is another.
+        """
+        if not isinstance(self.model, Operator):
+            raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one of one input")
+        return self.model
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the file's content."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": self.name,
+            "kind": self.model.kind,
+            "model": self.model.to_json(),
+            "memory": None if self.memory is None else self.operator.state_to_json(self.memory),
+            "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the file.
+
+        Raises
+        ------
+        DataError
+            If it cannot be written, or could not be loaded again because the class of the model is not registered.
+        """
+        content = self.to_json()
+        text = json.dumps(content, indent=1, ensure_ascii=False)
+        reference = f"{type(self.model).__module__}:{type(self.model).__qualname__}"
+        try:
+            registered = model_class(self.model.kind)
+        except ValueError:
+            registered = None
+        if registered is not type(self.model):
+            raise DataError(
+                f"model file {path} is not written, as it could not be loaded again: {reference} is not the class "
+                f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
+            )
+        again = parse_model(json.loads(text), str(path)).to_json()
+        if any(again[key] != content[key] for key in ("kind", "model", "memory")):
+            raise DataError(
+                f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
+            )
+        try:
+            path.write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise DataError(f"model file {path} cannot be written: {error}") from None
+
+
+def load_model(path: Path, kind: str | None = None) -> ModelFile:
+    """Read a model file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str or None
+        The only kind of model that is accepted; None accepts every registered kind.
+
+    Raises
+    ------
+    DataError
+        If there is none, it is damaged, its version or kind is unknown, or it is of another kind.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
+    # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
+    file = parse_model(content, str(path))
+    if kind not in (None, file.model.kind):
+        raise DataError(f"model file {path}: expected a model of the kind {kind!r}, got {file.model.kind!r}")
+    return file
+
+
+def is_model(content: object) -> bool:
+    """Return whether something is the content of a model file of any version."""
+    return isinstance(content, dict) and content.get("format") in list(_FORMER_FORMATS)
+
+
+def parse_model(content: object, source: str) -> ModelFile:
+    """Make a model of the content of its file.
+
+    Raises
+    ------
+    DataError
+        If it is not one, is damaged, or its version or kind is unknown; names `source`.
+    """
+    if not isinstance(content, dict) or not is_model(content):
+        raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")
+    version, format_ = content.get("version"), content["format"]
+    former = version == 1
+    if not former and (version != VERSION or format_ != FORMAT):
+        raise DataError(f"model file {source} has version {version!r}; this bench reads versions 1 and {VERSION}")
+    try:
+        model = model_from_json(content[_FORMER_FORMATS[format_] if former else "model"])
+        if not former and content["kind"] != model.kind:
+            raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
+        memory = content["memory"] if format_ == FORMAT else None
+        if isinstance(model, Operator):
+            for key in ("input_unit", "output_unit"):
+                if not isinstance(getattr(model, key), str):
+                    raise TypeError(f"operator: expected a text for {key}, got {getattr(model, key)!r}")
+            memory = None if memory is None else model.state_from_json(memory)
+        elif memory is not None:
+            raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory!r}")
+        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]))
+    except KeyError as error:
+        raise DataError(f"model file {source} is damaged: key {error} is missing") from None
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise DataError(f"model file {source} is damaged: {error}") from None
