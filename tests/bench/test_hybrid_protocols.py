@@ -70,7 +70,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     ModelFile("hybrid", made_up_model()).save(folder / "hybrid.json")
     content = json.loads((folder / "hybrid.json").read_text())
-    (folder / "other.json").write_text(json.dumps({**content, "format": "bench-model"}))
+    (folder / "other.json").write_text(json.dumps({**content, "format": "other"}))
     del content["model"]["dynamics"]
     (folder / "damaged.json").write_text(json.dumps(content))
     return {path.stem: path for path in folder.iterdir()} | {"none": folder / "none.json"}
