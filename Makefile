@@ -4,8 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test check benchmark clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check benchmark clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -15,8 +16,20 @@ demo: $(SETUP)
 demo-sma demo-muscles demo-hybrid: demo-%: $(SETUP)
 	$(BIN)/bench reproduce $* --out recordings
 
+# Under a minute: numbers, contracts and drivers.
+test-quick: $(SETUP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(PYTEST) -m 'not benchmark and not slow' tests/hysteresis tests/identification tests/control \
+		tests/contracts tests/drivers
+
+# Everything, the first seed of each study.
 test: check
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+	$(PYTEST)
+
+# Everything, all seeds.
+test-all: check
+	$(PYTEST) -m 'not benchmark'
 
 check: $(SETUP)
 	$(BIN)/ruff check

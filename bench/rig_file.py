@@ -136,10 +136,10 @@ class Driver(Protocol):
 
 @dataclass(frozen=True)
 class DeviceEntry:
-    """One device of a rig file: its driver class and that driver's validated settings."""
+    """One device of a rig file: its driver, which is a `Device` and a `Driver`, and its validated settings."""
 
     name: str
-    driver: type[Driver]
+    driver: Any
     settings: DriverSettings
 
 

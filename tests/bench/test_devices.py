@@ -106,7 +106,7 @@ class TestStatus:
         status = Status("tec", clock, lambda: clock.now() >= 5.0)
         status.add_callback(lambda status: came.append(("first", status.success)))
         status.add_callback(second)
-        assert both.wait(30.0)
+        assert both.wait(60.0)
         status.update()
         assert came == [("first", True), ("second", True)]
 
@@ -123,9 +123,9 @@ class TestStatus:
         status = Status("watched-device", clock, arrived, timeout=3.0)
         status.add_callback(lambda _: ended.set())
         watchers = [thread for thread in threading.enumerate() if thread.name == "watched-device"]
-        assert ended.wait(30.0)
+        assert ended.wait(60.0)
         for thread in watchers:
-            thread.join(30.0)
+            thread.join(60.0)
             assert not thread.is_alive()
         assert status.success == (end == "arrives")
 
@@ -134,7 +134,7 @@ class TestStatus:
         ended = threading.Event()
         status = Status("tec", VirtualClock(), lambda: 1 / 0)
         status.add_callback(lambda _: ended.set())
-        assert ended.wait(10.0)
+        assert ended.wait(60.0)
         assert isinstance(status.exception(), ZeroDivisionError)
         with pytest.raises(ZeroDivisionError):
             status.wait()

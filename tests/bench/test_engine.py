@@ -620,7 +620,7 @@ class TestControl:
         assert outcome.laboratory_seconds <= 100.0
         b.assert_safe()
 
-    @pytest.mark.timeout(30)
+    @pytest.mark.timeout(60)
     @pytest.mark.parametrize("wait", [0.0, -1.0, math.nan])
     def test_one_that_does_not_wait_is_stopped(self, bench, wait):
         b = bench()

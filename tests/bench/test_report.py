@@ -14,6 +14,7 @@ from bench.protocol import TRACES
 from bench.results.model_file import ModelFile
 from bench.results.report import report_run
 from bench.results.tracking import FOLLOW, REACH, READING
+from bench.settling import Settled
 from bench.units import fitting_prefix, format_numbers, with_unit
 
 META = {
@@ -56,10 +57,10 @@ def report(tmp_path):
             values = (1.0 + i, target + error, *beside)
             if moving:
                 journal.telemetry(t, i, values)
-                journal.step(StepRecord(i, t, t + 8.0, "", FOLLOW, True, {}, values))
+                journal.step(StepRecord(i, t, t + 8.0, "", FOLLOW, Settled.DWELL, {}, values))
                 continue
-            journal.step(StepRecord(2 * i, t, t + 8.0, "", REACH, True, {}, values))
-            journal.step(StepRecord(2 * i + 1, t + 8.0, t + 9.0, "", READING, True, {}, values))
+            journal.step(StepRecord(2 * i, t, t + 8.0, "", REACH, Settled.DWELL, {}, values))
+            journal.step(StepRecord(2 * i + 1, t + 8.0, t + 9.0, "", READING, Settled.DWELL, {}, values))
         journal.finish(status="completed", reason="", finished=40.0, safe_state={})
         journal.close()
         for model in models:

@@ -72,7 +72,7 @@ def rate(read):
 
 
 def rate_of_the_driver(port, clock):
-    settings = RoboteqSupply.Settings(port=port, output="average", voltage_limits=(0, 12), timeout=2.0)
+    settings = RoboteqSupply.Settings(port=port, output="average", voltage_limits=(0, 12), heartbeat=60, timeout=10.0)
     supply = RoboteqSupply.connect("supply", settings, clock)
     try:
         return rate(lambda: supply._line.read(_VOLTS, 2))
@@ -85,7 +85,7 @@ def rate_of_canopen(canopen, port):
     network.connect(interface="slcan", channel=port, bitrate=125_000, sleep_after_open=0)
     try:
         node = network.add_node(1, canopen.ObjectDictionary())
-        node.sdo.RESPONSE_TIMEOUT = 2.0
+        node.sdo.RESPONSE_TIMEOUT = 10.0
         return rate(lambda: int.from_bytes(node.sdo.upload(0x210D, 2), "little"))
     finally:
         network.disconnect()

@@ -1,20 +1,19 @@
 """What the role of a linear stage promises, of the emulated drum itself and of the driver over the wire."""
 
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pytest
+from emulated_bench import Bench, OnABench, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
-from bench.devices import LinearStage, role_of
-from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from bench.contracts.faults import SilentInstrumentContract
+from bench.contracts.roles import LinearStageContract
+from bench.errors import DeviceConnectionError, DeviceError
 from drivers.dynamixel import DynamixelDrum
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_drum import EmulatedDrum
 from sim_devices.instruments.dynamixel_table import COUNT, VELOCITY_UNIT, HardwareError
-from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
 
@@ -38,50 +37,28 @@ class Wall:
         pass
 
 
-@dataclass
-class Bench:
-    """One stage under test and what is behind it; its position grows against the counts, from half a turn."""
+@dataclass(kw_only=True)
+class StageBench(Bench):
+    """A stage on a servo; its position grows against the counts, from half a turn."""
 
-    clock: VirtualClock
-    device: LinearStage
-    servo: EmulatedMX28
-    plant: Wall
     drum: EmulatedDrum
-    connect: Callable[..., LinearStage] | None = None
-    requests: list = field(default_factory=list)
 
     def where(self):
         """Return where the wire's end is at the clock's present time, m, without asking the device."""
-        self.servo.world.advance()
-        return (math.pi - self.servo.position) * RADIUS
+        self.instrument.world.advance()
+        return (math.pi - self.instrument.position) * RADIUS
 
 
-class RecordingServer:
-    def __init__(self, server, requests):
-        self.server = server
-        self.requests = requests
-
-    def receive(self, data):
-        self.requests.append(data)
-        return self.server.receive(data)
-
-
-names = (f"contract-stage-{number}" for number in itertools.count())
-
-
-@pytest.fixture(params=["emulated", "driver"])
-def bench(request):
+@pytest.fixture
+def bench(kind, stack):
     clock, plant = VirtualClock(), Wall()
     servo = EmulatedMX28("stage", World(plant, clock), plant)
     drum = EmulatedDrum(servo, RADIUS, zero_counts=ZERO, direction=-1)
-    if request.param == "emulated":
+    if kind == "emulated":
         for address, value in ((11, 4), (108, 10), (112, 42), (98, 125)):
             servo.write_item(address, value)
-        yield Bench(clock, drum, servo, plant, drum)
-        return
-    requests = []
-    name = next(names)
-    port = register(name, RecordingServer(Dynamixel2Server([servo]), requests), clock)
+        return StageBench(clock=clock, device=drum, instrument=servo, plant=plant, drum=drum)
+    port, requests = serial_port(stack, Dynamixel2Server([servo]), clock)
 
     def connect(kind=DynamixelDrum.connect):
         settings = DynamixelDrum.Settings(
@@ -96,47 +73,51 @@ def bench(request):
         )
         return kind("stage", settings, clock)
 
-    bench = Bench(clock, connect(), servo, plant, drum, connect, requests)
-    yield bench
-    bench.device.close()
-    unregister(name)
+    device = connect()
+    stack.callback(device.close)
+    return StageBench(
+        clock=clock, device=device, instrument=servo, plant=plant, drum=drum, connect=connect, requests=requests
+    )
 
 
-over_the_wire = pytest.mark.parametrize("bench", ["driver"], indirect=True)
+class OnADrum(OnABench):
+    @pytest.fixture
+    def set_points(self):
+        return 0.01, 0.1
+
+    @pytest.fixture
+    def effects(self, bench):
+        return lambda: bench.where()
+
+
+class TestContract(OnADrum, LinearStageContract):
+    @pytest.fixture
+    def identity(self):
+        return "ROBOTIS MX-28, serial number id 1, firmware 45"
+
+    @pytest.fixture
+    def sent(self, bench):
+        return lambda: (len(bench.requests), bench.instrument.read_item(116))
+
+    @pytest.fixture
+    def tolerance(self):
+        return 0.02 * RADIUS
+
+
+class TestSilence(OnADrum, SilentInstrumentContract):
+    def test_a_motion_ends_with_the_error(self, bench):
+        status = bench.device.set(0.1)
+        bench.instrument.unplug()
+        with pytest.raises(DeviceConnectionError, match="stage: "):
+            status.wait()
 
 
 def test_initial_state(bench):
-    assert role_of(type(bench.device)) == "linear stage"
-    assert str(bench.device.identity) == "ROBOTIS MX-28, serial number id 1, firmware 45"
-    assert bench.device.name == "stage"
-    assert bench.device.parent is None
     bench.clock.sleep(2.0)
     assert not bench.device.force_enabled
     assert math.isnan(bench.device.setpoint)
     assert bench.device.measure() == {"stage_position": 0.0, "stage_velocity": 0.0, "stage_load": 0.0}
     assert bench.where() == 0.0
-
-
-def test_signals_readings_and_units_agree(bench):
-    device = bench.device
-    expected = [("stage_position", "m"), ("stage_velocity", "m/s"), ("stage_load", "1")]
-    assert [(signal.name, signal.unit) for signal in device.signals] == expected
-    names = [signal.name for signal in device.signals]
-    readings, keys = device.read(), device.describe()
-    assert list(device.measure()) == list(device.glance()) == list(readings) == list(keys) == names
-    for signal in device.signals:
-        assert keys[signal.name]["units"] == signal.unit
-        assert keys[signal.name]["source"] == f"MX-28:id 1:{signal.name}"
-        assert readings[signal.name]["timestamp"] == pytest.approx(bench.clock.timestamp(), abs=0.1)
-    assert device.setpoint_signal.unit == device.limits.unit == "m"
-
-
-def test_bluesky_finds_its_protocols(bench):
-    from bluesky.protocols import Movable, Readable, Stoppable
-
-    assert isinstance(bench.device, Readable)
-    assert isinstance(bench.device, Movable)
-    assert isinstance(bench.device, Stoppable)
 
 
 @pytest.mark.parametrize("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
@@ -167,28 +148,6 @@ def test_plant_sees_where_the_wire_is_going(bench):
     assert ahead == pytest.approx(before + VELOCITY, abs=1e-6)
     bench.clock.sleep(1.0)
     assert bench.where() == pytest.approx(ahead, abs=1e-6)
-
-
-def test_beyond_the_limits_nothing_is_sent(bench):
-    requests, goal = len(bench.requests), bench.servo.read_item(116)
-    low, high = bench.device.limits.low, bench.device.limits.high
-    for value in (low - 1e-5, high + 1e-5, math.nan, math.inf, -math.inf):
-        with pytest.raises(LimitError, match=r"^stage: set-point .* m is outside of .* m$"):
-            bench.device.set(value)
-        with pytest.raises(LimitError):
-            bench.device.check(value)
-    assert len(bench.requests) == requests
-    assert bench.servo.read_item(116) == goal
-    assert math.isnan(bench.device.setpoint)
-    assert not bench.device.force_enabled
-
-
-def test_limits_themselves_are_allowed(bench):
-    for value in (bench.device.limits.low, bench.device.limits.high):
-        bench.device.check(value)
-        bench.device.set(value)
-        assert bench.device.setpoint == value
-        bench.device.stop()
 
 
 def test_stop_holds_the_position_of_the_moment(bench):
@@ -227,12 +186,12 @@ def watchdog_expired(bench):
 
 def error_with_force_on(bench):
     bench.device.set(0.1)
-    bench.servo.trip(HardwareError.MOTOR_ENCODER)
+    bench.instrument.trip(HardwareError.MOTOR_ENCODER)
 
 
 def error_with_force_off(bench):
     bench.device.set(0.1)
-    bench.servo.trip(HardwareError.OVERLOAD)
+    bench.instrument.trip(HardwareError.OVERLOAD)
 
 
 @pytest.mark.parametrize(
@@ -249,19 +208,9 @@ def test_safe_from_any_state_and_again_changes_nothing(bench, state):
     assert not bench.device.force_enabled
 
 
-def test_safe_of_a_device_that_does_not_answer_raises(bench):
-    status = bench.device.set(0.1)
-    bench.servo.unplug()
-    with pytest.raises(DeviceError, match="stage: "):
-        bench.device.safe()
-    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(0.0), status.wait):
-        with pytest.raises(DeviceConnectionError, match="stage: "):
-            call()
-
-
 def test_every_call_tells_of_a_hardware_error(bench):
     status = bench.device.set(0.1)
-    bench.servo.trip(HardwareError.OVERHEATING)
+    bench.instrument.trip(HardwareError.OVERHEATING)
     device = bench.device
     for call in (device.measure, device.glance, device.read, lambda: device.set(0.0), status.wait):
         with pytest.raises(DeviceError, match=r"^stage: hardware error 0x04 \(overheating") as caught:
@@ -308,10 +257,10 @@ def test_a_reading_is_one_transaction(bench):
 
 @over_the_wire
 def test_error_is_cleared_by_a_reboot_and_by_recover(bench):
-    bench.servo.trip(HardwareError.OVERLOAD)
+    bench.instrument.trip(HardwareError.OVERLOAD)
     bench.device.reboot()
     bench.device.set(0.01).wait()
-    bench.servo.trip(HardwareError.OVERLOAD)
+    bench.instrument.trip(HardwareError.OVERLOAD)
     bench.device.close()
     with pytest.raises(DeviceError, match=r"stage: .*overload.*off and on"):
         bench.connect()

@@ -1,15 +1,15 @@
 """What every position sensor promises, run against the emulated device and the driver on its wire."""
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from emulated_bench import Bench, Given, OnABench, check_reproducible
 
 from bench.clock import VirtualClock
-from bench.devices import PositionSensor, role_of
+from bench.contracts.roles import PositionSensorContract
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7PositionSensor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
@@ -21,22 +21,10 @@ from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 
-class Stage:
-    """A plant whose position the test sets."""
+@dataclass(kw_only=True)
+class SensorBench(Bench):
+    """A sensor and the stage whose position the test sets; `spoil` makes its signal invalid."""
 
-    def __init__(self) -> None:
-        self.position = 0.0
-        self.velocity = 0.0
-
-    def advance(self, dt: float) -> None:
-        self.position += self.velocity * dt
-
-
-@dataclass
-class Laboratory:
-    sensor: PositionSensor
-    stage: Stage
-    clock: VirtualClock
     spoil: Callable[[], None]
     transducer: NormalisedPSD | TwoCurrentPSD | RatiometricSensor | DisplacementSensor
 
@@ -86,51 +74,48 @@ CASES = {
 }
 
 
-def laboratory(kind: str, readout: str, stack: ExitStack, seed: int = 1) -> Laboratory:
-    stage, clock = Stage(), VirtualClock()
+def connected(kind, readout, stack, seed=1):
+    stage, clock = Given(), VirtualClock()
     world = World(stage, clock)
     streams = np.random.default_rng(seed).spawn(2)
     if readout == "voltage":
-        transducer = NormalisedPSD(lambda: stage.position, rng=streams[0])
+        transducer = NormalisedPSD(lambda: stage.value, rng=streams[0])
         inputs = {0: transducer}
 
-        def spoil() -> None:
-            stage.position = 1.0
+        def spoil():
+            stage.value = 1.0
     elif readout == "displacement":
-        transducer = DisplacementSensor(lambda: stage.position, rng=streams[0])
+        transducer = DisplacementSensor(lambda: stage.value, rng=streams[0])
         inputs = {1: transducer}
 
-        def spoil() -> None:
-            stage.position = 210e-6
+        def spoil():
+            stage.value = 210e-6
     elif readout == "ratiometric":
-        transducer = RatiometricSensor(lambda: stage.position + ZERO, rng=streams[0])
+        transducer = RatiometricSensor(lambda: stage.value + ZERO, rng=streams[0])
         inputs = {4: transducer.output, 5: transducer.supply}
 
-        def spoil() -> None:
+        def spoil():
             transducer.supply_volts = 0.3
     else:
-        transducer = TwoCurrentPSD(lambda: stage.position, rng=streams[0])
+        transducer = TwoCurrentPSD(lambda: stage.value, rng=streams[0])
         inputs = {2: transducer.first, 3: transducer.second}
 
-        def spoil() -> None:
+        def spoil():
             transducer.light = 0.01
 
     instrument = EmulatedT7(world, inputs, rng=streams[1])
     case = CASES[readout]
     said = {"readout": case.readout or readout, "channels": case.channels} | case.settings
     if kind == "emulated":
-        sensor: PositionSensor = EmulatedPositionSensor("tip", instrument, **said)
+        sensor = EmulatedPositionSensor("tip", instrument, **said)
     else:
         server = stack.enter_context(ModbusTcpServer(instrument))
         settings = T7PositionSensor.Settings(port=server.address, **said)
         sensor = T7PositionSensor.connect("tip", settings, clock)
     stack.callback(sensor.close)
-    return Laboratory(sensor, stage, clock, spoil, transducer)
-
-
-@pytest.fixture(params=["emulated", "wire"])
-def kind(request) -> str:
-    return request.param
+    return SensorBench(
+        clock=clock, device=sensor, instrument=instrument, plant=stage, spoil=spoil, transducer=transducer
+    )
 
 
 @pytest.fixture(params=CASES)
@@ -144,137 +129,104 @@ def case(readout) -> Case:
 
 
 @pytest.fixture
-def lab(kind, readout) -> Iterator[Laboratory]:
-    with ExitStack() as stack:
-        yield laboratory(kind, readout, stack)
+def bench(kind, readout, stack):
+    return connected(kind, readout, stack)
 
 
-def test_plays_the_role(lab):
-    assert role_of(type(lab.sensor)) == "position sensor"
-    assert lab.sensor.name == "tip"
-    assert lab.sensor.parent is None
-
-
-def test_says_who_it_is(lab):
-    identity = lab.sensor.identity
-    assert (identity.maker, identity.model) == ("LabJack", "T7")
-    assert identity.serial_number == "470012345"
-    assert identity.firmware == "1.0300"
-
-
-def test_signals_are_what_measure_and_glance_deliver(lab):
-    names = [signal.name for signal in lab.sensor.signals]
-    assert names == ["tip_position"]
-    assert [signal.unit for signal in lab.sensor.signals] == ["m"]
-    assert list(lab.sensor.measure()) == names
-    assert list(lab.sensor.glance()) == names
+class TestContract(OnABench, PositionSensorContract):
+    @pytest.fixture
+    def identity(self):
+        return "LabJack T7, serial number 470012345, firmware 1.0300"
 
 
 @pytest.mark.parametrize("index", range(5))
-def test_measures_the_position(lab, case, index):
-    position = lab.stage.position = case.positions[index]
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(position, abs=case.measured_within)
-    assert lab.sensor.glance()["tip_position"] == pytest.approx(position, abs=case.glanced_within)
+def test_measures_the_position(bench, case, index):
+    position = bench.plant.value = case.positions[index]
+    assert bench.device.measure()["tip_position"] == pytest.approx(position, abs=case.measured_within)
+    assert bench.device.glance()["tip_position"] == pytest.approx(position, abs=case.glanced_within)
 
 
-def test_read_and_describe_conform_to_bluesky(lab):
-    lab.stage.position = 5e-6
-    reading = lab.sensor.read()
-    described = lab.sensor.describe()
-    assert reading.keys() == described.keys() == {"tip_position"}
-    assert reading["tip_position"]["timestamp"] == lab.clock.timestamp()
-    assert described["tip_position"]["units"] == "m"
-    assert described["tip_position"]["source"] == "T7:470012345:tip_position"
-
-
-def test_a_spoilt_signal_is_an_error_and_not_a_number(lab):
-    lab.spoil()
-    for take in (lab.sensor.measure, lab.sensor.glance, lab.sensor.read):
+def test_a_spoilt_signal_is_an_error_and_not_a_number(bench):
+    bench.spoil()
+    for take in (bench.device.measure, bench.device.glance, bench.device.read):
         with pytest.raises(DeviceError, match=r"^tip: "):
             take()
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_outside_of_the_calibration_is_an_error(lab, case, side):
-    lab.stage.position = side * case.outside
+def test_outside_of_the_calibration_is_an_error(bench, case, side):
+    bench.plant.value = side * case.outside
     with pytest.raises(DeviceError, match=rf"tip: position {'-' if side < 0 else ''}\d\S* m is outside of"):
-        lab.sensor.measure()
+        bench.device.measure()
 
 
-def test_recovers_by_itself(lab, case):
-    lab.stage.position = 1.0
+def test_recovers_by_itself(bench, case):
+    bench.plant.value = 1.0
     with pytest.raises(DeviceError):
-        lab.sensor.measure()
-    lab.stage.position = case.positions[3]
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
+        bench.device.measure()
+    bench.plant.value = case.positions[3]
+    assert bench.device.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
 
 
-def test_safe_and_stop_change_nothing(lab, case):
-    lab.stage.position = case.positions[3]
+def test_safe_and_stop_change_nothing(bench, case):
+    bench.plant.value = case.positions[3]
     for _ in range(2):
-        lab.sensor.safe()
-        lab.sensor.stop()
-    assert lab.sensor.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
+        bench.device.safe()
+        bench.device.stop()
+    assert bench.device.measure()["tip_position"] == pytest.approx(case.positions[3], abs=case.measured_within)
 
 
-def test_a_measurement_takes_the_time_of_its_conversions(lab, readout):
-    begin = lab.clock.now()
-    lab.sensor.measure()
-    assert lab.clock.now() - begin == pytest.approx(0.010 * len(CASES[readout].channels))
-    begin = lab.clock.now()
-    lab.sensor.glance()
-    assert lab.clock.now() == begin
+def test_a_measurement_takes_the_time_of_its_conversions(bench, readout):
+    begin = bench.clock.now()
+    bench.device.measure()
+    assert bench.clock.now() - begin == pytest.approx(0.010 * len(CASES[readout].channels))
+    begin = bench.clock.now()
+    bench.device.glance()
+    assert bench.clock.now() == begin
 
 
-def test_a_measurement_is_the_mean_over_its_time(kind):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "voltage", stack)
-        lab.stage.velocity = 2e-3
-        # Conversions at 1, 2 ... 10 ms: their mean is at 5.5 ms.
-        assert lab.sensor.measure()["tip_position"] == pytest.approx(11e-6, abs=0.15e-6)
+def test_a_measurement_is_the_mean_over_its_time(kind, stack):
+    bench = connected(kind, "voltage", stack)
+    bench.plant.rate = 2e-3
+    # Conversions at 1, 2 ... 10 ms: their mean is at 5.5 ms.
+    assert bench.device.measure()["tip_position"] == pytest.approx(11e-6, abs=0.15e-6)
 
 
-def test_one_seed_gives_one_record(kind, readout):
-    def record(seed: int) -> list[float]:
-        with ExitStack() as stack:
-            lab = laboratory(kind, readout, stack, seed)
-            values = []
-            for position in CASES[readout].positions:
-                lab.stage.position = position
-                values += [lab.sensor.measure()["tip_position"], lab.sensor.glance()["tip_position"]]
-            return values
+def test_one_seed_gives_one_record(kind, readout, stack):
+    def record(seed):
+        bench = connected(kind, readout, stack, seed)
+        values = []
+        for bench.plant.value in CASES[readout].positions:
+            values += [*bench.device.measure().values(), *bench.device.glance().values()]
+        return values
 
-    assert record(7) == record(7)
-    assert record(7) != record(8)
+    check_reproducible(record)
 
 
-def test_the_wire_changes_no_more_than_the_rounding_of_a_float(readout):
-    def record(kind: str) -> list[float]:
-        with ExitStack() as stack:
-            lab = laboratory(kind, readout, stack)
-            lab.stage.position = CASES[readout].positions[-1]
-            return [lab.sensor.measure()["tip_position"] for _ in range(5)]
+def test_the_wire_changes_no_more_than_the_rounding_of_a_float(readout, stack):
+    def record(kind):
+        bench = connected(kind, readout, stack)
+        bench.plant.value = CASES[readout].positions[-1]
+        return [bench.device.measure()["tip_position"] for _ in range(5)]
 
-    np.testing.assert_allclose(record("wire"), record("emulated"), rtol=1e-6)
+    np.testing.assert_allclose(record("driver"), record("emulated"), rtol=1e-6)
 
 
-def test_noise_of_a_measurement_is_that_of_the_mean(kind):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "voltage", stack)
-        means = [lab.sensor.measure()["tip_position"] for _ in range(500)]
-        single = [lab.sensor.glance()["tip_position"] for _ in range(500)]
+def test_noise_of_a_measurement_is_that_of_the_mean(kind, stack):
+    bench = connected(kind, "voltage", stack)
+    means = [bench.device.measure()["tip_position"] for _ in range(500)]
+    single = [bench.device.glance()["tip_position"] for _ in range(500)]
     # 5 mV of the detector at 0.1 V/µm is 50 nm; the converter's own 0.1 mV does not show.
     assert np.std(means) == pytest.approx(50e-9 / math.sqrt(10), rel=0.12)
     assert np.std(single) == pytest.approx(50e-9, rel=0.12)
     assert abs(np.mean(means)) < 4 * 50e-9 / math.sqrt(5000)
 
 
-def test_noise_of_a_displacement_sensor_is_not_that_of_the_converter(kind):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "displacement", stack)
-        lab.stage.position = 33.003e-6
-        means = [lab.sensor.measure()["tip_position"] for _ in range(500)]
-        single = [lab.sensor.glance()["tip_position"] for _ in range(1000)]
+def test_noise_of_a_displacement_sensor_is_not_that_of_the_converter(kind, stack):
+    bench = connected(kind, "displacement", stack)
+    bench.plant.value = 33.003e-6
+    means = [bench.device.measure()["tip_position"] for _ in range(500)]
+    single = [bench.device.glance()["tip_position"] for _ in range(1000)]
     # 10 nm, steps of 10 nm, and 132 µV of the converter at 50 mV/µm, which are 2.6 nm.
     sigma = math.sqrt(10e-9**2 + 10e-9**2 / 12 + 2.6e-9**2)
     assert np.std(single) == pytest.approx(sigma, rel=0.07)
@@ -283,40 +235,36 @@ def test_noise_of_a_displacement_sensor_is_not_that_of_the_converter(kind):
 
 
 @pytest.mark.parametrize("position", [-1e-3, -200e-6, 200e-6, 1e-3])
-def test_a_displacement_beyond_the_reach_is_never_a_position(kind, position):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "displacement", stack)
-        lab.stage.position = position
-        for take in (lab.sensor.measure, lab.sensor.glance) * 20:
-            with pytest.raises(DeviceError, match=r"tip: AIN1 .*is over its range of ±10 V"):
-                take()
+def test_a_displacement_beyond_the_reach_is_never_a_position(kind, position, stack):
+    bench = connected(kind, "displacement", stack)
+    bench.plant.value = position
+    for take in (bench.device.measure, bench.device.glance) * 20:
+        with pytest.raises(DeviceError, match=r"tip: AIN1 .*is over its range of ±10 V"):
+            take()
 
 
-def test_supply_of_a_ratiometric_sensor_does_not_matter_within_its_range(kind):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "ratiometric", stack)
-        lab.stage.position = 5e-3
-        for volts in (4.55, 5.0, 5.45):
-            lab.transducer.supply_volts = volts
-            means = [lab.sensor.measure()["tip_position"] for _ in range(20)]
-            assert np.mean(means) == pytest.approx(5e-3, abs=8e-6)
+def test_supply_of_a_ratiometric_sensor_does_not_matter_within_its_range(kind, stack):
+    bench = connected(kind, "ratiometric", stack)
+    bench.plant.value = 5e-3
+    for volts in (4.55, 5.0, 5.45):
+        bench.transducer.supply_volts = volts
+        means = [bench.device.measure()["tip_position"] for _ in range(20)]
+        assert np.mean(means) == pytest.approx(5e-3, abs=8e-6)
 
 
 @pytest.mark.parametrize("volts", [0.0, 4.45, 5.55, 9.0])
-def test_a_failed_supply_is_named(kind, volts):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "ratiometric", stack)
-        lab.transducer.supply_volts = volts
-        for take in (lab.sensor.measure, lab.sensor.glance):
-            with pytest.raises(DeviceError, match=r"tip: supply voltage of the sensor is \S+ V"):
-                take()
+def test_a_failed_supply_is_named(kind, volts, stack):
+    bench = connected(kind, "ratiometric", stack)
+    bench.transducer.supply_volts = volts
+    for take in (bench.device.measure, bench.device.glance):
+        with pytest.raises(DeviceError, match=r"tip: supply voltage of the sensor is \S+ V"):
+            take()
 
 
 @pytest.mark.parametrize("position", [-1.0, -ZERO - 1e-3, 0.035 - ZERO + 1e-3, 1.0])
-def test_a_magnet_beyond_the_stroke_is_never_a_position(kind, position):
-    with ExitStack() as stack:
-        lab = laboratory(kind, "ratiometric", stack)
-        lab.stage.position = position
-        for take in (lab.sensor.measure, lab.sensor.glance) * 20:
-            with pytest.raises(DeviceError, match="tip: output of the sensor"):
-                take()
+def test_a_magnet_beyond_the_stroke_is_never_a_position(kind, position, stack):
+    bench = connected(kind, "ratiometric", stack)
+    bench.plant.value = position
+    for take in (bench.device.measure, bench.device.glance) * 20:
+        with pytest.raises(DeviceError, match="tip: output of the sensor"):
+            take()

@@ -1,7 +1,6 @@
 """What every switch promises, run against the emulated device and the driver on its wire."""
 
 import math
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -9,7 +8,8 @@ import numpy as np
 import pytest
 
 from bench.clock import VirtualClock
-from bench.devices import Switch, role_of
+from bench.contracts.roles import SwitchContract
+from bench.devices import Switch
 from bench.errors import DeviceError, LimitError
 from drivers.labjack_t7 import T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
@@ -52,7 +52,7 @@ class Laboratory:
     def __post_init__(self) -> None:
         self.t7 = RecordingT7(World(Lamp(), self.clock), {}, rng=np.random.default_rng(4))
         self.t7.requests = []
-        if self.kind == "wire":
+        if self.kind == "driver":
             self.server = self.stack.enter_context(ModbusTcpServer(self.t7))
 
     def connect(self, line: int, watchdog: int = WATCHDOG, name: str = "fan") -> Switch:
@@ -73,15 +73,9 @@ class Laboratory:
         self.t7.world.advance()
 
 
-@pytest.fixture(params=["emulated", "wire"])
-def kind(request) -> str:
-    return request.param
-
-
 @pytest.fixture(params=[True, False], ids=["active high", "active low"])
-def lab(kind, request) -> Iterator[Laboratory]:
-    with ExitStack() as stack:
-        yield Laboratory(kind, request.param, stack)
+def lab(kind, request, stack) -> Laboratory:
+    return Laboratory(kind, request.param, stack)
 
 
 @pytest.fixture
@@ -89,26 +83,26 @@ def fan(lab) -> Switch:
     return lab.connect(3)
 
 
-def test_plays_the_role(fan):
-    assert role_of(type(fan)) == "switch"
-    assert fan.name == "fan"
-    assert fan.parent is None
+class TestContract(SwitchContract):
+    @pytest.fixture
+    def device(self, fan):
+        return fan
 
+    @pytest.fixture
+    def clock(self, lab):
+        return lab.clock
 
-def test_says_who_it_is(fan):
-    assert str(fan.identity) == "LabJack T7, serial number 470012345, firmware 1.0300"
+    @pytest.fixture
+    def identity(self):
+        return "LabJack T7, serial number 470012345, firmware 1.0300"
 
+    @pytest.fixture
+    def effects(self, lab):
+        return lambda: lab.on(3)
 
-def test_signals_readings_and_units_agree(fan, lab):
-    assert [(signal.name, signal.unit) for signal in fan.signals] == [("fan_state", "1")]
-    assert list(fan.measure()) == list(fan.glance()) == ["fan_state"]
-    readings, keys = fan.read(), fan.describe()
-    assert list(readings) == list(keys) == ["fan_state"]
-    assert keys["fan_state"]["units"] == "1"
-    assert keys["fan_state"]["source"] == "T7:470012345:fan_state"
-    assert readings["fan_state"]["timestamp"] == lab.clock.timestamp()
-    assert (fan.setpoint_signal.name, fan.setpoint_signal.unit) == ("fan_setpoint", "1")
-    assert (fan.limits.low, fan.limits.high) == (0.0, 1.0)
+    @pytest.fixture
+    def sent(self, lab):
+        return lambda: len(lab.t7.requests)
 
 
 @pytest.mark.parametrize("line", [0, 7, 22])
@@ -273,10 +267,3 @@ def test_a_switch_alone_sets_its_own_time(lab):
     fan.set(1.0)
     lab.silence(59)
     assert lab.on(3)
-
-
-def test_bluesky_finds_its_protocols(fan):
-    protocols = pytest.importorskip("bluesky.protocols")
-    assert isinstance(fan, protocols.Readable)
-    assert isinstance(fan, protocols.Movable)
-    assert isinstance(fan, protocols.Stoppable)

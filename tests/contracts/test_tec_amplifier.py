@@ -1,28 +1,28 @@
 """What the role of a TEC amplifier promises, of the emulated device itself and of the driver over the wire."""
 
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from itertools import dropwhile
 
 import numpy as np
 import pytest
+from emulated_bench import Bench, OnABench, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
-from bench.devices import TECAmplifier, TECMode, role_of
-from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from bench.contracts.faults import SilentInstrumentContract, SpoiltAnswerContract
+from bench.contracts.roles import TECAmplifierContract
+from bench.devices import TECMode
+from bench.errors import DeviceError
 from drivers.meerstetter import MeerstetterTEC
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
-from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.world import World
 
 WATCHDOG = 5.0
 
 
-class RecordingLoad:
+class RecordingPlant:
     """Passes everything on to the plant and notes when what was commanded."""
 
     def __init__(self, plant, world):
@@ -46,100 +46,68 @@ class RecordingLoad:
         self.plant.release()
 
 
-@dataclass
-class Bench:
-    """One device under test and what is behind it."""
-
-    clock: VirtualClock
-    device: TECAmplifier
-    instrument: EmulatedTEC
-    load: RecordingLoad
-    connect: Callable[[], TECAmplifier] | None
-    requests: list = field(default_factory=list)
-
-
-class RecordingServer:
-    def __init__(self, server, requests):
-        self.server = server
-        self.requests = requests
-
-    def receive(self, data):
-        self.requests.append(data)
-        return self.server.receive(data)
-
-
-names = (f"contract-tec-{number}" for number in itertools.count())
-
-
-@pytest.fixture(params=["emulated", "driver"])
-def bench(request):
+def connected(kind, stack):
     clock = VirtualClock()
-    plant = VO2Cantilever(VO2Parameters(relay_count=64), np.random.default_rng(1))
-    world = World(plant, clock)
-    load = RecordingLoad(plant, world)
-    instrument = EmulatedTEC("tec", world, load, rng=np.random.default_rng(2))
+    specimen = VO2Cantilever(VO2Parameters(relay_count=64), np.random.default_rng(1))
+    world = World(specimen, clock)
+    plant = RecordingPlant(specimen, world)
+    instrument = EmulatedTEC("tec", world, plant, rng=np.random.default_rng(2))
     instrument.write_parameter(4010, 10.0)
     instrument.write_parameter(4011, 95.0)
-    if request.param == "emulated":
+    if kind == "emulated":
         instrument.write_parameter(2030, 3.0)
         instrument.write_parameter(2060, WATCHDOG)
-        yield Bench(clock, instrument, instrument, load, None)
-        return
-    requests = []
-    name = next(names)
+        return Bench(clock=clock, device=instrument, instrument=instrument, plant=plant)
+    port, requests = serial_port(stack, MeComServer(instrument), clock)
     settings = MeerstetterTEC.Settings(
-        port=register(name, RecordingServer(MeComServer(instrument), requests), clock),
-        temperature_limits=(10.0, 95.0),
-        current_limit=3.0,
-        voltage_limit=15.0,
-        watchdog=WATCHDOG,
+        port=port, temperature_limits=(10.0, 95.0), current_limit=3.0, voltage_limit=15.0, watchdog=WATCHDOG
     )
 
-    def connect():
-        return MeerstetterTEC.connect("tec", settings, clock)
+    def connect(kind=MeerstetterTEC.connect):
+        return kind("tec", settings, clock)
 
     device = connect()
-    yield Bench(clock, device, instrument, load, connect, requests)
-    device.close()
-    unregister(name)
+    stack.callback(device.close)
+    return Bench(clock=clock, device=device, instrument=instrument, plant=plant, connect=connect, requests=requests)
 
 
-def test_role_and_identity(bench):
-    assert role_of(type(bench.device)) == "TEC amplifier"
-    assert str(bench.device.identity) == ("Meerstetter Engineering TEC-1091, serial number 10910042, firmware 4.10")
-    assert bench.device.name == "tec"
-    assert bench.device.parent is None
+@pytest.fixture
+def bench(kind, stack):
+    return connected(kind, stack)
 
 
-def test_nothing_is_driven_before_the_first_set_point(bench):
-    bench.clock.sleep(2.0)
-    assert not bench.device.output_enabled
-    assert math.isnan(bench.device.setpoint)
-    assert all(command == "release" for _, command, _ in bench.load.commands)
+class OnAPlate(OnABench):
+    @pytest.fixture
+    def set_points(self):
+        return 45.0, 60.0
 
 
-def test_signals_readings_and_units_agree(bench):
-    device = bench.device
-    assert [(signal.name, signal.unit) for signal in device.signals] == [
-        ("tec_temperature", "°C"),
-        ("tec_sink_temperature", "°C"),
-        ("tec_current", "A"),
-        ("tec_voltage", "V"),
-    ]
-    names = [signal.name for signal in device.signals]
-    assert list(device.measure()) == list(device.glance()) == names
-    readings, keys = device.read(), device.describe()
-    assert list(readings) == list(keys) == names
-    for signal in device.signals:
-        assert keys[signal.name]["units"] == signal.unit
-        assert keys[signal.name]["source"] == f"TEC-1091:10910042:{signal.name}"
-        assert readings[signal.name]["timestamp"] == pytest.approx(bench.clock.timestamp(), abs=0.1)
+class TestContract(OnAPlate, TECAmplifierContract):
+    @pytest.fixture
+    def identity(self):
+        return "Meerstetter Engineering TEC-1091, serial number 10910042, firmware 4.10"
+
+    @pytest.fixture
+    def allowed(self):
+        return "is outside of 10 to 95 °C"
+
+    @pytest.fixture
+    def tolerance(self):
+        return 0.15
+
+    @pytest.fixture
+    def effects(self, bench):
+        return lambda: [*dropwhile(lambda command: command[1] == "release", bench.plant.commands)]
+
+
+class TestSilence(OnAPlate, SilentInstrumentContract):
+    pass
 
 
 def test_measures_what_the_plant_is(bench):
     bench.device.set(60.0).wait()
     values = bench.device.measure()
-    plant = bench.load.plant
+    plant = bench.plant.plant
     assert values["tec_temperature"] == pytest.approx(plant.plate_temperature, abs=0.02)
     assert values["tec_sink_temperature"] == pytest.approx(plant.sink_temperature, abs=0.04)
     assert values["tec_current"] == pytest.approx(plant.current, abs=2e-3)
@@ -168,24 +136,20 @@ def test_every_new_target_is_a_new_arrival(bench):
     assert bench.clock.now() - start > 1.0
 
 
-def test_current_mode(bench):
+def test_currents_of_both_signs_flow_and_have_limits(bench):
     device = bench.device
     device.select_mode(TECMode.CURRENT)
-    assert device.mode is TECMode.CURRENT
-    assert device.setpoint_signal.unit == device.limits.unit == "A"
     assert (device.limits.low, device.limits.high) == (-3.0, 3.0)
-    assert not device.output_enabled
     before = device.measure()["tec_temperature"]
-    status = device.set(0.5)
-    assert status.done
-    assert status.success
-    bench.clock.sleep(3.0)
-    values = device.measure()
-    assert values["tec_current"] == pytest.approx(0.5, abs=2e-3)
-    assert values["tec_temperature"] > before + 1.0
-    device.set(-0.5)
-    bench.clock.sleep(3.0)
-    assert device.measure()["tec_current"] == pytest.approx(-0.5, abs=2e-3)
+    for current in (0.5, -0.5):
+        assert device.set(current).success
+        bench.clock.sleep(3.0)
+        values = device.measure()
+        assert values["tec_current"] == pytest.approx(current, abs=2e-3)
+        if current > 0:
+            assert values["tec_temperature"] > before + 1.0
+    for limit in (3.0, -3.0):
+        device.set(limit)
 
 
 def test_change_of_mode_switches_off(bench):
@@ -208,31 +172,9 @@ def test_old_current_does_not_come_back_with_the_mode(bench):
     device.set(2.0)
     device.select_mode(TECMode.TEMPERATURE)
     device.select_mode(TECMode.CURRENT)
-    bench.load.commands.clear()
+    bench.plant.commands.clear()
     device.set(0.25)
-    assert {value for _, command, value in bench.load.commands if command == "drive"} == {0.25}
-
-
-@pytest.mark.parametrize("value", [9.9, 95.1, math.nan, math.inf, -math.inf])
-def test_beyond_the_limits_nothing_is_sent(bench, value):
-    commands, requests = len(bench.load.commands), len(bench.requests)
-    with pytest.raises(LimitError, match=r"tec: set-point .* is outside of 10 to 95 °C"):
-        bench.device.set(value)
-    with pytest.raises(LimitError):
-        bench.device.check(value)
-    assert (len(bench.load.commands), len(bench.requests)) == (commands, requests)
-    assert math.isnan(bench.device.setpoint)
-    assert not bench.device.output_enabled
-
-
-def test_limits_themselves_are_allowed(bench):
-    limits = bench.device.limits
-    for value in (limits.low, limits.high):
-        bench.device.check(value)
-    bench.device.set(limits.low)
-    bench.device.select_mode(TECMode.CURRENT)
-    bench.device.set(3.0)
-    bench.device.set(-3.0)
+    assert {value for _, command, value in bench.plant.commands if command == "drive"} == {0.25}
 
 
 def test_stop_holds_the_temperature_of_the_moment(bench):
@@ -246,9 +188,7 @@ def test_stop_holds_the_temperature_of_the_moment(bench):
     assert bench.device.output_enabled
 
 
-def test_stop_keeps_the_current_and_does_nothing_when_off(bench):
-    bench.device.stop()
-    assert not bench.device.output_enabled
+def test_stop_keeps_the_current(bench):
     bench.device.select_mode(TECMode.CURRENT)
     bench.device.set(0.5)
     bench.device.stop(success=False)
@@ -256,15 +196,14 @@ def test_stop_keeps_the_current_and_does_nothing_when_off(bench):
     assert bench.instrument.status is DeviceStatus.RUN
 
 
-def test_safe_switches_off_and_again_changes_nothing(bench):
+def test_safe_releases_the_plate(bench):
     bench.device.set(60.0).wait()
     bench.device.safe()
-    assert not bench.device.output_enabled
-    assert bench.load.commands[-1][1] == "release"
-    commands = len(bench.load.commands)
+    assert bench.plant.commands[-1][1] == "release"
+    commands = len(bench.plant.commands)
     bench.device.safe()
     bench.clock.sleep(1.0)
-    assert len(bench.load.commands) == commands
+    assert len(bench.plant.commands) == commands
     assert bench.device.measure()["tec_current"] == pytest.approx(0.0, abs=5e-3)
     bench.device.set(50.0).wait()
 
@@ -275,13 +214,6 @@ def test_safe_from_an_error_state(bench):
     bench.device.safe()
     bench.device.safe()
     assert not bench.device.output_enabled
-
-
-def test_safe_of_a_device_that_does_not_answer_raises(bench):
-    bench.device.set(60.0)
-    bench.instrument.unplug()
-    with pytest.raises(DeviceError, match="tec: "):
-        bench.device.safe()
 
 
 @pytest.mark.parametrize("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
@@ -302,10 +234,10 @@ def test_protection_of_the_device_ends_the_heating(bench):
     bench.instrument.write_parameter(4011, 50.0)
     status = bench.device.set(50.0) if bench.connect is None else bench.device.set(80.0)
     if bench.connect is None:
-        bench.load.plant.regulate(80.0)  # the device itself knows no target beyond its threshold
+        bench.plant.regulate(80.0)  # the device itself knows no target beyond its threshold
     with pytest.raises(DeviceError, match="error 138"):
         status.wait()
-    assert bench.load.commands[-1][1] == "release"
+    assert bench.plant.commands[-1][1] == "release"
 
 
 def test_silence_of_the_host_switches_the_output_off_at_that_instant(bench):
@@ -314,14 +246,14 @@ def test_silence_of_the_host_switches_the_output_off_at_that_instant(bench):
     last_request = bench.clock.now()
     bench.clock.sleep(3600.0)
     assert bench.instrument.status is DeviceStatus.ERROR
-    instant, command, _ = bench.load.commands[-1]
+    instant, command, _ = bench.plant.commands[-1]
     assert command == "release"
     # The answer to the last request took at most a few milliseconds of the wire.
     assert instant == pytest.approx(last_request + WATCHDOG, abs=0.005)
     with pytest.raises(DeviceError, match="error 183"):
         bench.device.measure()
     assert not bench.device.output_enabled
-    assert bench.load.plant.plate_temperature == pytest.approx(22.0, abs=0.5)
+    assert bench.plant.plate_temperature == pytest.approx(22.0, abs=0.5)
 
 
 def test_ticks_of_two_seconds_keep_the_output_on(bench):
@@ -332,41 +264,23 @@ def test_ticks_of_two_seconds_keep_the_output_on(bench):
     assert bench.device.output_enabled
 
 
-def test_device_that_stops_answering(bench):
-    bench.device.set(60.0)
-    bench.instrument.unplug()
-    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(50.0)):
-        with pytest.raises(DeviceConnectionError, match="tec: "):
-            call()
-
-
-def test_bluesky_finds_its_protocols(bench):
-    from bluesky.protocols import Movable, Readable, Stoppable
-
-    assert isinstance(bench.device, Readable)
-    assert isinstance(bench.device, Movable)
-    assert isinstance(bench.device, Stoppable)
-
-
 # What only a wire can do.
-
-
-over_the_wire = pytest.mark.parametrize("bench", ["driver"], indirect=True)
 
 
 @over_the_wire
 @pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
-def test_spoilt_answer_is_asked_for_again_and_the_order_is_carried_out_once(bench, fault):
-    bench.device.set(45.0).wait()
-    bench.load.commands.clear()
-    bench.requests.clear()
-    for call in (bench.device.measure, lambda: bench.device.set(50.0), bench.device.safe):
-        getattr(bench.instrument, fault)()
-        bench.requests.clear()
-        call()
-        assert bench.requests[0] == bench.requests[1]
-        assert len(set(bench.requests)) == len(bench.requests) - 1
-    assert [command for _, command, _ in bench.load.commands] == ["regulate", "release"]
+class TestSpoiltAnswer(OnAPlate, SpoiltAnswerContract):
+    @pytest.fixture
+    def spoil(self, bench, fault):
+        return getattr(bench.instrument, fault)
+
+    def test_the_order_is_carried_out_once(self, bench, spoil):
+        bench.device.set(45.0).wait()
+        bench.plant.commands.clear()
+        for call in (bench.device.measure, lambda: bench.device.set(50.0), bench.device.safe):
+            spoil()
+            call()
+        assert [command for _, command, _ in bench.plant.commands] == ["regulate", "release"]
 
 
 @over_the_wire
@@ -409,8 +323,7 @@ def test_error_of_before_is_refused_and_recovered(bench):
     bench.device.close()
     with pytest.raises(DeviceError, match=r"error 183 .*watchdog.*off and on"):
         bench.connect()
-    settings = bench.device._settings
-    device = MeerstetterTEC.recover("tec", settings, bench.clock)
+    device = bench.connect(MeerstetterTEC.recover)
     assert not device.output_enabled
     device.set(45.0).wait()
     device.safe()
@@ -433,31 +346,18 @@ def test_connecting_to_an_output_that_is_on_switches_it_off(bench):
     bench.device.close()
     device = bench.connect()
     assert not device.output_enabled
-    assert bench.load.commands[-1][1] == "release"
+    assert bench.plant.commands[-1][1] == "release"
     device.close()
 
 
-def test_two_runs_are_equal_to_the_last_digit():
+def test_two_runs_are_equal_to_the_last_digit(kind, stack):
     def run():
-        clock = VirtualClock()
-        plant = VO2Cantilever(VO2Parameters(relay_count=64), np.random.default_rng(1))
-        world = World(plant, clock)
-        instrument = EmulatedTEC("tec", world, plant, rng=np.random.default_rng(2))
-        name = next(names)
-        settings = MeerstetterTEC.Settings(
-            port=register(name, MeComServer(instrument), clock),
-            temperature_limits=(15, 90),
-            current_limit=3.0,
-            voltage_limit=15.0,
-        )
-        device = MeerstetterTEC.connect("tec", settings, clock)
+        device = connected(kind, stack).device
         readings = []
         for target in (30.0, 60.0, 45.0):
             device.set(target).wait()
             readings.append(device.read())
         device.safe()
-        device.close()
-        unregister(name)
         return readings
 
     assert run() == run()

@@ -1,15 +1,14 @@
 """What every temperature sensor promises, run against the emulated device and the driver on its wire."""
 
 import math
-from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from emulated_bench import Bench, Given, OnABench, check_reproducible
 
 from bench.clock import VirtualClock
-from bench.devices import TemperatureSensor, role_of
+from bench.contracts.roles import TemperatureSensorContract
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7Thermistor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
@@ -23,106 +22,73 @@ TEMPERATURES = (-30.0, 0.0, 22.0, 42.5, 110.0)
 NOISE = 0.02
 
 
-class Plate:
-    """A plant whose temperature the test sets."""
+@dataclass(kw_only=True)
+class SensorBench(Bench):
+    """A sensor and the plate whose temperature the test sets."""
 
-    def __init__(self) -> None:
-        self.temperature = 22.0
-        self.rate = 0.0
-
-    def advance(self, dt: float) -> None:
-        self.temperature += self.rate * dt
-
-
-@dataclass
-class Laboratory:
-    sensor: TemperatureSensor
-    plate: Plate
-    clock: VirtualClock
     thermistor: Thermistor
 
+    def takes(self):
+        return self.device.measure, self.device.glance, self.device.read
 
-def laboratory(kind: str, stack: ExitStack, seed: int = 1) -> Laboratory:
-    plate, clock = Plate(), VirtualClock()
+
+def connected(kind, stack, seed=1):
+    plate, clock = Given(22.0), VirtualClock()
     streams = np.random.default_rng(seed).spawn(2)
-    thermistor = Thermistor(lambda: plate.temperature, noise=NOISE, rng=streams[0])
+    thermistor = Thermistor(lambda: plate.value, noise=NOISE, rng=streams[0])
     inputs = {CHANNELS[0]: thermistor.divider, CHANNELS[1]: thermistor.excitation}
     instrument = EmulatedT7(World(plate, clock), inputs, rng=streams[1])
     if kind == "emulated":
-        sensor: TemperatureSensor = EmulatedTemperatureSensor("base", instrument, channels=CHANNELS)
+        sensor = EmulatedTemperatureSensor("base", instrument, channels=CHANNELS)
     else:
         server = stack.enter_context(ModbusTcpServer(instrument))
         settings = T7Thermistor.Settings(port=server.address, channels=CHANNELS)
         sensor = T7Thermistor.connect("base", settings, clock)
     stack.callback(sensor.close)
-    return Laboratory(sensor, plate, clock, thermistor)
-
-
-@pytest.fixture(params=["emulated", "wire"])
-def kind(request) -> str:
-    return request.param
+    return SensorBench(clock=clock, device=sensor, instrument=instrument, plant=plate, thermistor=thermistor)
 
 
 @pytest.fixture
-def lab(kind) -> Iterator[Laboratory]:
-    with ExitStack() as stack:
-        yield laboratory(kind, stack)
+def bench(kind, stack):
+    return connected(kind, stack)
 
 
-def takes(lab: Laboratory):
-    return lab.sensor.measure, lab.sensor.glance, lab.sensor.read
-
-
-def test_plays_the_role(lab):
-    assert role_of(type(lab.sensor)) == "temperature sensor"
-    assert lab.sensor.name == "base"
-    assert lab.sensor.parent is None
-
-
-def test_says_who_it_is(lab):
-    assert str(lab.sensor.identity) == "LabJack T7, serial number 470012345, firmware 1.0300"
-
-
-def test_signals_readings_and_units_agree(lab):
-    assert [(signal.name, signal.unit) for signal in lab.sensor.signals] == [("base_temperature", "°C")]
-    assert list(lab.sensor.measure()) == list(lab.sensor.glance()) == ["base_temperature"]
-    readings, keys = lab.sensor.read(), lab.sensor.describe()
-    assert list(readings) == list(keys) == ["base_temperature"]
-    assert keys["base_temperature"]["units"] == "°C"
-    assert keys["base_temperature"]["source"] == "T7:470012345:base_temperature"
-    assert readings["base_temperature"]["timestamp"] == lab.clock.timestamp()
+class TestContract(OnABench, TemperatureSensorContract):
+    @pytest.fixture
+    def identity(self):
+        return "LabJack T7, serial number 470012345, firmware 1.0300"
 
 
 @pytest.mark.parametrize("temperature", TEMPERATURES)
-def test_measures_the_temperature(lab, temperature):
-    lab.plate.temperature = temperature
+def test_measures_the_temperature(bench, temperature):
+    bench.plant.value = temperature
     # The noise of the thermistor, and up to 60 mK of the converter where the divider is steep.
-    assert lab.sensor.measure()["base_temperature"] == pytest.approx(temperature, abs=0.1)
-    assert lab.sensor.glance()["base_temperature"] == pytest.approx(temperature, abs=0.3)
+    assert bench.device.measure()["base_temperature"] == pytest.approx(temperature, abs=0.1)
+    assert bench.device.glance()["base_temperature"] == pytest.approx(temperature, abs=0.3)
 
 
-def test_excitation_does_not_matter_within_its_range(lab):
-    lab.plate.temperature = 30.0
+def test_excitation_does_not_matter_within_its_range(bench):
+    bench.plant.value = 30.0
     for volts in (2.02, 2.5, 2.98):
-        lab.thermistor.excitation_volts = volts
-        means = [lab.sensor.measure()["base_temperature"] for _ in range(20)]
+        bench.thermistor.excitation_volts = volts
+        means = [bench.device.measure()["base_temperature"] for _ in range(20)]
         assert np.mean(means) == pytest.approx(30.0, abs=0.01)
 
 
 @pytest.mark.parametrize("fault", ["open", "shorted"])
-def test_a_broken_thermistor_is_named_and_recovers_by_itself(lab, fault):
-    setattr(lab.thermistor, fault, True)
-    for take in takes(lab) * 10:
+def test_a_broken_thermistor_is_named_and_recovers_by_itself(bench, fault):
+    setattr(bench.thermistor, fault, True)
+    for take in bench.takes() * 10:
         with pytest.raises(DeviceError, match=rf"^base: thermistor {fault}"):
             take()
-    setattr(lab.thermistor, fault, False)
-    assert lab.sensor.measure()["base_temperature"] == pytest.approx(22.0, abs=0.1)
+    setattr(bench.thermistor, fault, False)
+    assert bench.device.measure()["base_temperature"] == pytest.approx(22.0, abs=0.1)
 
 
 @pytest.mark.parametrize("volts", [0.0, 1.9, 3.1, 20.0])
-def test_a_failed_excitation_is_an_error_and_not_a_number(lab, volts):
-    lab.thermistor.excitation_volts = volts
-    for take in takes(lab):
+def test_a_failed_excitation_is_an_error_and_not_a_number(bench, volts):
+    bench.thermistor.excitation_volts = volts
+    for take in bench.takes():
         with pytest.raises(
             DeviceError, match=r"^base: (excitation of the thermistor is \S+ V|AIN4 .* over its range)"
         ):
@@ -130,60 +96,51 @@ def test_a_failed_excitation_is_an_error_and_not_a_number(lab, volts):
 
 
 @pytest.mark.parametrize("temperature", [-45.0, 130.0])
-def test_outside_of_the_limits_is_an_error(lab, temperature):
-    lab.plate.temperature = temperature
-    for take in takes(lab):
+def test_outside_of_the_limits_is_an_error(bench, temperature):
+    bench.plant.value = temperature
+    for take in bench.takes():
         with pytest.raises(DeviceError, match=r"^base: temperature -?\d\S* °C is outside of -40 to 125 °C"):
             take()
 
 
-def test_safe_and_stop_change_nothing(lab):
+def test_safe_and_stop_change_nothing(bench):
     for _ in range(2):
-        lab.sensor.safe()
-        lab.sensor.stop()
-    assert lab.sensor.measure()["base_temperature"] == pytest.approx(22.0, abs=0.1)
+        bench.device.safe()
+        bench.device.stop()
+    assert bench.device.measure()["base_temperature"] == pytest.approx(22.0, abs=0.1)
 
 
-def test_a_measurement_takes_the_time_of_its_conversions(lab):
-    begin = lab.clock.now()
-    lab.sensor.measure()
-    assert lab.clock.now() - begin == pytest.approx(0.020)
-    begin = lab.clock.now()
-    lab.sensor.glance()
-    assert lab.clock.now() == begin
+def test_a_measurement_takes_the_time_of_its_conversions(bench):
+    begin = bench.clock.now()
+    bench.device.measure()
+    assert bench.clock.now() - begin == pytest.approx(0.020)
+    begin = bench.clock.now()
+    bench.device.glance()
+    assert bench.clock.now() == begin
 
 
-def test_noise_is_that_of_the_thermistor(lab):
-    single = [lab.sensor.glance()["base_temperature"] for _ in range(1000)]
-    means = [lab.sensor.measure()["base_temperature"] for _ in range(500)]
+def test_noise_is_that_of_the_thermistor(bench):
+    single = [bench.device.glance()["base_temperature"] for _ in range(1000)]
+    means = [bench.device.measure()["base_temperature"] for _ in range(500)]
     assert np.std(single) == pytest.approx(NOISE, rel=0.1)
     assert np.std(means) == pytest.approx(NOISE / math.sqrt(10), rel=0.15)
     assert abs(np.mean(means) - 22.0) < 4 * NOISE / math.sqrt(5000) + 1e-3
 
 
-def test_one_seed_gives_one_record(kind):
-    def record(seed: int) -> list[float]:
-        with ExitStack() as stack:
-            lab = laboratory(kind, stack, seed)
-            values = []
-            for temperature in TEMPERATURES:
-                lab.plate.temperature = temperature
-                values += [lab.sensor.measure()["base_temperature"], lab.sensor.glance()["base_temperature"]]
-            return values
+def test_one_seed_gives_one_record(kind, stack):
+    def record(seed):
+        bench = connected(kind, stack, seed)
+        values = []
+        for bench.plant.value in TEMPERATURES:
+            values += [*bench.device.measure().values(), *bench.device.glance().values()]
+        return values
 
-    assert record(7) == record(7)
-    assert record(7) != record(8)
+    check_reproducible(record)
 
 
-def test_the_wire_changes_no_more_than_the_rounding_of_a_float():
-    def record(kind: str) -> list[float]:
-        with ExitStack() as stack:
-            lab = laboratory(kind, stack)
-            return [lab.sensor.measure()["base_temperature"] for _ in range(5)]
+def test_the_wire_changes_no_more_than_the_rounding_of_a_float(stack):
+    def record(kind):
+        bench = connected(kind, stack)
+        return [bench.device.measure()["base_temperature"] for _ in range(5)]
 
-    np.testing.assert_allclose(record("wire"), record("emulated"), atol=1e-4)
-
-
-def test_bluesky_finds_its_protocols(lab):
-    protocols = pytest.importorskip("bluesky.protocols")
-    assert isinstance(lab.sensor, protocols.Readable)
+    np.testing.assert_allclose(record("driver"), record("emulated"), atol=1e-4)

@@ -180,6 +180,7 @@ def step(size, at=0.1, before=0.0):
 RANGE = SmoothMoves([0.0, 85 * MICRO, -120 * MICRO, 0.0], SPEED, hold=20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_holds_and_moves_over_more_than_200_micrometres(model, seed):
     run = follow(HybridController(model, RANGE), RANGE, RANGE.duration, seed)
@@ -205,6 +206,7 @@ def test_kalman_filter_is_at_least_as_good_as_a_low_pass(model):
         assert passed < 10 * NANO
 
 
+@pytest.mark.slow
 def test_comparisons_are_far_worse(model):
     moves = SmoothMoves([0.0, 40 * MICRO, -50 * MICRO], SPEED, hold=20.0)
     hybrid, thermal, blind = (

@@ -184,6 +184,7 @@ def test_random_states_of_an_imposed_length(kinds):
         assert model.step(state, voltage, between, together=True)[1] == pytest.approx(length, abs=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(st.integers(0, 100_000))
 def test_lengths_and_forces_are_monotone_in_the_voltage(seed):

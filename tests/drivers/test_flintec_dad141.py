@@ -281,7 +281,7 @@ needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-ter
 def test_over_a_pseudo_terminal(bench):
     bench.put(12.0)
     with pseudo_terminal(bench.tap) as path:
-        settings = Settings(port=path, timeout=5.0, force_limits=WIDE, samples=3, interval=0.01)
+        settings = Settings(port=path, timeout=10.0, force_limits=WIDE, samples=3, interval=0.01)
         cell = FlintecDAD141.connect("load", settings, WallClock())
         assert cell.measure() == {"load_force": 12.0}
         cell.tare()
@@ -292,7 +292,7 @@ def test_over_a_pseudo_terminal(bench):
 @needs_pty
 def test_a_line_that_is_pulled_out(bench):
     with pseudo_terminal(bench.tap) as path:
-        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=5.0, force_limits=WIDE), WallClock())
+        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=10.0, force_limits=WIDE), WallClock())
     with pytest.raises(DeviceConnectionError, match=r"^load: lost the line .*check the cable"):
         cell.glance()
     with pytest.raises(DeviceConnectionError, match="closed"):
@@ -316,7 +316,7 @@ def test_over_tcp(bench):
         thread = threading.Thread(target=serve)
         thread.start()
         url = f"socket://127.0.0.1:{listener.getsockname()[1]}"
-        cell = FlintecDAD141.connect("load", Settings(port=url, timeout=5.0, force_limits=WIDE), WallClock())
+        cell = FlintecDAD141.connect("load", Settings(port=url, timeout=10.0, force_limits=WIDE), WallClock())
         assert cell.glance() == {"load_force": -3.5}
         cell.close()
         thread.join()
@@ -515,14 +515,14 @@ def test_a_late_reply_is_not_taken_for_the_next(bench):
             reply = bench.tap.server.receive(data)
             if self.slow:
                 self.slow = False
-                threading.Event().wait(0.3)
+                threading.Event().wait(1.3)
                 bench.put(9.0)
             return reply
 
     late = Late()
     bench.put(1.0)
     with pseudo_terminal(late) as path:
-        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=0.2, force_limits=WIDE), WallClock())
+        cell = FlintecDAD141.connect("load", Settings(port=path, timeout=1.0, force_limits=WIDE), WallClock())
         late.slow = True
         assert cell.glance() == {"load_force": 9.0}
         assert cell.glance() == {"load_force": 9.0}

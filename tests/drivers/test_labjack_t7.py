@@ -129,7 +129,7 @@ class Scripted:
         with self._listener:
             client, _ = self._listener.accept()
             with client:
-                client.settimeout(5)
+                client.settimeout(60)
                 for expected, reply in self._exchanges:
                     self.received.append(client.recv(4096))
                     assert self.received[-1] == expected

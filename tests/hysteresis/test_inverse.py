@@ -75,6 +75,7 @@ def targets_for(rng, operator, state):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [film, plain], ids=["non-monotonic", "monotone"])
 def test_1000_random_states_against_a_dense_scan(make):
     rng = np.random.default_rng(1)

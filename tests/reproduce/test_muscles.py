@@ -13,17 +13,19 @@ MUSCLES = ("mckibben", "coiled_polymer")
 SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "length-verification": 90}
 
 
-def test_campaign(tmp_path, capsys):
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.seeds)])
+def test_campaign(tmp_path, capsys, seed):
     result = tmp_path / "result.json"
     with pytest.raises(SystemExit) as stopped:
-        main(["reproduce", "muscles", "--seed", "1", "--out", str(tmp_path), "--json", str(result)])
+        main(["reproduce", "muscles", "--seed", str(seed), "--out", str(tmp_path), "--json", str(result)])
     assert not stopped.value.code
     out, err = capsys.readouterr()
     assert "McKibben muscle" in out
     assert "super-coiled polymer muscle" in out
     assert err == ""
     campaign = json.loads(result.read_text())
-    assert campaign["seed"] == 1
+    assert campaign["seed"] == seed
     assert campaign["laboratory_seconds"] > 8 * 3600
     for muscle in MUSCLES:
         errors = campaign[muscle]

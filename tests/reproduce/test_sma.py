@@ -117,7 +117,8 @@ def everything_that_it_says_is_there(campaign):
     assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.seeds) for seed in range(1, 5))])
 def test_campaign(tmp_path, capsys, seed):
     """One campaign a seed: it takes most of a minute, so that everything is looked at in one test."""
     result = tmp_path / "result.json"

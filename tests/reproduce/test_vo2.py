@@ -105,7 +105,8 @@ def everything_that_it_says_is_there(campaign):
                 )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.seeds) for seed in range(1, 6))])
 def test_campaign(tmp_path, seed):
     """One campaign a seed: it takes most of a minute, so that everything is looked at in one test."""
     bench("reproduce", "vo2", "--seed", seed, "--out", tmp_path, "--json", tmp_path / "result.json")
@@ -122,7 +123,8 @@ def test_campaign(tmp_path, seed):
     everything_that_it_says_is_there(campaign)
 
 
-@pytest.mark.parametrize("seed", [6, 7])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6, pytest.param(7, marks=pytest.mark.seeds)])
 def test_the_same_step_by_step(tmp_path, seed):
     """Run, identify, run in another session, predict: what an operator types."""
     columns = ("--input", "tec_temperature", "--output", "curvature")

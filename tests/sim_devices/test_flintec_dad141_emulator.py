@@ -584,7 +584,7 @@ def test_minimalmodbus():
         client = minimalmodbus.Instrument(path, 42)
         try:
             client.serial.baudrate = 115200
-            client.serial.timeout = 0.3  # waited out at each exception, as its reply is shorter
+            client.serial.timeout = 1.0  # waited out at each exception, as its reply is shorter
             assert client.read_registers(0x3500, 5) == [0x4140, 0, 0x4138, 0, 0x0030]
             assert client.read_float(0x2000, functioncode=4) == 12.0
             assert client.read_float(0x2002) == 11.5
@@ -604,7 +604,7 @@ def test_minimalmodbus():
 
 def mbpoll(path: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = ["mbpoll", "-m", "rtu", "-b", "115200", "-P", "none", "-a", "7", "-0", "-1", "-q", "-o", "5"]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30, check=False)
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
 def values(result: subprocess.CompletedProcess[str]) -> list[str]:

@@ -835,10 +835,10 @@ def test_any_bytes_are_answered_or_end_the_connection(pieces):
 @pytest.mark.parametrize("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 00ff 01"])
 def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
     with ModbusTcpServer(wired) as server:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as spoilt:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=60) as spoilt:
             spoilt.sendall(frame(bad))
             assert spoilt.recv(100) == b""
-        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as client:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=60) as client:
             client.sendall(frame(VECTORS[0][0]))
             assert client.recv(100) == frame(VECTORS[0][1])
 
@@ -846,7 +846,7 @@ def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
 def test_several_requests_in_one_segment(wired):
     with (
         ModbusTcpServer(wired) as server,
-        socket.create_connection(("127.0.0.1", server.port), timeout=5) as client,
+        socket.create_connection(("127.0.0.1", server.port), timeout=60) as client,
     ):
         client.sendall(b"".join(frame(sent) for sent, _ in VECTORS))
         expected = b"".join(frame(reply) for _, reply in VECTORS)
@@ -860,7 +860,7 @@ def test_many_clients_at_once(wired):
     failures = []
 
     def ask(port: int) -> None:
-        with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
             for sent, reply in VECTORS[:2] * 50:
                 client.sendall(frame(sent))
                 if client.recv(100) != frame(reply):
@@ -884,7 +884,7 @@ def test_start_and_close_leave_nothing(wired):
         server.start()
         with pytest.raises(RuntimeError, match="already"):
             server.start()
-        client = socket.create_connection(("127.0.0.1", server.port), timeout=5)
+        client = socket.create_connection(("127.0.0.1", server.port), timeout=60)
         client.sendall(frame(VECTORS[0][0]))
         assert client.recv(100) == frame(VECTORS[0][1])
         server.close()
@@ -892,18 +892,18 @@ def test_start_and_close_leave_nothing(wired):
         assert client.recv(1) == b""
         client.close()
         with pytest.raises(OSError, match="refused"):
-            socket.create_connection(("127.0.0.1", server.port), timeout=5)
+            socket.create_connection(("127.0.0.1", server.port), timeout=60)
     assert threading.active_count() == before
 
 
 def test_a_client_that_resets_its_connection_ends_alone(wired):
     with ModbusTcpServer(wired) as server:
         for _ in range(5):
-            client = socket.create_connection(("127.0.0.1", server.port), timeout=5)
+            client = socket.create_connection(("127.0.0.1", server.port), timeout=60)
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             client.sendall(frame(VECTORS[0][0]))
             client.close()
-        with socket.create_connection(("127.0.0.1", server.port), timeout=5) as client:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=60) as client:
             client.sendall(frame(VECTORS[0][0]))
             assert client.recv(100) == frame(VECTORS[0][1])
 
@@ -929,7 +929,7 @@ def served() -> Iterator[tuple[EmulatedT7, ModbusTcpServer]]:
 
 def test_pymodbus_as_it_is(served):
     t7, server = served
-    client = ModbusTcpClient("127.0.0.1", port=server.port, timeout=5, retries=0)
+    client = ModbusTcpClient("127.0.0.1", port=server.port, timeout=60, retries=0)
     assert client.connect()
     try:
         both = client.read_input_registers(0, count=4, device_id=1)
@@ -949,7 +949,7 @@ def test_pymodbus_as_it_is(served):
 
 def mbpoll(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = ["mbpoll", "-m", "tcp", "-p", str(port), "-a", "1", "-0", "-1", "-q", "-o", "5"]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30, check=False)
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
 needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")

@@ -187,7 +187,7 @@ class TestTime:
         assert port.read(5) == b""
         assert clock.now() == 0.0
 
-    @pytest.mark.timeout(20)
+    @pytest.mark.timeout(60)
     def test_waiting_for_ever_for_what_never_comes_is_an_error(self, port):
         # A real port would never return, which no test or rehearsal can use.
         port.timeout = None

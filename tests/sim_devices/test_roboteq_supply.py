@@ -597,6 +597,7 @@ class TestIndependentClient:
             network.connect(interface="slcan", channel=path, bitrate=125_000, sleep_after_open=0)
             try:
                 node = network.add_node(1, dictionary(canopen))
+                node.sdo.RESPONSE_TIMEOUT = 10.0
                 assert node.sdo[0x1008].raw == "Roboteq SDC2160"
                 node.sdo[COMMAND][1].raw = 250
                 assert load.voltage == 6.0
@@ -611,14 +612,15 @@ def test_driver_over_a_pseudo_terminal():
     device, load = make_device(clock, watchdog=0.0)
     with Terminal(CanopenSlcanServer(device)) as path:
         settings = RoboteqSupply.Settings(
-            port=path, output="average", voltage_limits=(0, 12), watchdog=0, heartbeat=5, timeout=2
+            port=path, output="average", voltage_limits=(0, 12), watchdog=0, heartbeat=60, timeout=10
         )
         supply = RoboteqSupply.connect("supply", settings, clock)
         try:
             supply.set(6.0).wait()
-            clock.sleep(0.3)
-            assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
-            assert supply._line.heartbeat_age() < 0.2
+            connected = clock.now()
+            while supply._line.heartbeat_age() > clock.now() - connected:
+                clock.sleep(0.1)
+                assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
             supply.safe()
             assert load.voltage == 0.0
         finally:
