@@ -1,7 +1,7 @@
-"""The roles that an instrument can play on the bench, and what each promises.
+"""What every device on the bench is and promises; `bench.roles` has the roles that it can play.
 
-A protocol asks for roles, a rig file names the instruments that play them. A driver (real wire) and an
-emulated instrument implement the same role, and one contract test suite runs against both.
+A protocol asks for slots, and a rig file binds them to devices. A driver (real wire) and an emulated instrument
+implement the same role, and one contract test suite runs against both.
 
 Promises of every device
 ------------------------
@@ -23,10 +23,9 @@ from __future__ import annotations
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, TypedDict
 
 from pydantic import BaseModel, ConfigDict
@@ -97,7 +96,7 @@ class Limits:
         return f"{self.low:g} to {self.high:g} {self.unit}"
 
 
-class Reading(TypedDict):
+class BlueskyReading(TypedDict):
     """One value as `bluesky.protocols.Reading` has it; the timestamp is seconds since 1970 UTC."""
 
     value: float
@@ -302,7 +301,7 @@ class Device(ABC):
         """Measure every signal quickly, for telemetry and interlocks; values by signal name."""
         return self.measure()
 
-    def read(self) -> dict[str, Reading]:
+    def read(self) -> dict[str, BlueskyReading]:
         """Measure every signal; values with time stamps, as bluesky has them."""
         values = self.measure()
         timestamp = self._clock.timestamp()
@@ -384,245 +383,3 @@ class Actuator(Device):
         """Raise `LimitError` if `set` would not take `value`."""
         if not (math.isfinite(value) and value in self.limits):
             raise LimitError(self.name, f"set-point {value:g} {self.limits.unit} is outside of {self.limits}")
-
-
-class TECMode(Enum):
-    """What a TEC amplifier holds constant."""
-
-    CURRENT = "current"
-    TEMPERATURE = "temperature"
-
-
-class TECAmplifier(Actuator):
-    """Drives a thermoelectric cooler, as a current source or as a temperature controller.
-
-    In temperature mode the set-point is the object temperature in °C, and `set` completes when the
-    controller reports it stable. In current mode it is the current in A, positive heats, and `set`
-    completes at once.
-
-    The safe state is the output stage off: no current flows, the plate drifts to ambient.
-
-    Signals: `NAME_temperature` °C (object), `NAME_sink_temperature` °C, `NAME_current` A, `NAME_voltage` V.
-    """
-
-    @property
-    @abstractmethod
-    def mode(self) -> TECMode:
-        """What is held constant."""
-
-    @abstractmethod
-    def select_mode(self, mode: TECMode) -> None:
-        """Choose what is held constant; the output is switched off by the change."""
-
-    @property
-    @abstractmethod
-    def output_enabled(self) -> bool:
-        """Whether the output stage is on, as the device says now."""
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (
-            Signal(f"{self.name}_temperature", "°C", "object temperature", 3),
-            Signal(f"{self.name}_sink_temperature", "°C", "sink temperature", 2),
-            Signal(f"{self.name}_current", "A", "TEC current", 3),
-            Signal(f"{self.name}_voltage", "V", "TEC voltage", 3),
-        )
-
-    @property
-    def setpoint_signal(self) -> Signal:
-        """The set-point in the present mode."""
-        if self.mode is TECMode.TEMPERATURE:
-            return Signal(f"{self.name}_setpoint", "°C", "temperature set-point", 3)
-        return Signal(f"{self.name}_setpoint", "A", "current set-point", 4)
-
-
-class VoltageSupply(Actuator):
-    """A voltage source, switching or linear. The set-point is in V, as `output` defines it.
-
-    The safe state is 0 V with the output stage off where the device has one.
-
-    Signals: `NAME_voltage` V, `NAME_current` A.
-    """
-
-    @property
-    @abstractmethod
-    def output(self) -> str:
-        """Which voltage the set-point is: `average` or `rms` of a switched waveform, or `dc`."""
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (
-            Signal(f"{self.name}_voltage", "V", f"{self.output} output voltage", 3),
-            Signal(f"{self.name}_current", "A", "output current", 2),
-        )
-
-    @property
-    def setpoint_signal(self) -> Signal:
-        """The voltage asked for."""
-        return Signal(f"{self.name}_setpoint", "V", f"{self.output} voltage set-point", 3)
-
-
-class LoadCell(Device):
-    """Measures a force in N, positive in tension. It cannot harm anything: its safe state is any state.
-
-    `measure` raises `DeviceError` when the cell is under or over its range.
-
-    Signal: `NAME_force` N.
-    """
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (Signal(f"{self.name}_force", "N", "force", 3),)
-
-    @abstractmethod
-    def tare(self) -> None:
-        """Make the present force read zero from now on."""
-
-    @abstractmethod
-    def clear_tare(self) -> None:
-        """Read gross force again."""
-
-
-class PositionSensor(Device):
-    """Measures a position or a deflection in m. Its safe state is any state.
-
-    `measure` raises `DeviceError` when the input is outside of its range or of its calibration.
-
-    Signal: `NAME_position` m.
-    """
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (Signal(f"{self.name}_position", "m", "position", 9),)
-
-
-class TemperatureSensor(Device):
-    """Measures a temperature in °C. Its safe state is any state.
-
-    Signal: `NAME_temperature` °C.
-    """
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (Signal(f"{self.name}_temperature", "°C", "temperature", 3),)
-
-
-class Servo(Actuator):
-    """Holds an angle in rad, over several turns, counted from its homing position.
-
-    `set` completes when the servo stands at the goal; `stop` holds the present angle. The safe state is
-    torque off: the shaft turns freely.
-
-    Signals: `NAME_position` rad, `NAME_velocity` rad/s, `NAME_load` 1 (share of the stall torque, as the
-    servo infers it).
-    """
-
-    @property
-    @abstractmethod
-    def torque_enabled(self) -> bool:
-        """Whether the servo holds its position, as the device says now."""
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (
-            Signal(f"{self.name}_position", "rad", "angle", 4),
-            Signal(f"{self.name}_velocity", "rad/s", "angular velocity", 3),
-            Signal(f"{self.name}_load", "1", "inferred load", 3),
-        )
-
-    @property
-    def setpoint_signal(self) -> Signal:
-        """The angle asked for."""
-        return Signal(f"{self.name}_setpoint", "rad", "angle set-point", 4)
-
-
-class LinearStage(Actuator):
-    """Holds a point at a position along a line, in m.
-
-    `set` completes when the stage stands at the goal; `stop` holds the present position. The safe state is
-    without force: the point can be moved by hand.
-
-    Signals: `NAME_position` m, `NAME_velocity` m/s, `NAME_load` 1 (share of the greatest force, as the stage
-    infers it).
-    """
-
-    @property
-    @abstractmethod
-    def force_enabled(self) -> bool:
-        """Whether the stage holds its position, as the device says now."""
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (
-            Signal(f"{self.name}_position", "m", "position", 6),
-            Signal(f"{self.name}_velocity", "m/s", "velocity", 5),
-            Signal(f"{self.name}_load", "1", "inferred load", 3),
-        )
-
-    @property
-    def setpoint_signal(self) -> Signal:
-        """The position asked for."""
-        return Signal(f"{self.name}_setpoint", "m", "position set-point", 6)
-
-
-class Switch(Actuator):
-    """Switches something on (1) or off (0), such as a fan; no other set-point is allowed.
-
-    The safe state is off.
-
-    Signal: `NAME_state` 1, what the device drives its output to.
-    """
-
-    @property
-    def limits(self) -> Limits:
-        """Off and on."""
-        return Limits(0.0, 1.0, "(0 is off, 1 is on)")
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """What is measured."""
-        return (Signal(f"{self.name}_state", "1", "whether it is on", 0),)
-
-    @property
-    def setpoint_signal(self) -> Signal:
-        """Whether it shall be on."""
-        return Signal(f"{self.name}_setpoint", "1", "whether it shall be on", 0)
-
-    def check(self, value: float) -> None:
-        """Raise `LimitError` unless `value` is 0 or 1."""
-        if value not in (0.0, 1.0):
-            raise LimitError(self.name, f"set-point {value:g} is neither 0 (off) nor 1 (on)")
-
-
-ROLES: Mapping[str, type] = {
-    "TEC amplifier": TECAmplifier,
-    "voltage supply": VoltageSupply,
-    "load cell": LoadCell,
-    "position sensor": PositionSensor,
-    "temperature sensor": TemperatureSensor,
-    "servo": Servo,
-    "linear stage": LinearStage,
-    "switch": Switch,
-}
-"""The roles by the names that messages use."""
-
-
-def role_of(device_class: type[Device]) -> str:
-    """Return the name of the role that a device class plays.
-
-    Raises
-    ------
-    TypeError
-        If it plays none.
-    """
-    for name, role in ROLES.items():
-        if issubclass(device_class, role):
-            return name
-    raise TypeError(f"{device_class.__name__} plays none of the roles {', '.join(ROLES)}")

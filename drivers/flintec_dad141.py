@@ -26,8 +26,9 @@ from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOEx
 from pymodbus.pdu import ModbusPDU
 
 from bench.clock import Clock
-from bench.devices import Identity, LoadCell
+from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
+from bench.roles import LoadCell
 from drivers.device import LineDevice, Slope
 from drivers.modbus import exception_text, pack, swapped, unpack
 from drivers.serial_line import SerialSettings, lost_line, open_port

@@ -9,9 +9,9 @@ import pytest
 
 from bench.clock import Clock
 from bench.contracts.devices import ActuatorContract, DeviceContract
-from bench.devices import (
-    Actuator,
-    Device,
+from bench.devices import Actuator, Device
+from bench.errors import DeviceError
+from bench.roles import (
     LinearStage,
     LoadCell,
     PositionSensor,
@@ -22,7 +22,6 @@ from bench.devices import (
     TemperatureSensor,
     VoltageSupply,
 )
-from bench.errors import DeviceError
 
 
 class TECAmplifierContract(ActuatorContract):

@@ -13,8 +13,9 @@ from typing import ClassVar, Self
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
-from bench.devices import Limits, Status, VoltageSupply
+from bench.devices import Limits, Status
 from bench.errors import DeviceError
+from bench.roles import VoltageSupply
 from drivers.device import Slope, attempt
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings

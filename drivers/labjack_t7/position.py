@@ -11,8 +11,8 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bench.devices import PositionSensor
 from bench.errors import DeviceError
+from bench.roles import PositionSensor
 from drivers.device import Slope
 from drivers.labjack_t7.inputs import T7InputDevice, T7InputSettings
 

@@ -10,8 +10,8 @@ from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from bench.devices import TemperatureSensor
 from bench.errors import DeviceError
+from bench.roles import TemperatureSensor
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 
 _SHORTED, _OPEN = 0.01, 0.99  # shares of the excitation at a divider beyond which its thermistor is shorted or open

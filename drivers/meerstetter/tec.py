@@ -19,8 +19,9 @@ from typing import ClassVar
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
+from bench.devices import Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, TECLineSettings, decode, encode, single

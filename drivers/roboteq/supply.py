@@ -32,8 +32,9 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status, VoltageSupply
+from bench.devices import Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.roles import VoltageSupply
 from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine, NodeSettings, described
 

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.control.loops import Playback
-from bench.number_list import NumberList
 from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Slots, Step, parameter, protocol
+from bench.protocol.number_list import NumberList
 from protocols.hybrid import FINE, SENSORS, THERMAL
 
 

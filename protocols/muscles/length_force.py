@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.number_list import NumberList
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, parameter, protocol
+from bench.protocol.number_list import NumberList
 from protocols.muscles.parts import (
     ON_STAGE,
     SAMPLE,

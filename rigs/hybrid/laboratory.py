@@ -19,9 +19,10 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.devices import Device, DriverSettings, Identity, PositionSensor, TECMode
+from bench.devices import Device, DriverSettings, Identity
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.rig_file import LaboratorySettings
+from bench.roles import PositionSensor, TECMode
 from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC

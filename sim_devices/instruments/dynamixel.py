@@ -32,8 +32,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Servo, Status
+from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
+from bench.roles import Servo
 from sim_devices.instruments.dynamixel_motion import (
     NO_LOAD_SPEED_PER_VOLT,
     STALL_TORQUE_PER_VOLT,

@@ -34,8 +34,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.devices import Identity, LoadCell
+from bench.devices import Identity
 from bench.errors import DeviceError
+from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError

@@ -26,8 +26,9 @@ from typing import Protocol
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
+from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
+from bench.roles import TECAmplifier, TECMode
 from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
 from sim_devices.instruments.meerstetter_table import (
     CONTROLLER,

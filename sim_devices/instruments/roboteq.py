@@ -36,8 +36,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Status, VoltageSupply
+from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
+from bench.roles import VoltageSupply
 from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
 from sim_devices.world import World
 

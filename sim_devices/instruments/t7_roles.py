@@ -10,8 +10,9 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Literal
 
-from bench.devices import Identity, Limits, PositionSensor, Status, Switch, TemperatureSensor, VoltageSupply
+from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
+from bench.roles import PositionSensor, Switch, TemperatureSensor, VoltageSupply
 from sim_devices.instruments.emulated import EmulatedDevice
 from sim_devices.instruments.labjack_t7 import ALL_DIO, Burst, EmulatedT7
 from sim_devices.transducers.thermistor import STEINHART_HART

@@ -11,18 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.devices import (
-    DriverSettings,
-    Identity,
-    Limits,
-    PositionSensor,
-    Status,
-    TECAmplifier,
-    TECMode,
-    TemperatureSensor,
-)
+from bench.devices import DriverSettings, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.rig_file import LaboratorySettings
+from bench.roles import PositionSensor, TECAmplifier, TECMode, TemperatureSensor
 
 RIG = """
 [rig]

@@ -1,29 +1,29 @@
 import math
 import threading
 import warnings
+from contextlib import nullcontext
 
 import pytest
-from heater_laboratory import HeaterTEC, NoSettings, Thermometer
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
-from bench.devices import (
-    ROLES,
-    Device,
-    Identity,
-    Limits,
-    LoadCell,
-    PositionSensor,
-    Servo,
-    Signal,
-    Status,
-    VoltageSupply,
-    role_of,
-)
+from bench.devices import Device, Identity, Limits, Signal, Status
 from bench.errors import DeviceError, LimitError
 from bench.rig import Rig
 from bench.rig_file import load_rig
+from bench.roles import (
+    GeneralActuator,
+    GeneralSensor,
+    LinearStage,
+    LoadCell,
+    PositionSensor,
+    Servo,
+    Switch,
+    TECAmplifier,
+    TemperatureSensor,
+    VoltageSupply,
+)
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="(bluesky|event_model|toolz|historydict).*")
@@ -196,16 +196,10 @@ class TestSetpoints:
 
 
 class TestRoles:
-    def test_by_class(self):
-        assert role_of(HeaterTEC) == "TEC amplifier"
-        assert role_of(Thermometer) == "temperature sensor"
-        assert set(ROLES) >= {"TEC amplifier", "voltage supply", "load cell", "position sensor", "servo"}
-
-    def test_none(self):
-        with pytest.raises(TypeError, match="NoSettings plays none of the roles TEC amplifier"):
-            role_of(NoSettings)
-
-    @pytest.mark.parametrize("role", list(ROLES.values()), ids=list(ROLES))
+    @pytest.mark.parametrize(
+        "role",
+        [TECAmplifier, VoltageSupply, LoadCell, PositionSensor, TemperatureSensor, Servo, LinearStage, Switch],
+    )
     def test_roles_cannot_be_made_without_their_methods(self, role):
         assert issubclass(role, Device)
         with pytest.raises(TypeError, match="abstract"):
@@ -224,6 +218,77 @@ class TestRoles:
         assert all(signal.unit for signal in device.signals)
         if hasattr(device, "setpoint_signal"):
             assert device.setpoint_signal.name == "left_setpoint"
+
+
+class Bridge(GeneralSensor):
+    def measure_quantities(self):
+        return {"strain": 1.5, "temperature": 22.0}
+
+    def close(self):
+        pass
+
+
+class Coil(GeneralActuator):
+    sent = ()
+    fails = False
+
+    def measure_quantities(self):
+        return {"current": 0.0 if math.isnan(self.setpoint) else self.setpoint}
+
+    def send(self, value):
+        self.sent = (*self.sent, value)
+        return Status.completed(self.name, self._clock)
+
+    def switch_off(self):
+        self.sent = (*self.sent, "off")
+        if self.fails:
+            raise DeviceError(self.name, "does not confirm that it is off")
+
+    def close(self):
+        pass
+
+
+class TestGeneralRoles:
+    identity = Identity("Acme", "X", "1", "2.0")
+
+    def bridge(self):
+        quantities = (Signal("strain", "1", "strain"), Signal("temperature", "°C", "temperature", 1))
+        return Bridge("bridge", VirtualClock(), self.identity, quantities)
+
+    def coil(self):
+        quantities = (Signal("current", "A", "coil current"),)
+        return Coil("coil", VirtualClock(), self.identity, quantities, Limits(-3.0, 3.0, "A"), description="current")
+
+    def test_signals_are_named_after_the_device_and_keep_their_units(self):
+        bridge = self.bridge()
+        assert [(signal.name, signal.unit) for signal in bridge.signals] == [
+            ("bridge_strain", "1"),
+            ("bridge_temperature", "°C"),
+        ]
+        assert bridge.measure() == bridge.glance() == {"bridge_strain": 1.5, "bridge_temperature": 22.0}
+        assert bridge.describe()["bridge_temperature"]["units"] == "°C"
+        bridge.safe()
+
+    def test_a_set_point_is_checked_sent_and_remembered(self):
+        coil = self.coil()
+        assert math.isnan(coil.setpoint)
+        assert coil.setpoint_signal == Signal("coil_setpoint", "A", "current", 3)
+        assert coil.set(2.0).success
+        assert coil.setpoint == 2.0
+        assert coil.measure() == {"coil_current": 2.0}
+        with pytest.raises(LimitError, match=r"coil: set-point 4 A is outside of -3 to 3 A"):
+            coil.set(4.0)
+        assert coil.sent == (2.0,)
+
+    @pytest.mark.parametrize("fails", [False, True])
+    def test_safe_forgets_the_set_point_even_if_it_cannot_be_confirmed(self, fails):
+        coil = self.coil()
+        coil.set(2.0)
+        coil.fails = fails
+        with pytest.raises(DeviceError) if fails else nullcontext():
+            coil.safe()
+        assert coil.sent == (2.0, "off")
+        assert math.isnan(coil.setpoint)
 
 
 class TestBlueskyByStructure:

@@ -17,7 +17,8 @@ laboratory = "stranger:Nothing"
 MODULE = """
 import math
 
-from bench.devices import DriverSettings, Identity, Limits, Status, VoltageSupply
+from bench.devices import DriverSettings, Identity, Limits, Status
+from bench.roles import VoltageSupply
 from bench.rig_file import LaboratorySettings
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from bench.clock import VirtualClock
 from bench.contracts.roles import SwitchContract
-from bench.devices import Switch
 from bench.errors import DeviceError, LimitError
+from bench.roles import Switch
 from drivers.labjack_t7 import T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.t7_roles import EmulatedSwitch

@@ -10,8 +10,8 @@ from emulated_bench import Bench, OnABench, over_the_wire, serial_port
 from bench.clock import VirtualClock
 from bench.contracts.faults import SilentInstrumentContract, SpoiltAnswerContract
 from bench.contracts.roles import TECAmplifierContract
-from bench.devices import TECMode
 from bench.errors import DeviceError
+from bench.roles import TECMode
 from drivers.meerstetter import MeerstetterTEC
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.devices import TECMode
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.roles import TECMode
 from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
 from drivers.meerstetter import tec as driver
 from drivers.meerstetter.mecom import RefusedError, TECLine, decode, encode

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bench.clock import VirtualClock
-from bench.devices import TECMode
 from bench.errors import DeviceConnectionError, DeviceError
+from bench.roles import TECMode
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus, ServerError
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC

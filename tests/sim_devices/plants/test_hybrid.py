@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
 
 from bench.clock import VirtualClock
-from bench.devices import TECMode
+from bench.roles import TECMode
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants import _hybrid_kernels as kernels
 from sim_devices.plants.hybrid import HybridCantilever

@@ -1,0 +1,288 @@
+"""The bench for scripts and notebooks: the functions that `import bench` offers.
+
+>>> import bench
+>>> with bench.open_rig("vo2") as rig:  # on its virtual clock, as it is emulated
+...     status = rig.devices["tec"].set(40.0)
+...     status.wait()
+...     print(round(rig.measure()["tec_temperature"]))
+40
+
+Leaving the block brings every device into its safe state before its line is closed.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from bench.clock import make_clock
+from bench.errors import BenchError, DeviceError
+from bench.protocol import ProtocolDefinition, find_protocol
+from bench.results.model_file import ModelFile, load_model
+from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
+from bench.results.models import predict as predict_file
+from bench.results.report import report_run
+from bench.results.run_folder import RunFolder
+from bench.rig import Rig
+from bench.rig_file import load_rig
+from bench.runs import Run, carry_out
+from bench.safety import SAFE
+
+Model = IdentifiedFile | ModelFile | Path | str
+"""What a model may be given as: the result of `identify` or `load`, or a model file."""
+
+
+def open_rig(
+    rig: str | Path, *, seed: int = 0, clock: str | None = None, overrides: Mapping[str, str] | None = None
+) -> Rig:
+    """Connect a rig.
+
+    Parameters
+    ----------
+    rig : str or Path
+        Name of an installed rig, or path of a rig file.
+    seed : int
+        Seed of all that is random in an emulated laboratory.
+    clock : str, optional
+        `wall`, `virtual` or `xN`; `virtual` for an emulated rig if not given, else `wall`.
+    overrides : mapping of str to str, optional
+        Values of the rig file to replace, by dotted key.
+
+    Returns
+    -------
+    Rig
+        A context manager: leaving it makes every device safe, then closes its line.
+
+    Raises
+    ------
+    ConfigurationError
+        If the rig file is wrong.
+    DeviceError
+        If a device cannot be connected; nothing has moved.
+    """
+    file = load_rig(str(rig), overrides)
+    return Rig(file, make_clock(clock or ("virtual" if file.emulated else "wall")), seed)
+
+
+def run(
+    protocol: str | ProtocolDefinition,
+    rig: str | Path,
+    *,
+    out: str | Path = "recordings",
+    seed: int = 0,
+    clock: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    live: bool = False,
+    recording: bool = False,
+    progress: bool = False,
+    **parameters: Any,  # noqa: ANN401 - each protocol names and types its own
+) -> RunFolder:
+    """Carry out a protocol on a rig, record it, and leave every device in its safe state.
+
+    Parameters
+    ----------
+    protocol : str or ProtocolDefinition
+        Name, `path/to/file.py[:NAME]`, or the protocol itself.
+    rig : str or Path
+        Name of an installed rig, or path of a rig file.
+    out : str or Path
+        Where the folder of the run is made.
+    seed, clock, overrides
+        As for `open_rig`.
+    live : bool
+        Whether to serve the live view on the loopback interface.
+    recording : bool
+        Whether to write the recording for the viewer while the run goes on.
+    progress : bool
+        Whether to print the progress.
+    **parameters
+        Parameters of the protocol; the others have the rig's defaults or its own.
+
+    Returns
+    -------
+    RunFolder
+        What was recorded.
+
+    Raises
+    ------
+    BenchError
+        If anything is wrong before the start, the run does not complete, or the safe state is not confirmed; what
+        was recorded is kept, and the error names its folder.
+
+    Examples
+    --------
+    >>> found = run("creep", "vo2", out=tempfile.mkdtemp(), hot=70.0, cool=50.0, duration=8.0)
+    >>> found.status, len(found.readings)
+    ('completed', 35)
+    >>> round(float(found.readings["tec_temperature"].max()))
+    70
+    """
+    definition = find_protocol(protocol) if isinstance(protocol, str) else protocol
+    file = load_rig(str(rig), overrides)
+    result = carry_out(
+        Run(
+            protocol=definition,
+            settings=parameters,
+            rig=str(rig),
+            folder=Path(out),
+            overrides=overrides or {},
+            seed=seed,
+            clock=clock or ("virtual" if file.emulated else "wall"),
+            live=live,
+            recording=recording,
+        ),
+        Console(quiet=not progress),
+    )
+    outcome = result.outcome
+    unsafe = ", ".join(name for name, state in outcome.safe_state.items() if state != SAFE)
+    error = outcome.error or (DeviceError(unsafe, "NOT in its safe state") if unsafe else None)
+    if error is not None:
+        error.add_note(f"recorded in {result.folder}" + (f"; NOT in its safe state: {unsafe}" if unsafe else ""))
+        raise error
+    return RunFolder(result.folder)
+
+
+def identify(
+    source: RunFolder | str | Path,
+    model: str,
+    *,
+    input: str | None = None,  # noqa: A002 - the word of the command line
+    output: str | None = None,
+    **options: Any,  # noqa: ANN401 - each model names and types its own
+) -> IdentifiedFile:
+    """Identify a model from a run or a CSV file.
+
+    Parameters
+    ----------
+    source : RunFolder, str or Path
+        A run, or a CSV file with a header.
+    model : str
+        Name of a registered model.
+    input, output : str, optional
+        Columns; of a run, the reading of its slot `drive` and the signal of its slot `response` if not given.
+    **options
+        As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial` and the options
+        of the model.
+
+    Raises
+    ------
+    DataError
+        If the measurements cannot be used.
+    ConfigurationError
+        If there is no such model, or an option does not belong to it.
+
+    Examples
+    --------
+    >>> measured = run("damped-oscillation", "vo2", out=tempfile.mkdtemp(), increment=3.0, half_cycles=8)
+    >>> model = identify(measured, "preisach-nonmonotonic", levels=8, plane=(30.0, 70.0))
+    >>> model.identification.errors.rms_percent < 5.0
+    True
+    >>> curvature = predict(model, [21.0, 60.0, 66.0, 62.0])
+    >>> curvature.shape
+    (4,)
+    >>> invert(model, [500.0, 900.0]).flags
+    ('met', 'met')
+    """
+    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    if folder.is_dir():
+        recorded = RunFolder(folder)
+        input, output = input or recorded.signal_of("drive"), output or recorded.signal_of("response")  # noqa: A001
+    if input is None or output is None:
+        raise BenchError(f"{folder}: name the columns: input=..., output=...")
+    return identify_file(folder, input_column=input, output_column=output, model=model, **options)
+
+
+def predict(model: Model, inputs: npt.ArrayLike, *, continue_memory: bool = False) -> npt.NDArray[np.float64]:
+    """Return the outputs of a model for a sequence of inputs, shape (N,), in its units.
+
+    Parameters
+    ----------
+    model : IdentifiedFile, ModelFile, Path or str
+        The model.
+    inputs : array_like, shape (N,)
+        Inputs in the unit of the model.
+    continue_memory : bool
+        Whether to start from the memory at the end of the model's own data, not from its initial state.
+
+    Raises
+    ------
+    DataError
+        If a model file cannot be read.
+    """
+    return predict_file(_model(model), np.asarray(inputs, dtype=np.float64), continue_memory=continue_memory)
+
+
+def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = False) -> InvertedTargets:
+    """Return the set-points that bring a model's output to one target after another; see `InvertedTargets`.
+
+    Parameters
+    ----------
+    model : IdentifiedFile, ModelFile, Path or str
+        The model.
+    targets : array_like, shape (N,)
+        Targets in the unit of the model's output.
+    continue_memory : bool
+        Whether to start from the memory at the end of the model's own data, not from its initial state.
+
+    Raises
+    ------
+    DataError
+        If a model file cannot be read, or the model has several inputs.
+    """
+    return invert_targets(_model(model), np.asarray(targets, dtype=np.float64), continue_memory=continue_memory)
+
+
+@overload
+def load(path: Path) -> RunFolder | ModelFile: ...
+@overload
+def load(path: str) -> RunFolder | ModelFile: ...
+def load(path: str | Path) -> RunFolder | ModelFile:
+    """Return a run (a folder or its journal) or a model (a `.json` file).
+
+    Raises
+    ------
+    DataError
+        If it is neither, or cannot be read.
+    """
+    if Path(path).suffix == ".json":
+        return load_model(Path(path))
+    found = RunFolder(Path(path))
+    # Reads the journal, so that a wrong path is found here.
+    _ = found.status
+    return found
+
+
+def report(source: RunFolder | str | Path, models: tuple[Model, ...] = ()) -> dict[str, Any]:
+    """Print tables of a run and draw its figures; return the same for programs.
+
+    Parameters
+    ----------
+    source : RunFolder, str or Path
+        The run.
+    models : tuple of IdentifiedFile, ModelFile, Path or str
+        Models to try on it, beside those that were identified from it.
+
+    Raises
+    ------
+    DataError
+        If the run or a model cannot be read.
+    """
+    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    with tempfile.TemporaryDirectory() as scratch:
+        paths = []
+        for i, model in enumerate(models):
+            paths.append(Path(scratch) / f"{_model(model).name}-{i}.json")
+            _model(model).save(paths[-1])
+        return report_run(folder, paths, None, Console())
+
+
+def _model(model: Model) -> ModelFile:
+    if isinstance(model, IdentifiedFile):
+        return model.file
+    return model if isinstance(model, ModelFile) else load_model(Path(model))
