@@ -1,1 +1,34 @@
-"""A lab bench for smart-material actuators: instruments, protocols, identification and control."""
+"""A lab bench for smart-material actuators.
+
+What scripts and notebooks need::
+
+    import bench
+
+    run = bench.run("damped-oscillation", rig="my-rig.toml")
+    model = bench.identify(run, "preisach", levels=20)
+    setpoints = bench.invert(model, [500.0, 900.0]).setpoints
+
+`open_rig`, `run`, `identify`, `predict`, `invert`, `load` and `report` are documented in `bench.face`; each is
+imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bench.face import identify, invert, load, open_rig, predict, report, run
+
+__all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
+    if name not in __all__:
+        raise AttributeError(f"module 'bench' has no attribute {name!r}")
+    from bench import face
+
+    return getattr(face, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -12,10 +12,9 @@ Leaving the block brings every device into its safe state before its line is clo
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +33,7 @@ from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from bench.safety import SAFE
 
-Model = IdentifiedFile | ModelFile | Path | str
+Model: TypeAlias = IdentifiedFile | ModelFile | Path | str
 """What a model may be given as: the result of `identify` or `load`, or a model file."""
 
 
@@ -117,7 +116,8 @@ def run(
 
     Examples
     --------
-    >>> found = run("creep", "vo2", out=tempfile.mkdtemp(), hot=70.0, cool=50.0, duration=8.0)
+    >>> folder = getfixture("tmp_path")
+    >>> found = run("creep", "vo2", out=folder, hot=70.0, cool=50.0, duration=8.0)
     >>> found.status, len(found.readings)
     ('completed', 35)
     >>> round(float(found.readings["tec_temperature"].max()))
@@ -179,7 +179,8 @@ def identify(
 
     Examples
     --------
-    >>> measured = run("damped-oscillation", "vo2", out=tempfile.mkdtemp(), increment=3.0, half_cycles=8)
+    >>> folder = getfixture("tmp_path")
+    >>> measured = run("damped-oscillation", "vo2", out=folder, increment=3.0, half_cycles=8)
     >>> model = identify(measured, "preisach-nonmonotonic", levels=8, plane=(30.0, 70.0))
     >>> model.identification.errors.rms_percent < 5.0
     True
@@ -238,10 +239,6 @@ def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = Fals
     return invert_targets(_model(model), np.asarray(targets, dtype=np.float64), continue_memory=continue_memory)
 
 
-@overload
-def load(path: Path) -> RunFolder | ModelFile: ...
-@overload
-def load(path: str) -> RunFolder | ModelFile: ...
 def load(path: str | Path) -> RunFolder | ModelFile:
     """Return a run (a folder or its journal) or a model (a `.json` file).
 
@@ -258,14 +255,14 @@ def load(path: str | Path) -> RunFolder | ModelFile:
     return found
 
 
-def report(source: RunFolder | str | Path, models: tuple[Model, ...] = ()) -> dict[str, Any]:
+def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict[str, Any]:
     """Print tables of a run and draw its figures; return the same for programs.
 
     Parameters
     ----------
     source : RunFolder, str or Path
         The run.
-    models : tuple of IdentifiedFile, ModelFile, Path or str
+    models : sequence of IdentifiedFile, ModelFile, Path or str
         Models to try on it, beside those that were identified from it.
 
     Raises
@@ -274,12 +271,7 @@ def report(source: RunFolder | str | Path, models: tuple[Model, ...] = ()) -> di
         If the run or a model cannot be read.
     """
     folder = source.folder if isinstance(source, RunFolder) else Path(source)
-    with tempfile.TemporaryDirectory() as scratch:
-        paths = []
-        for i, model in enumerate(models):
-            paths.append(Path(scratch) / f"{_model(model).name}-{i}.json")
-            _model(model).save(paths[-1])
-        return report_run(folder, paths, None, Console())
+    return report_run(folder, [_model(model) for model in models], None, Console())
 
 
 def _model(model: Model) -> ModelFile:

@@ -47,7 +47,7 @@ SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of the roughness penalty that cross-validation tries."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class IdentifiedFile:
     """A model that was identified from a file of measurements.
 
@@ -74,6 +74,10 @@ class IdentifiedFile:
     outputs: Floats
     coverage: Coverage | None = None
     trials: CrossValidation | None = None
+
+    def __repr__(self) -> str:
+        """Return what a person should know of the fit."""
+        return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""

@@ -19,22 +19,22 @@ from bench.identification import measure_errors
 from bench.journal import Record, Table, run_card
 from bench.results.data import header_with_unit, write_csv
 from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
-from bench.results.model_file import ModelFile, load_model, parse_model
+from bench.results.model_file import ModelFile, parse_model
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
 from bench.units import format_numbers, with_unit
 
 
-def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console: Console) -> dict[str, Any]:
+def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console: Console) -> dict[str, Any]:
     """Print a run's tables, draw its figures, and compare models on it.
 
     Parameters
     ----------
     run : Path
         Folder or journal of the run.
-    model_paths : sequence of Path
-        Model files to compare, besides those that were identified from the run.
+    models : sequence of ModelFile
+        Models to compare, besides those that were identified from the run.
     out : Path or None
         Folder of the figures; `report` beside the journal if None.
     console : Console
@@ -59,7 +59,7 @@ def report_run(run: Path, model_paths: Sequence[Path], out: Path | None, console
         _print_extremes(record, extremes, console)
         _print_events(record, console)
         figures = _draw_run(record, steps, folder)
-        models = [*_models_of(record), *(load_model(path) for path in model_paths)]
+        models = [*_models_of(record), *models]
         comparison, more = _compare(record, steps, models, folder)
         controlled = str(record.meta.get("controls", ""))
         control = results_json(record, controlled) if controlled else {}

@@ -1,0 +1,120 @@
+"""What `import bench` offers: its examples, executed, and what it does when something goes wrong."""
+
+import doctest
+import re
+import subprocess
+import sys
+
+import pytest
+
+import bench
+import bench.face
+from bench.errors import BenchError, ConfigurationError, DataError, InterlockError
+from bench.results.model_file import ModelFile
+
+
+@pytest.mark.parametrize("name", ["", "run", "identify"])
+def test_examples(name, request, tmp_path):
+    tested = getattr(bench.face, name) if name else bench.face
+    names = {**vars(bench.face), "getfixture": request.getfixturevalue, "bench": bench}
+    finder = doctest.DocTestFinder(recurse=False)
+    examples = finder.find(tested, name or "bench.face", module=bench.face, globs=names)
+    results = [doctest.DocTestRunner().run(example) for example in examples]
+    assert sum(result.attempted for result in results) > 1
+    assert not sum(result.failed for result in results)
+
+
+def test_importing_it_imports_nothing_heavy():
+    code = "import sys, bench; dir(bench); print(sorted({'numpy', 'rerun', 'pydantic'} & set(sys.modules)))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"
+
+
+def test_what_it_does_not_offer():
+    with pytest.raises(AttributeError, match="module 'bench' has no attribute 'runn'"):
+        _ = bench.runn
+
+
+def test_leaving_a_rig_makes_its_devices_safe_also_by_an_error():
+    rig = bench.open_rig("vo2")
+    emulated = rig.laboratory.tec
+
+    def heat_and_fail():
+        with rig:
+            rig.devices["tec"].set(60.0)
+            rig.clock.sleep(2.0)
+            assert rig.devices["tec"].output_enabled
+            _ = 1 / 0
+
+    with pytest.raises(ZeroDivisionError):
+        heat_and_fail()
+    assert emulated.current == 0.0
+    assert not emulated.output_enabled
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return bench.run("creep", "vo2", out=tmp_path_factory.mktemp("runs"), hot=60.0, cool=40.0, duration=8.0)
+
+
+def test_a_run_is_tables_with_units(found):
+    readings = found.readings
+    assert readings.units["curvature"] == "1/m"
+    text = repr(readings)
+    assert "curvature [1/m]" in text
+    assert "35 rows" in text
+    assert "creep on vo2: completed, 35 readings" in repr(found)
+    assert len(found.notes) == 2
+    assert found.signal_of("response") == "curvature"
+    with pytest.raises(DataError, match=r"no slot 'load'.* drive, response"):
+        found.signal_of("load")
+    assert bench.load(str(found.folder)).status == "completed"
+
+
+def test_tables_become_pandas_frames_where_pandas_is_installed(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ConfigurationError, match="pandas is not installed"):
+        found.readings.to_pandas()
+    made = {}
+
+    class Frame:
+        def __init__(self, columns):
+            made.update(columns)
+            self.attrs = {}
+
+    monkeypatch.setitem(sys.modules, "pandas", type("pandas", (), {"DataFrame": Frame}))
+    frame = found.telemetry.to_pandas()
+    assert made["tec_temperature"].shape == made["t"].shape
+    assert frame.attrs["units"]["tec_temperature"] == "°C"
+
+
+def test_a_model_is_saved_loaded_and_reported(found, tmp_path, capsys):
+    model = bench.identify(found, "polynomial", degree=2)
+    assert re.search(r"polynomial\n +samples +35 ", repr(model))
+    model.file.save(tmp_path / "model.json")
+    loaded = bench.load(tmp_path / "model.json")
+    assert isinstance(loaded, ModelFile)
+    assert bench.predict(loaded, [40.0]) == bench.predict(tmp_path / "model.json", [40.0])
+    assert bench.report(found, [model])["status"] == "completed"
+    assert "polynomial" in capsys.readouterr().out
+
+
+def test_a_run_that_fails_raises_and_names_its_record(tmp_path):
+    with pytest.raises(InterlockError) as caught:
+        bench.run("creep", "vo2", out=tmp_path, overrides={"interlocks": '[{signal = "curvature", high = 1.0}]'})
+    folder = next(tmp_path.iterdir())
+    assert any(str(folder) in note for note in caught.value.__notes__)
+    assert bench.load(folder).status == "failed"
+
+
+def test_wrong_names_and_values(tmp_path, found):
+    with pytest.raises(ConfigurationError, match="there is no protocol 'crep'"):
+        bench.run("crep", "vo2", out=tmp_path)
+    with pytest.raises(ConfigurationError, match="there is no parameter 'warm'"):
+        bench.run("creep", "vo2", out=tmp_path, warm=3.0)
+    with pytest.raises(ConfigurationError, match="there is no model 'preisatch'"):
+        bench.identify(found, "preisatch")
+    with pytest.raises(BenchError, match=r"name the columns"):
+        bench.identify(tmp_path / "file.csv", "preisach")
+    with pytest.raises(DataError, match="is not a run"):
+        bench.load(tmp_path)
