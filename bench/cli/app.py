@@ -1,0 +1,59 @@
+"""The `bench` command: its groups put together, and how it ends.
+
+Every command prints for people, and with `--json FILE` writes the same result for programs. Heavy imports
+wait until a command needs them, so that `bench --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+import typer
+
+from bench import registry
+from bench.cli import models, records, runs
+from bench.cli.console import error_console, fail
+from bench.cli.registered import RegisteredCommands, Studies
+from bench.errors import BenchError
+
+_EPILOG = (
+    "Exit codes: 0 done; 1 failed; 2 wrong command, rig file or parameter (nothing has moved); 3 unusable data or "
+    "model file; 4 device fault; 5 interlock; 6 not steady in time; 7 safe state not confirmed; 130 ended by the "
+    "operator. Try: bench run damped-oscillation --rig vo2 --clock virtual"
+)
+
+app = typer.Typer(
+    name="bench",
+    cls=RegisteredCommands,
+    help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
+    "identify hysteresis models from what was measured, and apply them.",
+    epilog=_EPILOG,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+for group in (runs.app, models.app, records.app):
+    app.add_typer(group)
+reproduce_ = typer.Typer(
+    help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
+    no_args_is_help=True,
+    cls=Studies,
+)
+app.add_typer(reproduce_, name="reproduce")
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command; every error that the bench raises becomes one message and an exit code."""
+    try:
+        registry.check_own_packages()
+        app(args=None if arguments is None else list(arguments))
+    except BenchError as error:
+        fail(error)
+    except sqlite3.Error as error:
+        error_console.print(f"[bold red]error:[/] the journal cannot be written: {error}", highlight=False)
+        sys.exit(1)
+    sys.exit(0)

@@ -1,0 +1,105 @@
+"""What the commands share: the console, options, and how results and errors are printed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bench.errors import BenchError, ConfigurationError
+
+console = Console()
+error_console = Console(stderr=True)
+
+JsonOption = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
+]
+
+
+def fail(error: BenchError) -> NoReturn:
+    """Print an error of the bench and exit with its code."""
+    print_error(error)
+    sys.exit(error.exit_code)
+
+
+def print_error(error: BenchError) -> None:
+    """Print an error of the bench, a line each of its lines."""
+    for line in str(error).splitlines():
+        error_console.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning."""
+    error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
+
+
+def print_table(title: str, rows: dict[str, str]) -> None:
+    """Print names and what they stand for under a title."""
+    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for name, text in rows.items():
+        table.add_row(name, text)
+    console.print(table)
+    console.print()
+
+
+def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print (name, text) pairs under a title."""
+    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+    for name, text in rows:
+        table.add_row(name, text)
+    console.print(table)
+
+
+def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
+    """Split texts of the form `key=value`.
+
+    Raises
+    ------
+    ConfigurationError
+        If one is not of this form, or a key comes twice.
+    """
+    pairs: dict[str, str] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise ConfigurationError(f"{option} {text!r}: expected KEY=VALUE")
+        if key in pairs:
+            raise ConfigurationError(f"{option}: {key} is given twice")
+        pairs[key] = value
+    return pairs
+
+
+def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
+    """Split texts of the form `key=number`; errors as `parse_assignments`, or if a value is not a number."""
+    numbers: dict[str, int | float] = {}
+    for key, text in parse_assignments(option, texts).items():
+        try:
+            numbers[key] = int(text) if text.lstrip("-").isdigit() else float(text)
+        except ValueError:
+            raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
+    return numbers
+
+
+def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+    """Write a result for programs, if a file was asked for.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"--json {path} cannot be written: {error.strerror}") from None

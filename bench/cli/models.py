@@ -1,0 +1,326 @@
+"""The commands that identify, compare and apply models."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.table import Table
+
+from bench.cli.console import JsonOption, console, parse_numbers, print_rows, warn, write_json
+from bench.errors import ConfigurationError
+
+app = typer.Typer()
+
+
+@app.command("identify")
+def identify_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="What answers.")],
+    model: Annotated[str, typer.Option(metavar="NAME", help="Which model; `bench list` shows them.")],
+    levels: Annotated[
+        int | None,
+        typer.Option(min=2, max=1000, help="Discretization levels of the Preisach plane; 20 if not given."),
+    ] = None,
+    degree: Annotated[
+        int | None,
+        typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
+    ] = None,
+    plane: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH", help="Ends of the Preisach plane, in input units; the model's own if not given."
+        ),
+    ] = None,
+    reversible: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
+    ] = None,
+    smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
+    skip: Annotated[
+        int, typer.Option(metavar="ROWS", help="First rows that drive the memory but do not count in the fit.")
+    ] = 0,
+    initial: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
+            "reach, or estimate it.",
+        ),
+    ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="KEY=VALUE", help="Another option of the model, a number; may come several times."
+        ),
+    ] = None,
+    cross_validate: Annotated[
+        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw loops, errors and density there.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Identify a hysteresis model from measurements, and say how good it is.
+
+    Columns are named as in the header; a unit in brackets at the end, as in `force [N]`, may be left out and
+    goes into the model. Of a run, the readings are taken: `bench identify RUN --input voltage
+    --output displacement --model preisach --out model.json`.
+    """
+    from bench.results.models import certificate_lines, identify_file
+
+    found = identify_file(
+        file,
+        input_column=input_column,
+        output_column=output_column,
+        model=model,
+        levels=levels,
+        degree=degree,
+        plane=plane,
+        reversible=reversible,
+        smoothing=smoothing,
+        skip=skip,
+        initial=initial,
+        **parse_numbers("--option", options or ()),
+        cross_validated=cross_validate,
+    )
+    if found.trials is not None:
+        console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
+        console.print(found.trials.table(), highlight=False, markup=False)
+    for warning in found.warnings:
+        warn(warning)
+    print_rows(f"{model} from {file.name}", certificate_lines(found))
+    if out is not None:
+        found.file.save(out)
+        console.print(f"model: {out}", highlight=False, soft_wrap=True)
+    if figures is not None:
+        from bench.results.report import draw_identification
+
+        for path in draw_identification(found, figures):
+            console.print(f"figure: {path}", highlight=False, soft_wrap=True)
+    write_json(json_file, found.summary())
+
+
+@app.command("predict")
+def predict_(
+    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the input and the prediction go.")],
+    output_column: Annotated[
+        str | None, typer.Option("--output", metavar="COLUMN", help="What was measured, to compare with.")
+    ] = None,
+    continue_memory: Annotated[
+        bool,
+        typer.Option(
+            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        ),
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Apply a model to a column of inputs, row by row.
+
+    Writes a CSV file with the input column and `predicted`.
+    """
+    from bench.identification import measure_errors
+    from bench.results.data import read_columns, write_csv
+    from bench.results.model_file import load_model
+    from bench.results.models import check_unit, errors_json, outside_of_range, predict
+
+    model = load_model(model_path)
+    columns = read_columns(file, [input_column] + ([output_column] if output_column else []))
+    inputs = columns.values[input_column]
+    check_unit(model.operator.input_unit, columns.units[input_column], input_column)
+    if warning := outside_of_range(model, inputs):
+        warn(warning)
+    predicted = predict(model, inputs, continue_memory=continue_memory)
+    write_csv(out, [input_column, "predicted"], [inputs, predicted])
+    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
+    if output_column:
+        errors = measure_errors(columns.values[output_column], predicted)
+        result |= errors_json(errors)
+        unit = model.operator.output_unit
+        print_rows(
+            f"{model.name} on {file.name}",
+            (
+                ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
+                ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
+            ),
+        )
+    console.print(f"{inputs.size} rows: {out}", highlight=False, soft_wrap=True)
+    write_json(json_file, result)
+
+
+@app.command("compare")
+def compare_(
+    models: Annotated[list[Path], typer.Argument(metavar="A.json B.json", help="Model files.")],
+    data: Annotated[
+        Path, typer.Option("--data", metavar="FILE", help="CSV file with a header, or the folder of a run.")
+    ],
+    input_column: Annotated[
+        str | None, typer.Option("--input", metavar="COLUMN", help="What drives; the first model's if not given.")
+    ] = None,
+    output_column: Annotated[
+        str | None, typer.Option("--output", metavar="COLUMN", help="What answers; the first model's if not given.")
+    ] = None,
+    skip: Annotated[
+        int, typer.Option(min=0, metavar="ROWS", help="First rows that drive the memory but do not count.")
+    ] = 0,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the residuals there.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare models on measurements that they may not have seen.
+
+    Shows each model's errors raw, and after re-zeroing the sensor: between sessions a sensor's offset moves, and
+    what a model is worth then is another number.
+    """
+    from bench.results.models import compare_models
+
+    result = compare_models(models, data, input_column, output_column, skip=skip)
+    table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
+    table.add_column("model")
+    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
+        table.add_column(column, justify="right")
+    for name, entry in result.comparisons.items():
+        raw, mended = entry.raw, entry.rezeroed
+        table.add_row(
+            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
+            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+        )  # fmt: skip
+    console.print(table)
+    if figures is not None:
+        from bench.results.report import draw_comparison
+
+        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, soft_wrap=True)
+    write_json(json_file, result.to_json())
+
+
+@app.command()
+def design(
+    rig: Annotated[
+        str | None, typer.Option("--rig", metavar="RIG", help="Rig whose range, plane and dwell are taken.")
+    ] = None,
+    plane: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Ends of the Preisach plane; the rig's if not given."),
+    ] = None,
+    operating: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--range", metavar="LOW HIGH", help="Operating range, which contains the plane; the rig's if not given."
+        ),
+    ] = None,
+    levels: Annotated[int, typer.Option(min=2, max=60, help="Discretization levels of the plane.")] = 20,
+    dwell: Annotated[
+        float | None, typer.Option(min=0.0, help="Settling time at each set-point, s; the rig's if not given.")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
+
+    The damped oscillation of the papers, first-order reversal curves, the shortest sequence that covers every cell,
+    and the same twice as fine with two set-points a level, which averages noise. Each is a protocol:
+    damped-oscillation, first-order-reversals, covering.
+    """
+    from bench.results.models import assess_designs
+
+    if rig is not None:
+        from bench.rig_file import load_rig
+
+        file = load_rig(rig)
+        drive = file.roles.get("drive")
+        operating = operating or (drive.range if drive else None)
+        dwell = dwell if dwell is not None else (drive.dwell if drive else None)
+        plane = plane or (file.dashboard.plane if file.dashboard else None)
+    if plane is None or operating is None or dwell is None:
+        raise ConfigurationError("give --rig RIG, whose file says them, or --plane, --range and --dwell")
+    result = assess_designs(plane, operating, levels, dwell)
+    table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
+    for column in ("set-points", "cells covered", "rank / coefficients", "condition", "laboratory time"):
+        table.add_column(column, justify="right")
+    for name, entry in result.items():
+        table.add_row(
+            name,
+            str(entry.setpoints),
+            f"{entry.covered} of {entry.cells}",
+            f"{entry.rank} of {entry.coefficients}",
+            f"{entry.condition:.2g}",
+            f"{entry.time / 3600:.2f} h",
+        )
+    console.print(table)
+    write_json(json_file, {name: vars(entry) for name, entry in result.items()})
+
+
+class PolicyOption(Enum):
+    """Which answer of an inverse is taken."""
+
+    NEAREST: Literal["nearest"] = "nearest"  # type: ignore[misc]  # so that its value is of a literal type
+    PAPER: Literal["paper"] = "paper"  # type: ignore[misc]
+
+
+@app.command()
+def invert(
+    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
+    column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the set-points go.")] = Path("setpoints.csv"),
+    policy: Annotated[
+        PolicyOption,
+        typer.Option(help="Which answer, where there are several: nearest, or the paper's direction rule."),
+    ] = PolicyOption.NEAREST,
+    continue_memory: Annotated[
+        bool,
+        typer.Option(
+            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        ),
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Compute the set-points that bring a model's output to one target after another.
+
+    Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
+    only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
+    `too low`; what cannot be met is clamped to the nearest reachable value).
+    """
+    from bench.results.data import header_with_unit, read_columns, write_csv
+    from bench.results.model_file import load_model
+    from bench.results.models import check_unit, invert_targets
+
+    model = load_model(model_path)
+    columns = read_columns(file, [column])
+    units = (model.operator.input_unit, model.operator.output_unit)
+    check_unit(units[1], columns.units[column], column)
+    found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
+    header = [
+        header_with_unit(name, unit)
+        for name, unit in (
+            ("target", units[1]), ("passing", units[0]), ("setpoint", units[0]), ("predicted", units[1]), ("flag", "")
+        )
+    ]  # fmt: skip
+    passing = ["" if value != value else value for value in found.passing.tolist()]
+    write_csv(out, header, [found.targets, passing, found.setpoints, found.predicted, list(found.flags)])
+    counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
+    two = sum(value != "" for value in passing)
+    console.print(
+        f"{len(found.flags)} targets: {counts['met']} met, {counts['too high']} too high, "
+        f"{counts['too low']} too low; {two} by way of saturation: {out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    met = [abs(p - t) for p, t, f in zip(found.predicted, found.targets, found.flags, strict=True) if f == "met"]
+    write_json(
+        json_file,
+        {
+            "model": model.name,
+            "targets": len(found.flags),
+            "met": counts["met"],
+            "too_high": counts["too high"],
+            "too_low": counts["too low"],
+            "through_saturation": two,
+            "largest_residual": float(max(met)) if met else None,
+            "out": str(out),
+        },
+    )

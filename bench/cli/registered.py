@@ -1,0 +1,81 @@
+"""Commands that packages register: those of rigs, and the studies of `bench reproduce`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import typer
+from typer.core import TyperGroup
+
+from bench import registry
+from bench.cli.console import JsonOption, console, write_json
+from bench.errors import ConfigurationError
+
+
+class RegisteredCommands(TyperGroup):
+    """A group of commands with those that packages register in `group`, each loaded when it is asked for."""
+
+    group: ClassVar[registry.Group] = "commands"
+
+    # The types of click are a private part of typer.
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
+        """Return the names of all commands, the registered ones last."""
+        own = super().list_commands(ctx)
+        return [*own, *(name for name in registry.entries(self.group) if name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
+        """Return a command; one that cannot be loaded says so when it is called."""
+        entry = registry.entries(self.group).get(cmd_name)
+        if cmd_name in self.commands or entry is None:
+            return super().get_command(ctx, cmd_name)
+        one = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+        try:
+            callback = self.make_callback(cmd_name, entry.load())
+        except ConfigurationError as error:
+            failure = error
+
+            def callback() -> None:
+                raise failure
+
+            callback.__doc__ = f"Cannot be loaded: {error}"
+        one.command(cmd_name)(callback)
+        return typer.main.get_command(one)
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401
+        """Return the function of a command whose entry point is `part`: that itself."""
+        callback: Callable[..., None] = part
+        return callback
+
+
+class Studies(RegisteredCommands):
+    """The commands of `bench reproduce`, one for each registered study."""
+
+    group = "studies"
+
+    def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ANN401
+        """Return a function that carries a study out."""
+
+        def carry_out_study(
+            rig: Annotated[
+                str | None,
+                typer.Option("--rig", metavar="RIG", help="Another rig with the same signals."),
+            ] = None,
+            seed: Annotated[
+                int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
+            ] = 0,
+            out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path(
+                "recordings"
+            ),
+            live: Annotated[
+                bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+            ] = False,
+            json_file: JsonOption = None,
+        ) -> None:
+            from bench.campaign import reproduce
+
+            write_json(json_file, reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console))
+
+        carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"
+        return carry_out_study

@@ -1,0 +1,212 @@
+"""The commands that list what there is and carry protocols out."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markdown import Markdown
+from rich.table import Table
+
+from bench.cli.console import (
+    JsonOption,
+    console,
+    error_console,
+    parse_assignments,
+    print_error,
+    print_table,
+    warn,
+    write_json,
+)
+from bench.errors import BenchError, ConfigurationError
+
+app = typer.Typer()
+
+UNSAFE_EXIT_CODE = 7
+
+
+@app.command("list")
+def list_(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="A rig, a protocol or a model, to see all of it; nothing, to see what there is."),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Show what there is: rigs with the protocols that fit them, models, controllers, studies; or one of these.
+
+    A protocol is shown with its parameters, a rig with its file: `bench list RIG > desk.toml` gives you a copy to
+    fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
+    """
+    from bench.catalogue import Catalogue
+
+    catalogue = Catalogue.of_installed()
+    if name is None:
+        _print_catalogue(catalogue)
+        write_json(json_file, catalogue.to_json())
+    elif name in catalogue.rigs:
+        # Plain, so that it can be redirected into a file.
+        typer.echo(catalogue.rigs[name].text, nl=False)
+        write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
+    elif name in catalogue.protocols:
+        definition = catalogue.protocols[name]
+        print_protocol(definition)
+        write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
+    elif name in (others := {**catalogue.models, **catalogue.studies, **catalogue.controllers}):
+        console.print(others[name], highlight=False)
+        write_json(json_file, {"name": name, "summary": others[name]})
+    else:
+        known = ", ".join([*catalogue.rigs, *catalogue.protocols, *others])
+        raise ConfigurationError(
+            f"there is no rig, protocol, model, controller or study {name!r}; there are: {known}"
+        )
+
+
+def _print_catalogue(catalogue: Any) -> None:  # noqa: ANN401 - a Catalogue, not imported at start
+    def foreign(name: str) -> str:
+        package = catalogue.packages.get(name)
+        return f" \\[{package}]" if package else ""
+
+    for rigs, protocols in catalogue.by_protocols():
+        print_table("rigs", {name: catalogue.rigs[name].rig.title + foreign(name) for name in rigs})
+        listed = ", ".join(name + "*" * catalogue.protocols[name].needs_model for name in protocols) or "none"
+        console.print(f"    [dim]protocols (*: takes a model file):[/] {listed}\n", highlight=False)
+    titles = {name: each.summary + foreign(name) for name, each in catalogue.protocols.items()}
+    print_table("protocols", titles)
+    print_table("models", {name: text + foreign(name) for name, text in catalogue.models.items()})
+    print_table("controllers", {name: text + foreign(name) for name, text in catalogue.controllers.items()})
+    print_table(
+        "studies, for `bench reproduce`", {name: text + foreign(name) for name, text in catalogue.studies.items()}
+    )
+    for problem in catalogue.problems:
+        warn(f"left out: {problem}")
+
+
+@app.command(add_help_option=False)
+def run(
+    context: typer.Context,
+    protocol: Annotated[
+        str | None, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")
+    ] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; may come several times."),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--override",
+            metavar="KEY=VALUE",
+            help="Replace a value of the rig file, such as devices.tec.port=/dev/ttyUSB1; may come several times.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in an emulated laboratory.")] = 0,
+    clock: Annotated[
+        str,
+        typer.Option(
+            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast, up to about 100)."
+        ),
+    ] = "wall",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the folder of the run is made.")] = Path(
+        "recordings"
+    ),
+    live: Annotated[
+        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
+    ] = False,
+    json_file: JsonOption = None,
+    help_: Annotated[
+        bool,
+        typer.Option(
+            "--help",
+            help="Show this message; after PROTOCOL also its parameters, and with --rig their defaults there.",
+        ),
+    ] = False,
+) -> None:
+    """Carry a protocol out on a rig, record it, and leave every device in its safe state.
+
+    The set-points are checked against the rig's limits before anything moves. Ctrl-C pauses at the next
+    step and asks; Ctrl-C again ends at once; so do SIGTERM and SIGHUP. Whatever ends the run, every
+    device is brought into its safe state, and what was recorded so far is kept.
+    """
+    from bench.protocol import find_protocol
+
+    if help_ or protocol is None:
+        console.print(context.get_help(), highlight=False)
+        if protocol is not None:
+            print_protocol(find_protocol(protocol), rig)
+        return
+    if rig is None:
+        raise ConfigurationError("--rig is missing: `bench list` shows the packaged rigs")
+    definition = find_protocol(protocol)
+    given = parse_assignments("--set", settings or [])
+
+    from bench.runs import Run, carry_out
+    from bench.safety import SAFE
+
+    result = carry_out(
+        Run(
+            protocol=definition,
+            settings=given,
+            rig=rig,
+            overrides=parse_assignments("--override", overrides or []),
+            seed=seed,
+            clock=clock,
+            folder=out,
+            live=live,
+        ),
+        console,
+    )
+    outcome, ratio = result.outcome, result.time_ratio
+    console.print(
+        f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time in "
+        f"{result.wall_seconds:.1f} s"
+        + (f" ({ratio:.0f} times as fast)" if (ratio := result.time_ratio) >= 2 else ""),
+        highlight=False,
+    )
+    console.print(f"record: {result.folder}", highlight=False, soft_wrap=True)
+    write_json(
+        json_file,
+        {
+            "folder": str(result.folder),
+            "status": outcome.status,
+            "reason": outcome.reason,
+            "steps": outcome.steps,
+            "laboratory_seconds": outcome.laboratory_seconds,
+            "wall_seconds": result.wall_seconds,
+            "safe_state": dict(outcome.safe_state),
+            "is_safe": outcome.is_safe,
+        },
+    )
+    for name, state in outcome.safe_state.items():
+        if state != SAFE:
+            error_console.print(
+                f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False, soft_wrap=True
+            )
+    if outcome.error is not None:
+        if not isinstance(outcome.error, BenchError):
+            raise outcome.error
+        print_error(outcome.error)
+    # What is not safe matters more than what ended the run.
+    if not outcome.is_safe:
+        sys.exit(UNSAFE_EXIT_CODE)
+    if isinstance(outcome.error, BenchError):
+        sys.exit(outcome.error.exit_code)
+
+
+def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: ANN401 - a ProtocolDefinition
+    """Print a protocol's help: what it does and what can be set; with a rig, its defaults and units."""
+    from bench.rig_file import load_rig
+
+    file = load_rig(rig) if rig is not None else None
+    console.print(Markdown(f"**{definition.name}**: {definition.description}"))
+    console.print()
+    table = Table("--set", "default", "unit", "allowed", "what it does", title="parameters", title_justify="left")
+    for entry in definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help():
+        table.add_row(entry.name, entry.default, entry.unit, entry.allowed, entry.text)
+    console.print(table)
