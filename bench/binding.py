@@ -33,6 +33,7 @@ from bench.devices import Actuator, Device, Signal
 from bench.errors import ConfigurationError
 from bench.layout import Range
 from bench.settling import Dwell, Settle, UntilSteady
+from bench.units import format_numbers
 
 
 class _Table(BaseModel):
@@ -161,7 +162,8 @@ class Slot:
 
     def show(self, value: float) -> str:
         """Return a value of the signal with its unit, for notes."""
-        return f"{value:.{self.precision}f}{'' if self.unit == '1' else ' ' + self.unit}"
+        number, unit = format_numbers([value], self.unit, self.precision)
+        return f"{number} {unit}".rstrip()
 
     def settle(self, minimum: float) -> Settle:
         """Return how a reset settles: by the rule of the rig file, but at least `minimum` s."""

@@ -35,7 +35,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,10 +46,13 @@ from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.settling import Settled
+from bench.units import header_with_unit
 
 SCHEMA = 2
 _READABLE = (1, SCHEMA)
 FILE_NAME = "journal.sqlite"
+_ROWS_SHOWN = 5
+"""Rows of a table at either end that its text shows."""
 
 _SETTLED = "settled NOT IN ({})".format(", ".join(f"'{each}'" for each in Settled if each.failed))
 """Whether the settling rule was met, for SQL."""
@@ -263,7 +266,7 @@ class _Transaction:
         self._db.execute("COMMIT" if kind is None else "ROLLBACK")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Table:
     """Columns of equal length.
 
@@ -271,15 +274,48 @@ class Table:
     ----------
     columns : mapping of str to ndarray
         Float columns by signal or column name, shape (rows,).
+    units : mapping of str to str
+        Unit by the same names.
     """
 
     columns: Mapping[str, npt.NDArray[np.float64]]
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
         return self.columns[name]
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
+
+    def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is optional
+        """Return a pandas `DataFrame`, with the units in its `attrs`.
+
+        Raises
+        ------
+        ConfigurationError
+            If pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise ConfigurationError("pandas is not installed; `pip install pandas`") from None
+        frame = pd.DataFrame(dict(self.columns))
+        frame.attrs["units"] = dict(self.units)
+        return frame
+
+    def __repr__(self) -> str:
+        """Return size, column heads with units, and the first and last rows."""
+        count = len(self)
+        heads = [header_with_unit(name, self.units.get(name, "")) for name in self.columns]
+        shown = list(range(count)) if count <= 2 * _ROWS_SHOWN else [*range(_ROWS_SHOWN), *range(-_ROWS_SHOWN, 0)]
+        rows = [[f"{column[i]:.6g}" for column in self.columns.values()] for i in shown]
+        if len(shown) < count:
+            rows.insert(_ROWS_SHOWN, ["…"] * len(heads))
+        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+        lines = [
+            "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [heads, *rows]
+        ]
+        return "\n".join([*lines, f"{count} rows"])
 
 
 class Record:
@@ -387,7 +423,8 @@ class Record:
             data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
         except (ValueError, TypeError) as error:
             raise DataError(f"{self.path} is damaged: table {table}: {error}") from error
-        return Table({name: data[:, i].copy() for i, name in enumerate(names)})
+        values = {name: data[:, i].copy() for i, name in enumerate(names)}
+        return Table(values, {name: self.unit(name) for name in names})
 
     def _query(self, statement: str) -> list[tuple[Any, ...]]:
         # All at once: damage may show at any row.

@@ -48,3 +48,8 @@ def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -
 def with_unit(name: str, unit: str) -> str:
     """Return the label of an axis: the name and, unless it is a plain number, the unit."""
     return f"{name} / {unit}" if unit not in ("", "1") else name
+
+
+def header_with_unit(name: str, unit: str) -> str:
+    """Return a column header such as `force [N]`; the name alone where there is no unit."""
+    return f"{name} [{unit}]" if unit else name
