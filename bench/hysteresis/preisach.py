@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -52,6 +53,16 @@ class Lattice:
     offset: float
     breaks: Floats
     quadratics: Floats
+
+    @property
+    def plane(self) -> tuple[Floats, float, Floats]:
+        """Levels, inverse step and table."""
+        return self.levels, self.inverse_step, self.table
+
+    @property
+    def terms(self) -> tuple[Floats, Floats]:
+        """Breaks and quadratics of the reversible part."""
+        return self.breaks, self.quadratics
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +261,7 @@ class Preisach(Operator[MemoryCurve]):
         from bench.hysteresis import _kernels
 
         t = self.lattice
-        tables = t.levels, t.inverse_step, t.table, t.below, t.offset, t.breaks, t.quadratics
-        return np.asarray(_kernels.evaluate(inputs, *tables, *self._pieces(state)))
+        return np.asarray(_kernels.evaluate(inputs, t.plane, t.below, t.offset, t.terms, self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
         """Return memory and output after the input moved monotonically to `value`.
@@ -280,20 +290,8 @@ class Preisach(Operator[MemoryCurve]):
             raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
         t = self.lattice
         left, height, _ = self._pieces(state)
-        found = Segment(
-            *_kernels.segment(
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.breaks,
-                t.quadratics,
-                *self.input_range,
-                left,
-                height,
-                state.input,
-                direction,
-            )
-        )
+        ends = self.input_range
+        found = Segment(*_kernels.segment(t.plane, t.terms, *ends, left, height, state.input, direction))
         return found if found.length > 0.0 else None
 
     def regressor(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Regressor:
@@ -317,24 +315,22 @@ class Preisach(Operator[MemoryCurve]):
 
         sequence = _checks.samples("inputs", inputs)
         t = self.lattice
-        left, height, present = self._pieces(state)
-        no_cells, no_changes = np.empty(0, dtype=np.int32), np.empty(0)
+        axis, start = (t.levels, t.inverse_step), self._pieces(state)
 
-        count = _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, no_cells, no_changes, False)
-        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
-        _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, cells, changes, True)
-        base = np.bincount(cells, changes, minlength=self.density.size) - self.cell_areas()
+        def listed(sweep: Callable[..., int], *arguments: object) -> tuple[NDArray[np.int32], Floats]:
+            count = sweep(*arguments, (np.empty(0, dtype=np.int32), np.empty(0)), False)
+            entries = np.empty(count, dtype=np.int32), np.empty(count)
+            sweep(*arguments, entries, True)
+            return entries
 
+        base = np.bincount(*listed(_kernels.swept_areas, axis, start), minlength=self.density.size)
         starts = np.empty(sequence.size + 1, dtype=np.int64)
-        arguments = (sequence, t.levels, t.inverse_step, left, height, present, starts)
-        count = _kernels.swept_differences(*arguments, no_cells, no_changes, False)
-        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
-        _kernels.swept_differences(*arguments, cells, changes, True)
+        cells, changes = listed(_kernels.swept_differences, sequence, axis, start, starts)
         if self.reversible is None:
             extra = np.empty((sequence.size, 0))
         else:
             extra = np.ascontiguousarray(self.reversible.columns(sequence))
-        return Regressor(base=base, starts=starts, cells=cells, changes=changes, extra=extra)
+        return Regressor(base=base - self.cell_areas(), starts=starts, cells=cells, changes=changes, extra=extra)
 
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest output over every memory the operating range can produce.
