@@ -15,9 +15,19 @@ from bench.errors import ConfigurationError
 app = typer.Typer()
 
 
+DataArgument = Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
+ContinueMemory = Annotated[
+    bool,
+    typer.Option(
+        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+    ),
+]
+
+
 @app.command("identify")
 def identify_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="What answers.")],
     model: Annotated[str, typer.Option(metavar="NAME", help="Which model; `bench list` shows them.")],
@@ -106,19 +116,14 @@ def identify_(
 
 @app.command("predict")
 def predict_(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    model_path: ModelArgument,
+    file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the input and the prediction go.")],
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="What was measured, to compare with.")
     ] = None,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
@@ -263,7 +268,7 @@ class PolicyOption(Enum):
 
 @app.command()
 def invert(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    model_path: ModelArgument,
     file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the set-points go.")] = Path("setpoints.csv"),
@@ -271,12 +276,7 @@ def invert(
         PolicyOption,
         typer.Option(help="Which answer, where there are several: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Compute the set-points that bring a model's output to one target after another.

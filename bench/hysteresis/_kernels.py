@@ -460,19 +460,6 @@ def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floa
 
 
 @njit(cache=True)
-def difference_transpose_product(
-    starts: Integers, cells: NDArray[np.int32], changes: Floats, residuals: Floats, result: Floats
-) -> None:
-    """Add (row differences).T @ (reverse running sum of residuals) to result."""
-    total = 0.0
-    for t in range(residuals.size - 1, -1, -1):
-        total += residuals[t]
-        if total != 0.0:
-            for e in range(starts[t], starts[t + 1]):
-                result[cells[e]] += changes[e] * total
-
-
-@njit(cache=True)
 def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base: Floats, result: Floats) -> None:
     """Fill result[:, : base.size] with the rows themselves."""
     row = base.copy()

@@ -134,10 +134,7 @@ class Inverse(ABC, Generic[S]):
     def invert(self, state: S, target: float) -> Inversion[S]:
         """Return the set-points that bring the output from `state` to `target`, output units.
 
-        Raises
-        ------
-        ValueError
-            If the target is not finite.
+        Raises ValueError if the target is not finite.
         """
 
     @abstractmethod

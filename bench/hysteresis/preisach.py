@@ -72,8 +72,8 @@ class Preisach(Operator[MemoryCurve]):
     output = bias + sum over cells of density * (2 on-area - area) + reversible(input): Zhang et al. 2013,
     eqs. 2, 10 and 12. The levels l_0 < ... < l_M divide the plane {l_0 <= β <= α <= l_M} into K = M(M+1)/2
     cells of constant density; diagonal cells are triangles. Beyond the plane every hysteron is saturated and
-    the reversible part goes on. The non-monotonic model of VO2 films is the case
-    `reversible=ThermalExpansion(...)`.
+    the reversible part goes on. The non-monotonic model of Zhang et al. 2013 is the
+    case `reversible=ThermalExpansion(...)`.
 
     Parameters
     ----------
@@ -142,10 +142,7 @@ class Preisach(Operator[MemoryCurve]):
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Preisach:
         """Return the same operator with other coefficients, shape (K + q,), and bias.
 
-        Raises
-        ------
-        ValueError
-            If there are not K + q coefficients or one is not finite.
+        Raises ValueError if there are not K + q coefficients or one is not finite.
         """
         values = _checks.samples("coefficients", coefficients)
         cells = self.density.size
@@ -231,7 +228,7 @@ class Preisach(Operator[MemoryCurve]):
         return np.array(left, dtype=np.float64), np.array(height, dtype=np.float64), present
 
     def evaluate(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Floats:
-        """Return the outputs of a sequence of inputs.
+        """Return the outputs of a sequence of inputs, shape (N,), output units.
 
         Parameters
         ----------
@@ -240,11 +237,6 @@ class Preisach(Operator[MemoryCurve]):
         state : MemoryCurve or None
             Memory before the first sample; default negative saturation. `state.advance(inputs)` is the
             memory after the last.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Outputs, output units.
 
         Raises
         ------
@@ -266,10 +258,7 @@ class Preisach(Operator[MemoryCurve]):
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
         """Return memory and output after the input moved monotonically to `value`.
 
-        Raises
-        ------
-        ValueError
-            If `value` is not finite.
+        Raises ValueError if `value` is not finite.
         """
         after = state.step(value)
         return after, self.value(after)
@@ -277,12 +266,8 @@ class Preisach(Operator[MemoryCurve]):
     def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
         """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).
 
-        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17.
-
-        Raises
-        ------
-        ValueError
-            If `direction` is neither -1 nor 1.
+        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17. Raises ValueError if
+        `direction` is neither -1 nor 1.
         """
         from bench.hysteresis import _kernels
 
@@ -455,10 +440,7 @@ class Preisach(Operator[MemoryCurve]):
 def uniform_levels(low: float, high: float, intervals: int) -> Floats:
     """Return `intervals` + 1 equally spaced discretization levels from low to high.
 
-    Raises
-    ------
-    ValueError
-        If low >= high or there is no interval.
+    Raises ValueError if low >= high or there is no interval.
     """
     first, last = _checks.increasing("low, high", [low, high]).tolist()
     if intervals < 1:
