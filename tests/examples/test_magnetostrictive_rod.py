@@ -22,7 +22,7 @@ def python(tmp_path_factory):
     source = shutil.copytree(EXAMPLE, home / "source", ignore=shutil.ignore_patterns("build", "*.egg-info", "__pyc*"))
     environment = {**os.environ, "PYTHONPATH": str(home / "site"), "COLUMNS": "120"}
 
-    def run(*arguments, cwd=home, code=0):
+    def run(*arguments, cwd=home, both=False):
         done = subprocess.run(
             [sys.executable, *map(str, arguments)],
             cwd=cwd,
@@ -32,8 +32,8 @@ def python(tmp_path_factory):
             timeout=240,
             check=False,
         )
-        assert done.returncode == code, done.stdout + done.stderr
-        return done.stdout if code == 0 else done.stderr
+        assert done.returncode == 0, done.stdout + done.stderr
+        return (done.stdout, done.stderr) if both else done.stdout
 
     options = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
     run("-m", "pip", "install", *options, "--target", home / "site", source)
@@ -125,25 +125,36 @@ def test_its_devices_keep_their_contracts(python, device, least):
     assert "failed" not in shown
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ('[roles.response]\nsignal = "stain"', ("roles.response.signal = 'stain'", "strain")),
-        ('[roles.drive]\nunit = "mA"', ("roles.drive.unit = 'mA'", "coil_current is in A")),
-        ('[roles.drive]\ndevice = "bridge"', ("roles.drive.device = 'bridge'", "allowed: coil")),
-        (
-            '[derived.strain]\nexpression = "bridge_voltage_c"',
-            ("derived.strain.", "bridge_voltage_c", "coil_current"),
-        ),
-        ('[derived.strain]\nunit = "mm"', ("derived.strain.", "unit = 'mm'")),
-    ],
-)
-def test_a_wrong_rig_file_is_one_message(python, tmp_path, change, said):
-    rig = tmp_path / "wrong.toml"
-    rig.write_text(f'extends = "magnetostrictive-rod"\n{change}\n')
-    errors = python(*BENCH, "run", "butterfly-loop", "--rig", rig, "--out", tmp_path / "runs", code=2)
-    assert errors.count("error:") == 1
-    assert len(errors.splitlines()) == 1
-    for part in (str(rig), *said):
-        assert part in errors
-    assert not list((tmp_path / "runs").glob("*"))
+WRONG = {
+    '[roles.response]\nsignal = "stain"': ("roles.response.signal = 'stain': there is no such signal", "strain"),
+    '[roles.drive]\nunit = "mA"': ("roles.drive.unit = 'mA': coil_current is in A",),
+    '[roles.drive]\ndevice = "bridge"': ("roles.drive.device = 'bridge' takes no set-point; allowed: coil",),
+    '[derived.strain]\nexpression = "2 * bridge_voltage_c / (5 * gauge_factor)"': (
+        "derived.strain.expression: 'bridge_voltage_c': there is no such signal", "bridge_voltage_a",
+    ),
+    '[derived.strain]\nunit = "mm"': ("derived.strain.expression = ", "not in unit = 'mm'"),
+}  # fmt: skip
+"""Wrong keys of a rig file, and what the message has to say."""
+
+TRY_EACH = """
+import sys
+from bench.cli import main
+for rig in sys.argv[1:]:
+    try:
+        main(["run", "butterfly-loop", "--rig", rig, "--out", "runs"])
+    except SystemExit as stopped:
+        print(stopped.code)
+"""
+
+
+def test_a_wrong_rig_file_is_one_message_before_anything_moves(python, tmp_path):
+    rigs = [tmp_path / f"wrong-{i}.toml" for i in range(len(WRONG))]
+    for rig, change in zip(rigs, WRONG, strict=True):
+        rig.write_text(f'extends = "magnetostrictive-rod"\n{change}\n')
+    codes, errors = python("-c", TRY_EACH, *rigs, cwd=tmp_path, both=True)
+    assert codes.split() == ["2"] * len(WRONG)
+    for rig, said, message in zip(rigs, WRONG.values(), errors.splitlines(), strict=True):
+        assert message.startswith(f"error: {rig}: ")
+        for part in said:
+            assert part in message
+    assert not (tmp_path / "runs").exists()
