@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from bench import registry
 from bench.control.loops import Reaching, ReachTarget
+from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
+from bench.model_file import ModelFile, load_model
 from bench.protocol import (
     Control,
     Dwell,
@@ -23,7 +24,6 @@ from bench.protocol import (
     parameter,
     protocol,
 )
-from bench.results.model_file import load_model
 from bench.results.tracking import REACH, READING
 from protocols.muscles.parts import (
     ON_STAGE,
@@ -36,7 +36,6 @@ from protocols.muscles.parts import (
 )
 from protocols.preparation import Part
 
-ControllerName = Literal["open-loop-inverse", "proportional-integral", "closed-loop-inverse"]
 Output = Literal["length", "force"]
 
 _MARGIN = 0.05
@@ -49,7 +48,9 @@ class Controlled(ProtocolParameters):
     """Parameters of either task."""
 
     model: str = parameter(..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it")
-    controller: ControllerName = parameter("closed-loop-inverse", unit="", help="which controller")
+    controller: str = parameter(
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("coupled-length")
+    )
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
@@ -133,8 +134,13 @@ def _load_model(path: str) -> TwoStage:
 def _make_controller(
     parameters: LengthParameters | ForceParameters, model: TwoStage, state: TwoStageState, output: Output
 ) -> Reaching:
-    make = registry.load("controllers", f"coupled-{output}.{parameters.controller}")
-    controller: Reaching = make(model, state=state, limits=(0.0, parameters.highest), duration=parameters.duration)
+    setup = ControllerSetup(
+        model=ModelFile("two-stage", model),
+        limits=(0.0, parameters.highest),
+        state=state,
+        options={"duration": parameters.duration},
+    )
+    controller: Reaching = make_controller(f"coupled-{output}", parameters.controller, setup)
     return controller
 
 

@@ -10,9 +10,7 @@ themselves, without a wire, for loops of many kHz on the virtual clock.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -23,7 +21,6 @@ from bench.devices import Device, DriverSettings, Identity
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.rig_file import LaboratorySettings
 from bench.roles import PositionSensor, TECMode
-from sim_devices import protocol_emulated
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.instruments.t7_roles import (
@@ -31,6 +28,7 @@ from sim_devices.instruments.t7_roles import (
     EmulatedPositionSensor,
     EmulatedTemperatureSensor,
 )
+from sim_devices.laboratory import EmulatedLaboratory, Event
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
@@ -99,7 +97,7 @@ class HybridLaboratorySettings(LaboratorySettings):
     fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
 
-class HybridLaboratory:
+class HybridLaboratory(EmulatedLaboratory):
     """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP).
 
     With `direct` they are `tec`, `displacement`, `base`, `tip` and `piezo`, without wires.
@@ -120,7 +118,6 @@ class HybridLaboratory:
         # One stream a source of noise: reading one instrument must not change the noise of another.
         plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
         self._settings = settings
-        self._clock = clock
         self.plant = HybridCantilever(
             HybridParameters(ambient_sd=settings.ambient_deviation, resonance_offset=settings.resonance_offset), plant
         )
@@ -147,12 +144,11 @@ class HybridLaboratory:
         self.t7.add_follower(
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )
-        self._t7_server = ModbusTcpServer(self.t7)
-        self._opened = ExitStack()
+        super().__init__("hybrid laboratory", {"t7": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
         if settings.ambient_step:
-            self.world.add(_Event(settings.ambient_step_time, self._step_room))
+            self.world.add(Event(settings.ambient_step_time, self._step_room))
         if settings.fault != "none":
-            self.world.add(_Event(settings.fault_time, self._go_wrong))
+            self.world.add(Event(settings.fault_time, self._go_wrong))
 
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name.
@@ -164,32 +160,11 @@ class HybridLaboratory:
         ConfigurationError
             If another one with `direct` is open in this process.
         """
-        with ExitStack() as opened:
-            if self._settings.direct:
-                ports = self._open_directly()
-                opened.callback(_direct.clear)
-            else:
-                self._t7_server.start()
-                opened.callback(self._t7_server.close)
-                ports = {"t7": self._t7_server.address}
-                ports["tec"] = protocol_emulated.register("tec", MeComServer(self.tec), self._clock)
-                opened.callback(protocol_emulated.unregister, "tec")
-            self._opened = opened.pop_all()
+        if not self._settings.direct:
+            return super().open()
+        ports = self._open_directly()
+        self._opened.callback(_direct.clear)
         return ports
-
-    def operate(self, task: str, value: float) -> None:  # noqa: ARG002 - nothing is done by hand here
-        """Refuse: nothing is to be done by hand.
-
-        Raises
-        ------
-        ConfigurationError
-            Always.
-        """
-        raise ConfigurationError(f"the hybrid laboratory cannot carry out {task!r}; nothing is done by hand there")
-
-    def close(self) -> None:
-        """Switch the instruments off; those of another laboratory stay as they are."""
-        self._opened.close()
 
     def _open_directly(self) -> dict[str, str]:
         if _direct:
@@ -232,23 +207,6 @@ class HybridLaboratory:
             self.tec.trip(_OBJECT_TOO_HOT)
         elif fault == "amplifier-trips":
             self.amplifier.trip()
-
-
-class _Event:
-    """An event that happens once, at its time; a `Timed` part of the world."""
-
-    def __init__(self, instant: float, happen: Callable[[], None]) -> None:
-        self._due = instant
-        self._happen = happen
-
-    def deadline(self) -> float:
-        """Return when it is due, s."""
-        return self._due
-
-    def expire(self) -> None:
-        """Let it happen."""
-        self._due = math.inf
-        self._happen()
 
 
 class DirectSettings(DriverSettings):

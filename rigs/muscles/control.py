@@ -22,15 +22,16 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from bench.control.baselines import saturation
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.loops import SHORTEST_WAIT
 from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
+from bench.controllers import ControllerSetup, ControllerSpec
 from bench.errors import DataError
-from bench.hysteresis import TwoStage, TwoStageState, _checks
+from bench.hysteresis import TwoStageState, _checks
 from bench.hysteresis.inverse import Reach
 
 
@@ -572,52 +573,34 @@ Its time constant is 5 s, and over 0 to 3 V it moves by 1.5 mm/V and pulls 3.8 N
 """
 
 
-class MakeController(Protocol):
-    """A controller by name: an entry of the group `bench.controllers`."""
-
-    def __call__(
-        self, model: TwoStage, *, state: TwoStageState, limits: tuple[float, float], duration: float
-    ) -> MuscleController:
-        """Make it, for the memory at the start, voltages that it may ask for (V), and the time for each target (s).
-
-        Raises
-        ------
-        DataError
-            If the model cannot be inverted.
-        """
-
-
 def _with_inverse(
-    controller: Callable[..., MuscleController], task: Callable[[TwoStageInverse], Task]
-) -> MakeController:
-    def make(
-        model: TwoStage, *, state: TwoStageState, limits: tuple[float, float], duration: float
-    ) -> MuscleController:
+    summary: str, controller: Callable[..., MuscleController], task: Callable[[TwoStageInverse], Task]
+) -> ControllerSpec:
+    def make(setup: ControllerSetup) -> MuscleController:
         try:
-            inverse = TwoStageInverse(model)
+            inverse = TwoStageInverse(setup.model.model)
         except ValueError as error:
             raise DataError(f"the two-stage model has no inverse: {error}") from error
-        return controller(task(inverse), state, limits, InverseControlParameters(duration=duration))
+        parameters = InverseControlParameters(duration=setup.options["duration"])
+        return controller(task(inverse), setup.state, setup.limits, parameters)
 
-    return make
-
-
-def _with_gain(gain: float) -> MakeController:
-    def make(
-        model: TwoStage,  # noqa: ARG001 - for comparison without a model
-        *,
-        state: TwoStageState,  # noqa: ARG001
-        limits: tuple[float, float],
-        duration: float,
-    ) -> MuscleController:
-        return MuscleProportionalIntegral(limits, ProportionalIntegralParameters(gain, duration=duration))
-
-    return make
+    return ControllerSpec(summary, make)
 
 
-LENGTH_OPEN_LOOP = _with_inverse(MuscleOpenLoop, LengthTask)
-LENGTH_CLOSED_LOOP = _with_inverse(MuscleClosedLoop, LengthTask)
+def _with_gain(gain: float) -> ControllerSpec:
+    def make(setup: ControllerSetup) -> MuscleController:
+        parameters = ProportionalIntegralParameters(gain, duration=setup.options["duration"])
+        return MuscleProportionalIntegral(setup.limits, parameters)
+
+    return ControllerSpec("proportional-integral control without a model, for comparison", make)
+
+
+_OPEN_LOOP = "inverse of the two-stage model, without feedback"
+_CLOSED_LOOP = "inverse of the two-stage model, with the disturbance estimated from the measured output"
+
+LENGTH_OPEN_LOOP = _with_inverse(_OPEN_LOOP, MuscleOpenLoop, LengthTask)
+LENGTH_CLOSED_LOOP = _with_inverse(_CLOSED_LOOP, MuscleClosedLoop, LengthTask)
 LENGTH_PROPORTIONAL_INTEGRAL = _with_gain(LENGTH_GAIN)
-FORCE_OPEN_LOOP = _with_inverse(MuscleOpenLoop, ForceTask)
-FORCE_CLOSED_LOOP = _with_inverse(MuscleClosedLoop, ForceTask)
+FORCE_OPEN_LOOP = _with_inverse(_OPEN_LOOP, MuscleOpenLoop, ForceTask)
+FORCE_CLOSED_LOOP = _with_inverse(_CLOSED_LOOP, MuscleClosedLoop, ForceTask)
 FORCE_PROPORTIONAL_INTEGRAL = _with_gain(FORCE_GAIN)
