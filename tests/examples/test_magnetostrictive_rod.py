@@ -80,20 +80,22 @@ def test_both_models_fit(characterized):
     assert (saved["model"]["input_unit"], saved["model"]["output_unit"]) == ("A", "µm/m")
 
 
-@pytest.mark.parametrize("model", ["quadratic-play", "preisach-signed"])
-def test_tracking_with_a_model_and_its_report(python, characterized, tmp_path, model):
+def test_tracking_with_its_model_and_the_report(python, characterized, tmp_path):
     folder, _ = characterized
+    models = [folder / "quadratic-play.json", folder / "preisach-signed.json"]
     python(
-        *BENCH, "run", "tracking", *RIG, "--clock", "virtual", "--set", f"model={folder / model}.json",
+        *BENCH, "run", "tracking", *RIG, "--clock", "virtual", "--set", f"model={models[0]}",
         "--set", "count=8", "--out", tmp_path, "--json", tmp_path / "run.json",
     )  # fmt: skip
     run = json.loads((tmp_path / "run.json").read_text())["folder"]
     shown = python(
-        *BENCH, "report", run, "--model", folder / f"{model}.json", "--out", tmp_path, "--json", tmp_path / "r.json"
-    )
+        *BENCH, "report", run, "--model", models[0], "--model", models[1],
+        "--out", tmp_path, "--json", tmp_path / "r.json",
+    )  # fmt: skip
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["tracking"]["rms"] < 15.0  # µm/m, of targets from 50 to 600
-    assert report["models"][model]["rms"] > 0.0
+    assert set(report["models"]) == {"quadratic-play", "preisach-signed"}
+    assert all(model["rms"] > 0.0 for model in report["models"].values())
     assert all(Path(path).stat().st_size > 0 for path in report["figures"])
     assert "tracking: error max" in shown
 
