@@ -7,6 +7,7 @@ from typing import TypeAlias, TypeVar
 
 from bench.controllers import saturated_below
 from bench.devices import Actuator, Signal
+from bench.model_file import ModelFile
 from bench.protocol import (
     Dwell,
     Message,
@@ -22,7 +23,6 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
-from bench.results.model_file import ModelFile
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""

@@ -30,7 +30,7 @@ class Parameters(LoadedParameters):
 
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
     controller: str = parameter(
-        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('target'))}"
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("target")
     )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
     targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")

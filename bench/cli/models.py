@@ -126,8 +126,8 @@ def predict_(
     Writes a CSV file with the input column and `predicted`.
     """
     from bench.identification import measure_errors
+    from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
-    from bench.results.model_file import load_model
     from bench.results.models import check_unit, errors_json, outside_of_range, predict
 
     model = load_model(model_path)
@@ -285,8 +285,8 @@ def invert(
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value).
     """
+    from bench.model_file import load_model
     from bench.results.data import header_with_unit, read_columns, write_csv
-    from bench.results.model_file import load_model
     from bench.results.models import check_unit, invert_targets
 
     model = load_model(model_path)

@@ -30,7 +30,7 @@ def report(
 
     Models that were identified from this run are compared without being named. Works while the run goes on.
     """
-    from bench.results.model_file import load_model
+    from bench.model_file import load_model
     from bench.results.report import report_run
 
     result = report_run(run, [load_model(path) for path in models or []], out, console)

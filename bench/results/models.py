@@ -37,8 +37,8 @@ from bench.identification import (
     first_order_reversals,
     identify,
 )
+from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
-from bench.results.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
 

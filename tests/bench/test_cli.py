@@ -14,7 +14,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import FILE_NAME, Record
-from bench.results.model_file import load_model
+from bench.model_file import load_model
 
 FAST = ["--rig", "vo2", "--clock", "virtual"]
 # On the clock of a busy machine: neither the watchdog of the output nor a late answer ends the run.

@@ -16,8 +16,8 @@ from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
+from bench.model_file import ModelFile
 from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
-from bench.results.model_file import ModelFile
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
