@@ -63,12 +63,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bench import registry
 from bench.binding import RoleTable
 from bench.clock import Clock
+from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
 from bench.layout import DashboardLayout
 from bench.safety import Interlock
-from bench.validation import problems
 
 
 class _Table(BaseModel):

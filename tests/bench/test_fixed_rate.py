@@ -653,7 +653,7 @@ class TestTrouble:
                 check_before_moving(rig, wrong, plan(wrong, Nothing()))
 
 
-class TestTimeOfTheRoom:
+class TestWallClockTime:
     @pytest.mark.parametrize(("rate", "duration"), [(200.0, 1.0), (2000.0, 0.25)])
     def test_the_record_is_consistent_however_busy_the_machine_is(self, bench, rate, duration):
         b, controller = bench(clock=WallClock()), Controller()

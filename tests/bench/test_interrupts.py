@@ -88,7 +88,7 @@ class TestFlags:
 
 
 class Process:
-    """A run in a process of its own, on the clock of the room."""
+    """A run in a process of its own, on the wall clock."""
 
     def __init__(self, tmp_path, rig, protocol, *settings, clock="wall", terminal=False, **keys):
         self.folder = tmp_path / "runs"
