@@ -1,4 +1,4 @@
-"""Carries a protocol out on a rig.
+"""Runs a protocol on a rig.
 
 For each step: checks the set-points, sends them, ticks through the hold (telemetry, interlocks, faults), takes the
 reading, writes the journal, and then notifies the observers. However the run ends, every device is brought into its
@@ -159,7 +159,7 @@ class Engine:
         error: Exception | None = None
         try:
             self._carry_out(definition, parameters)
-        # Whatever is raised, every way out leads through the safe state.
+        # Every exit path leads through the safe state, after any exception.
         except Exception as caught:
             error = caught
         finally:
@@ -339,7 +339,7 @@ class Engine:
         if self._rig.laboratory is not None:
             self._rig.laboratory.operate(message.task, message.value)
         elif self._ask is None:
-            raise AbortError(f"nobody is there to do it: {message.text}")
+            raise AbortError(f"no operator is present to do it: {message.text}")
         elif self._await_answer(self._ask, f"{message.text}; then") != RESUME:
             raise AbortError("ended by the operator at a prompt")
         # Kept in any case: it shows what was wrong.
@@ -482,7 +482,7 @@ class Engine:
         if not self._interrupts.pause_requested:
             return
         if self._ask is None:
-            raise AbortError("ended by Ctrl-C; nobody is there to be asked whether to resume")
+            raise AbortError("ended by Ctrl-C; no operator is present to resume")
         self._event("WARN", "pause", "paused before the next step, at the operator's wish")
         answer = self._await_answer(self._ask, "paused:")
         self._interrupts.pause_requested = False

@@ -1,4 +1,4 @@
-"""A rig file: what is connected, how it is bound to roles, and within which limits.
+"""A rig file: devices, slots, derived signals, interlocks and limits.
 
 A rig file is TOML::
 

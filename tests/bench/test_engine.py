@@ -748,7 +748,10 @@ class TestPrompt:
         b = bench()
         self.by_hand(b)
         outcome = b.run(prompt())
-        assert (outcome.status, outcome.reason) == ("aborted", "nobody is there to do it: Turn the plate to 33 °C")
+        assert (outcome.status, outcome.reason) == (
+            "aborted",
+            "no operator is present to do it: Turn the plate to 33 °C",
+        )
         b.assert_safe()
 
     def test_the_dry_run_counts_them(self):
@@ -827,7 +830,7 @@ class TestInterrupted:
         self.b = b = bench()
         outcome = b.run(self.request(pause_requested=True))
         assert (outcome.status, outcome.steps) == ("aborted", 1)
-        assert "nobody is there" in outcome.reason
+        assert "no operator is present" in outcome.reason
         b.assert_safe()
 
     def test_abort_at_once(self, bench):
