@@ -84,7 +84,7 @@ class ModelFile:
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the file.
 
         Raises
@@ -110,7 +110,7 @@ class ModelFile:
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
         try:
-            path.write_text(text + "\n", encoding="utf-8")
+            Path(path).write_text(text + "\n", encoding="utf-8")
         except OSError as error:
             raise DataError(f"model file {path} cannot be written: {error}") from None
 

@@ -70,7 +70,8 @@ def check_reset(model: ModelFile, drive: Slot, setpoint: float) -> None:
     """
     if not saturated_below(model.operator, setpoint):
         raise ValueError(
-            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; choose it lower"
+            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; "
+            "choose it lower, or identify the model with a plane that begins higher"
         )
 
 
