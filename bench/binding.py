@@ -274,7 +274,7 @@ def check_roles(
         if table.device:
             actuators = [key for key, device in devices.items() if isinstance(device, Actuator)]
             if table.device not in actuators:
-                what = "takes no set-point" if table.device in devices else "is no device of this rig"
+                what = "takes no set-point" if table.device in devices else "is not a device of this rig"
                 raise ConfigurationError(
                     f"{path}: roles.{name}.device = {table.device!r} {what}; "
                     f"allowed: {', '.join(actuators) or 'none'}"

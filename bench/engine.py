@@ -381,13 +381,13 @@ class Engine:
     def _check_signals(self, *names: str) -> None:
         for name in names:
             if name not in self._names:
-                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+                raise ConfigurationError(f"{name} is not a signal of this rig; there are: {', '.join(self._names)}")
 
     def _actuator(self, name: str) -> Actuator:
         actuators = self._rig.actuators
         if name not in actuators:
             known = ", ".join(actuators) or "none"
-            raise ConfigurationError(f"{name} is no device that takes a set-point; there are: {known}")
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
         return actuators[name]
 
     def _send(self, setpoints: Mapping[str, float]) -> list[Status]:

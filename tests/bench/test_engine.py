@@ -251,7 +251,7 @@ class TestWrongSetpoints:
         def wrong(parameters):
             yield Step({"probe": 30.0}, Dwell(1.0))
 
-        assert "probe is no device that takes a set-point" in bench().run(define(wrong)).reason
+        assert "probe is not a device that takes a set-point" in bench().run(define(wrong)).reason
 
     def test_an_unknown_signal_to_settle_is_found_before_anything_is_sent(self, bench):
         b = bench()
