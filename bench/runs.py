@@ -125,7 +125,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
                 f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
-                "run it in a terminal, where somebody can answer"
+                "run it in a terminal, where an operator can answer"
             )
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
@@ -206,7 +206,7 @@ def _metadata(
 
 
 def _say_at_once(text: str) -> None:
-    # In a signal's handler: a console has locks, and whatever was interrupted may hold them.
+    # In a signal handler: a console has locks, and the interrupted code may hold them.
     os.write(2, f"\n{text}\n".encode())
 
 

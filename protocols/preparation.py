@@ -1,4 +1,4 @@
-"""What general protocols do before they measure: the load, and the reset of the memory."""
+"""Preparation of general protocols: the load, and the reset of the memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns what happened into the columns of a recording, and arranges its views."""
+"""Turns entries into the columns of a recording, and arranges its views."""
 
 from __future__ import annotations
 

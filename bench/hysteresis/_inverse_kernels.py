@@ -135,7 +135,7 @@ def invert(
     """Return number of set-points, the first, the last, the error at the last, and the segments walked.
 
     `minus` and `plus` are the outputs at negative and positive saturation, at the ends of the plane. Of a
-    `monotone` operator the output rises with the input, whatever its memory: one walk tells all.
+    `monotone` operator the output rises with the input for every memory: one walk finds all solutions.
     """
     # A monotone operator finds the target this way; the other way then is walked no further than that.
     first = 1 if target > value else -1

@@ -1,4 +1,4 @@
-"""From a file of measurements to a model file, and back: what `bench identify` and `bench predict` do."""
+"""From measurements to a model file, and back: the work of `bench identify`, `bench predict` and their like."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control of a muscle: its length under a weight, or its force between fixed ends, to one target after another."""
+"""Control of a muscle: its length under a weight, or its force between fixed ends, follows a sequence of targets."""
 
 from __future__ import annotations
 
