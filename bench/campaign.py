@@ -1,4 +1,4 @@
-"""Studies: series of runs on emulated rigs, with what they give as values, tables and figures.
+"""Studies: series of runs on emulated rigs, and their results as values, tables and figures.
 
 A package registers a `Study` as an entry point of the group `bench.studies`; `bench reproduce NAME` carries it out.
 """

@@ -19,7 +19,7 @@ from bench.control.latched import Latched
 from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
-from bench.results.model_file import ModelFile, load_model
+from bench.model_file import ModelFile, load_model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,8 +22,8 @@ from rich.console import Console
 
 from bench.clock import make_clock
 from bench.errors import BenchError, DeviceError
+from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
-from bench.results.model_file import ModelFile, load_model
 from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
 from bench.results.models import predict as predict_file
 from bench.results.report import report_run

@@ -1,4 +1,4 @@
-"""Parts by name: what the bench and other packages register as entry points.
+"""Parts by name: the entry points that the bench and other packages register.
 
 A package registers its parts in its `pyproject.toml`::
 

@@ -335,7 +335,7 @@ class GeneralActuator(GeneralSensor, Actuator):
 
     @abstractmethod
     def switch_off(self) -> None:
-        """Switch the output off, whatever state the device is in; raise `DeviceError` if that is not confirmed."""
+        """Switch the output off from any state; raise `DeviceError` if that is not confirmed."""
 
     def set(self, value: float) -> Status:
         """Send a set-point; raises `LimitError` if it is outside of the limits, and then nothing is sent."""

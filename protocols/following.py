@@ -28,7 +28,7 @@ class Parameters(ControlledParameters):
     """What can be set."""
 
     controller: str = parameter(
-        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('follow'))}"
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("follow")
     )
     reference: str = parameter("", unit="", help="CSV file with columns `time` and `reference`; a sine if not given")
     low: float = parameter(from_slot("response", "low"), unit=unit_of("response"), help="lowest value of the sine")

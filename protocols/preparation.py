@@ -1,4 +1,4 @@
-"""What general protocols do before they measure: the load, and the reset of the memory."""
+"""Preparation of general protocols: the load, and the reset of the memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TypeAlias, TypeVar
 
 from bench.controllers import load_model_for, saturated_below
 from bench.devices import Actuator, Signal
+from bench.model_file import ModelFile
 from bench.protocol import (
     Dwell,
     Message,
@@ -22,7 +23,6 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
-from bench.results.model_file import ModelFile
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""
@@ -82,7 +82,8 @@ def load_checked_model(parameters: ControlledParameters, slots: Slots) -> ModelF
     model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=slots["response"].unit)
     if not saturated_below(model.operator, setpoint):
         raise ValueError(
-            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; choose it lower"
+            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; "
+            "choose it lower, or identify the model with a plane that begins higher"
         )
     return model
 

@@ -1,4 +1,4 @@
-"""Validation: a random sequence of set-points that no model was fitted to."""
+"""Validation: a random sequence of set-points that was not used for identification."""
 
 from __future__ import annotations
 

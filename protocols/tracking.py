@@ -1,4 +1,4 @@
-"""Tracking: bring the output to one target after another, by a controller of choice."""
+"""Tracking: bring the output to a sequence of targets, with a selectable controller."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Parameters(ControlledParameters):
     """What can be set."""
 
     controller: str = parameter(
-        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('target'))}"
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("target")
     )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
     targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")
@@ -44,7 +44,7 @@ class Parameters(ControlledParameters):
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
-    """Bring the response to one target after another.
+    """Bring the response to a sequence of targets.
 
     The targets are a decaying oscillation and a random part between `low` and `high`, or those of a file. When
     the controller has done what it can, `readings` readings are taken, 0.1 s apart: their mean less the target

@@ -29,7 +29,7 @@ app = typer.Typer(
     name="bench",
     cls=RegisteredCommands,
     help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
-    "identify hysteresis models from what was measured, and apply them.",
+    "identify hysteresis models from the measurements, and apply them.",
     epilog=_EPILOG,
     no_args_is_help=True,
     add_completion=False,

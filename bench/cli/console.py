@@ -1,4 +1,4 @@
-"""What the commands share: the console, options, and how results and errors are printed."""
+"""Shared by the commands: console, options, and printing of results and errors."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     entries = _entries(file, device)
     if not file.emulated and set_points is None and any(issubclass(entry.driver, Actuator) for entry in entries):
         raise pytest.UsageError(
-            f"{file.path} is a real rig, on which {device} will move: "
-            "say between which values by --set-points FIRST SECOND"
+            f"{file.path} is a real rig, on which {device} will move; "
+            "give the two values by --set-points FIRST SECOND"
         )
     session.config.stash[_SUBJECT] = _Subject(file, entries)
 

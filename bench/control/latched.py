@@ -1,4 +1,4 @@
-"""Tracking to the sensor's noise, by turning back a little at the target: the hysteresis then holds it."""
+"""Tracking to the sensor's noise: the input turns back at the target, so that the hysteresis holds the output."""
 
 from __future__ import annotations
 

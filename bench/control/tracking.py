@@ -1,6 +1,6 @@
 """Tracking controllers: readings in, the next set-point out; no device, no clock.
 
-Two kinds share one vocabulary. A `TargetController` is given one target after another: `aim` at it, then
+Two kinds share one vocabulary. A `TargetController` receives a sequence of targets: `aim` at one, then
 `update` with every reading until the `Command` says done, and further while it holds. A `Follower` is called at
 a fixed rate with a reference that moves.
 
@@ -8,8 +8,8 @@ Rules for all of them:
 
 * Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
 * The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point.
-* A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
-  next complete reading, estimators take no value in. A missing output does not keep the memory from following
+* A missing reading (nan or infinite) moves nothing: the set-point is held, the script waits for the next
+  complete reading, estimators are not updated. A missing output does not keep the memory from following
   the measured input. Controllers with a hysteresis model also take for missing what is further outside the
   model's range than that is wide. The caller decides how long missing readings are tolerated.
 * A target that cannot be met is replaced by the closest output, and `reach` says so.

@@ -1,4 +1,4 @@
-"""A picture of what a viewer shows of a recording, without a screen."""
+"""A picture of a recording as a viewer shows it, without a screen."""
 
 from __future__ import annotations
 

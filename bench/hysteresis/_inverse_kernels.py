@@ -108,7 +108,7 @@ def invert(
 ) -> tuple[int, float, float, float, int]:
     """Return number of set-points, the first, the last, the error at the last, and the segments walked.
 
-    Of a `monotone` operator the output rises with the input, whatever its memory: one walk tells all.
+    Of a `monotone` operator the output rises with the input for every memory: one walk finds all solutions.
     """
     low, high, minus, plus, tolerance, nearest, monotone = ends
     # A monotone operator finds the target this way; the other way then is walked no further than that.

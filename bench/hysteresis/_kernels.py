@@ -1,4 +1,4 @@
-"""Compiled loops over the memory curve. Imported on first use only: numba takes its time to load.
+"""Compiled loops over the memory curve. Imported on first use only, because numba is slow to load.
 
 The on-region of the plane is a staircase of pieces (left edge, height); see `MemoryCurve.staircase`.
 With each diagonal cell completed to a square, the integral of the density over {β < b, α < a} is bilinear

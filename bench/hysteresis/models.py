@@ -1,4 +1,4 @@
-"""Registered models: what an entry of the group `bench.models` says, and the classes that model files name."""
+"""Registered models: the entries of the group `bench.models`, and the classes that model files name."""
 
 from __future__ import annotations
 

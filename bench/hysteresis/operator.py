@@ -204,7 +204,7 @@ class Operator(Model, ABC, Generic[S]):
         """Return which cells of the plane a sequence sweeps; None for an operator without a plane."""
         return None
 
-    def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - whatever JSON the operator chooses
+    def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - any JSON that the operator chooses
         """Return a state as JSON: by default a list of its numbers, or null."""
         return None if state is None else list(state)  # type: ignore[call-overload]
 

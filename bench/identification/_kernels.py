@@ -1,4 +1,4 @@
-"""Compiled loops of the constrained fit. Imported on first use only: numba takes its time to load.
+"""Compiled loops of the constrained fit. Imported on first use only, because numba is slow to load.
 
 Columns are held as differences (`Columns`: starts, rows, values): `values[e]` is the change of a column at sample
 `rows[e]`, for e from `starts[c]` to `starts[c + 1]`. `remaining[n]` is the weight of samples n and later, so that

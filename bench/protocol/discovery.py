@@ -1,4 +1,4 @@
-"""Where protocols come from: installed packages, by name, and files of one's own."""
+"""Discovery of protocols: by name in installed packages, and in files of one's own."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def _place(path: Path, header: Sequence[str], name: str) -> int:
         known = ", ".join(cell.strip() for cell in header)
         raise DataError(f"{path}: has no column {name!r}; it has: {known}")
     if len(places) > 1:
-        raise DataError(f"{path}: has {len(places)} columns {name!r}; name one with its unit, as the header has it")
+        raise DataError(f"{path}: has {len(places)} columns {name!r}; name one with its unit, as in the header")
     return places[0]
 
 

@@ -1,4 +1,4 @@
-"""From a file of measurements to a model file, and back: what `bench identify` and `bench predict` do."""
+"""From measurements to a model file, and back: the work of `bench identify`, `bench predict` and their like."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from bench.identification import (
     first_order_reversals,
     identify,
 )
+from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
-from bench.results.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table, run_card
+from bench.model_file import ModelFile, parse_model
 from bench.results.data import header_with_unit, write_csv
 from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
-from bench.results.model_file import ModelFile, parse_model
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME

@@ -1,4 +1,4 @@
-"""The folder of a run, for programs and notebooks: what was measured as tables, and what happened."""
+"""The folder of a run, for programs and notebooks: measurements as tables, events, and outcome."""
 
 from __future__ import annotations
 

@@ -315,7 +315,7 @@ class MuscleController(ControllerBase, ABC):
             return Command(self._setpoint, self._period, done=True)
         self._setpoint = self._clip(self._decide(output, first=self._sample == 0))
         self._sample += 1
-        # Counted from the beginning, so that what is late once is not late ever after.
+        # Counted from the beginning, so that one delay does not shift all later samples.
         return Command(self._setpoint, max(SHORTEST_WAIT, self._start + self._sample * self._period - t))
 
     @abstractmethod

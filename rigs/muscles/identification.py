@@ -26,7 +26,7 @@ from bench.identification.two_stage import (
     identify_two_stage,
 )
 from bench.journal import Record
-from bench.results.model_file import ModelFile
+from bench.model_file import ModelFile
 from protocols.muscles.parts import SAMPLE
 
 Floats = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_le
 from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
-from bench.results.model_file import ModelFile
+from bench.model_file import ModelFile
 from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]

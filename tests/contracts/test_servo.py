@@ -427,7 +427,7 @@ def test_connecting_under_torque_switches_it_off(bench):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pty")
-def test_over_a_pty_in_the_time_of_the_room():
+def test_over_a_pty_in_wall_clock_time():
     import tty
 
     clock = WallClock()

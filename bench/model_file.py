@@ -1,4 +1,4 @@
-"""Model files: an identified model as versioned JSON, with its units and where it comes from.
+"""Model files: an identified model as versioned JSON, with its units and provenance.
 
 A file of version 2 is an object with these keys:
 
@@ -9,7 +9,7 @@ A file of version 2 is an object with these keys:
 `kind`
     The class of the model: the `kind` of a class that an entry of `bench.models` names.
 `model`
-    The model as it writes itself: its `type` (the kind), coefficients, ranges and units.
+    The content that the model's class writes: its `type` (the kind), coefficients, ranges and units.
 `memory`
     The state of an operator at the end of the data from which it was identified; null for a model without memory
     or of several inputs.
@@ -81,7 +81,7 @@ class ModelFile:
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the file.
 
         Raises DataError if it cannot be written, or could not be loaded again because the class of the model is not
@@ -105,7 +105,7 @@ class ModelFile:
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
         try:
-            path.write_text(text + "\n", encoding="utf-8")
+            Path(path).write_text(text + "\n", encoding="utf-8")
         except OSError as error:
             raise DataError(f"model file {path} cannot be written: {error}") from None
 
