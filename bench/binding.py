@@ -194,25 +194,11 @@ def bind(
     signals: Mapping[str, Signal],
     path: str,
 ) -> Slots:
-    """Bind the slots of a protocol to a rig.
+    """Bind the slots that a protocol needs, by name and kind, to the devices and signals of a rig by its roles.
 
-    Parameters
-    ----------
-    protocol : str
-        Name of the protocol, for messages.
-    needs : mapping of str to type
-        By slot: the role that its device has to play, or `Signal` where something is only measured.
-    roles : mapping of str to RoleTable
-        What the rig file binds.
-    devices, signals : mapping
-        What the rig has, by name.
-    path : str
-        The rig file, for messages.
-
-    Raises
-    ------
-    ConfigurationError
-        If a slot is not bound, or bound to something of another kind; names file, key and what is allowed.
+    A kind is the role that the device has to play, or `Signal` where something is only measured; protocol and path
+    of the rig file are for messages. Raises ConfigurationError if a slot is not bound, or bound to something of
+    another kind; names file, key and what is allowed.
     """
     missing = [name for name in needs if name not in roles]
     if missing:

@@ -141,19 +141,9 @@ INTEGRAL_FOLLOWER = ControllerSpec("integral action without a model", lambda s: 
 
 
 def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile:
-    """Read a model file for a rig.
+    """Read a model file for a rig, whose signals have the given units.
 
-    Parameters
-    ----------
-    path : str
-        The model file.
-    input_unit, output_unit : str
-        Units of the rig's signals that the model shall stand for.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or its units are others.
+    Raises DataError if it cannot be read, or its units are others.
     """
     model = load_model(Path(path))
     for what, unit, expected in (

@@ -94,23 +94,10 @@ class TwoStageInverse:
     def voltage_for_length(
         self, state: TwoStageState, length: float, force: float | None = None
     ) -> TwoStageInversion:
-        """Return the voltage that brings the length to a target under a known or measured force.
+        """Return the voltage that brings the length to a target under a force (default: the present one).
 
-        As in `TwoStage.step` the force moves first, then the voltage.
-
-        Parameters
-        ----------
-        state : TwoStageState
-            Present state.
-        length : float
-            Target, length units.
-        force : float or None
-            Force, force units; default the present one.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        As in `TwoStage.step` the force moves first, then the voltage; units are those of the model. Raises ValueError
+        if a number is not finite.
         """
         target = _checks.number("length", length)
         tension = state.force if force is None else _checks.number("force", force)
@@ -125,21 +112,8 @@ class TwoStageInverse:
     def voltage_for_force(self, state: TwoStageState, force: float, length: float | None = None) -> TwoStageInversion:
         """Return the voltage that brings the force to a target between fixed ends (isometric).
 
-        The argument u goes straight to that of the length, and stays where it is if the length is held.
-
-        Parameters
-        ----------
-        state : TwoStageState
-            Present state.
-        force : float
-            Target, force units.
-        length : float or None
-            Length imposed from now on, length units; default the present one.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        The argument u goes straight to that of the length, if one is imposed from now on, and stays where it is if
+        the length is held. Units are those of the model. Raises ValueError if a number is not finite.
         """
         target = _checks.number("force", force)
         argument, imposed = state.argument, Reach.MET

@@ -16,21 +16,9 @@ from bench.model_file import is_model, parse_model
 
 
 def rebuild(record: Record, path: Path) -> None:
-    """Make the .rrd of a run from its journal.
+    """Make the .rrd of a run, finished or not, from its journal; the folder of the file exists.
 
-    Parameters
-    ----------
-    record : Record
-        The journal, of a finished run or not.
-    path : Path
-        The file to write; its folder exists, the file does not.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file exists.
-    DataError
-        If the journal is damaged.
+    Raises ConfigurationError if the file exists, and DataError if the journal is damaged.
     """
     meta = record.meta
     models = [

@@ -67,10 +67,7 @@ class Recording:
     def follow_viewer(self, entries: int) -> str:
         """Suspend the live view for the next `entries` entries if its viewer has stalled; never waits long.
 
-        Returns
-        -------
-        str
-            What changed, for the log; empty if nothing did.
+        Returns what changed, for the log; empty if nothing did.
         """
         if self._live is None:
             return ""

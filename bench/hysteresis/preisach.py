@@ -228,20 +228,10 @@ class Preisach(Operator[MemoryCurve]):
         return np.array(left, dtype=np.float64), np.array(height, dtype=np.float64), present
 
     def evaluate(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Floats:
-        """Return the outputs of a sequence of inputs, shape (N,), output units.
+        """Return the outputs of a sequence of inputs, shape (N,), output units; see `Operator.evaluate`.
 
-        Parameters
-        ----------
-        inputs : array_like, shape (N,)
-            Inputs, between which the input moves monotonically.
-        state : MemoryCurve or None
-            Memory before the first sample; default negative saturation. `state.advance(inputs)` is the
-            memory after the last.
-
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite.
+        The memory before the first sample defaults to negative saturation; `state.advance(inputs)` is that after the
+        last.
         """
         return self._outputs(_checks.samples("inputs", inputs), state)
 
@@ -282,19 +272,8 @@ class Preisach(Operator[MemoryCurve]):
     def regressor(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Regressor:
         """Return the matrix of s = 2 on-area - area per cell, then the reversible part's columns.
 
-        evaluate(inputs) = bias + regressor @ coefficients (Zhang et al. 2013, eqs. 10 and 12).
-
-        Parameters
-        ----------
-        inputs : array_like, shape (N,)
-            Inputs.
-        state : MemoryCurve or None
-            Memory before the first sample; default negative saturation.
-
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite.
+        evaluate(inputs) = bias + regressor @ coefficients (Zhang et al. 2013, eqs. 10 and 12). Arguments and errors
+        as `evaluate`.
         """
         from bench.hysteresis import _kernels
 
@@ -414,17 +393,8 @@ class Preisach(Operator[MemoryCurve]):
     def coverage(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Coverage:
         """Return which cells of the plane a sequence of inputs sweeps.
 
-        Parameters
-        ----------
-        inputs : array_like, shape (N,)
-            The sequence. The move to the first input does not count: nothing was measured before it.
-        state : MemoryCurve or None
-            Memory before the first input; default negative saturation.
-
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite.
+        The move to the first input does not count: nothing was measured before it. Arguments and errors as
+        `evaluate`.
         """
         return Coverage.of(self.regressor(inputs, state), self.levels)
 

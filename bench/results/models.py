@@ -384,21 +384,10 @@ def compare_models(
 def assess_designs(
     plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
 ) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane, by the name of its protocol.
+    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
 
-    Parameters
-    ----------
-    plane, operating : (float, float)
-        Ends of the Preisach plane and of the operating range, input units.
-    levels : int
-        Number of intervals M of the plane.
-    dwell : float
-        Settling time at each set-point, s.
-
-    Raises
-    ------
-    ConfigurationError
-        If the ranges do not fit.
+    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
+    ConfigurationError if the ranges do not fit.
     """
     low, high = operating
     try:

@@ -274,39 +274,20 @@ class MuscleController(ControllerBase, ABC):
         self._setpoint = self._low
 
     def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Start towards a new target and return the first command.
+        """Start towards a new target and return the first command; see `TargetController`.
 
-        Parameters
-        ----------
-        target : float
-            Wanted output, output units.
-        t : float
-            Time, s.
-        measured_input : float
-            Voltage that the supply puts out and has put out since the last reading, V.
-        output : float
-            One reading of the output.
-        others : float
-            Further signals that the task needs.
-
-        Raises
-        ------
-        ValueError
-            If the target is not finite, the time goes back or the number of further signals is wrong.
+        The measured input is the voltage (V) that the supply has put out since the last reading. The task may need
+        further signals. Raises ValueError if the target is not finite, the time goes back or the number of signals is
+        wrong.
         """
         self._reference = _checks.number("target", target)
         self._start, self._sample, self._reach = t, 0, Reach.MET
         return self.update(t, measured_input, output, *others)
 
     def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Take in a reading and return the next command; parameters as in `aim`.
+        """Take in a reading and return the next command; arguments and errors as `aim`.
 
-        Raises
-        ------
-        RuntimeError
-            If there is no target yet.
-        ValueError
-            As `aim`.
+        Raises RuntimeError if there is no target yet.
         """
         if math.isnan(self._reference):
             raise RuntimeError("update: expected a target first, by aim")
