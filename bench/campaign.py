@@ -104,18 +104,9 @@ class Campaign:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """One table of a study.
+    """One table of a study: title above, heads of the columns, rows of cells, and note below (empty for none).
 
-    Attributes
-    ----------
-    title : str
-        Line above it.
-    columns : sequence of str
-        Heads.
-    rows : sequence of sequence of str
-        Cells. Each is a format string over the values of the study, such as `{validation[linear][rms]:.1f}`.
-    note : str
-        Line below it, a format string as well; empty for none.
+    Title, cells and note are format strings over the values of the study, such as `{validation[linear][rms]:.1f}`.
     """
 
     title: str

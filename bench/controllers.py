@@ -64,14 +64,9 @@ class ControllerSetup:
 
 @dataclass(frozen=True)
 class ControllerSpec:
-    """An entry of the group `bench.controllers`.
+    """An entry of the group `bench.controllers`: a one-line summary, and what makes the controller of a setup.
 
-    Parameters
-    ----------
-    summary : str
-        What the controller does, in one line.
-    make : callable
-        Takes a `ControllerSetup`; returns the controller. A DataError says what kind of model it needs.
+    `make` raises a DataError that says what kind of model it needs.
     """
 
     summary: str

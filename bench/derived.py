@@ -65,16 +65,9 @@ _ON_QUANTITIES: dict[str, Callable[..., Any]] = {
 
 @dataclass(frozen=True)
 class Derived:
-    """A derived signal of one rig, ready to be computed.
+    """A derived signal of one rig, ready to be computed from the signals that are its sources.
 
-    Attributes
-    ----------
-    signal : Signal
-        What it gives.
-    sources : tuple of str
-        Signals that it is computed from.
-    compute : callable
-        Takes the values of all signals above it, returns its own. Raises `DeviceError` if it has none for these.
+    `compute` takes the values of all signals above it and returns its own, or raises `DeviceError` if it has none.
     """
 
     signal: Signal

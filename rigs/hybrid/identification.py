@@ -77,16 +77,9 @@ class PiezoIdentification:
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of one fast loop.
+    """The samples of one fast loop at a period in s; `names` gives the signal by slot, and by `SLOT_setpoint`.
 
-    Attributes
-    ----------
-    table : Table
-        Signals by name; set-points are those sent after the sample was read.
-    period : float
-        Time between two samples, s.
-    names : mapping of str to str
-        Signal by slot, and by `SLOT_setpoint`.
+    In the table by signal name, set-points are those sent after the sample was read.
     """
 
     table: Table

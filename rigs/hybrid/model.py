@@ -154,15 +154,7 @@ class HybridModel(Model):
 
 @dataclass(frozen=True)
 class OrderChoice:
-    """Errors of polynomials of each order, and the order chosen.
-
-    Parameters
-    ----------
-    order : int
-        The order chosen.
-    rms : tuple of float
-        RMS error for each order from 1 on, output units.
-    """
+    """The polynomial order chosen, and the RMS error of each order from 1 on, output units."""
 
     order: int
     rms: tuple[float, ...]
