@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections import namedtuple
 from dataclasses import dataclass
-from functools import cache
-from typing import Annotated, ClassVar, Generic, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +30,11 @@ Signed = Annotated[float, "signed"]
 
 Seed = Annotated[int, "zero or positive"]
 """A seed of a specimen."""
+
+Floats = NDArray[np.float64]
+
+Record = Any
+"""A record of named numbers, a scalar of a structured dtype."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +88,6 @@ class GridPlant(ABC, Generic[P]):
         Shape of the standard normal numbers that one step takes.
     """
 
-    OUTPUTS: ClassVar[tuple[str, ...]]
-    """Names of the properties in a snapshot."""
-
     def __init__(self, parameters: P, rng: np.random.Generator, noise_shape: tuple[int, ...] = ()) -> None:
         self._parameters = parameters
         self._step = parameters.step
@@ -101,10 +101,6 @@ class GridPlant(ABC, Generic[P]):
     def parameters(self) -> P:
         """The numbers of this plant."""
         return self._parameters
-
-    def snapshot(self) -> tuple[float, ...]:
-        """Return all outputs at the present instant, as a named tuple."""
-        return _snapshot_type(self.OUTPUTS)(*(getattr(self, name) for name in self.OUTPUTS))
 
     def advance(self, dt: float) -> None:
         """Advance the plant in time.
@@ -139,9 +135,9 @@ class GridPlant(ABC, Generic[P]):
         """Take as many grid steps as there are rows of noise."""
 
 
-@cache
-def _snapshot_type(names: tuple[str, ...]) -> type[tuple[float, ...]]:
-    return namedtuple("Snapshot", names)  # the names are known at run time only
+def record(**values: float) -> Record:
+    """Return numbers as a record, which a compiled loop takes in a few microseconds and reads by their names."""
+    return np.array([tuple(values.values())], [(name, np.float64) for name in values])[0]
 
 
 def fluctuation(deviation: float, time: float, step: float) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
+from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, Record, coefficients
 from sim_devices.plants.grid import NotNegative
 from sim_devices.plants.muscle import MILLIMETRE
 
@@ -31,8 +31,8 @@ _BAR_NEWTON = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class McKibbenParameters(MuscleParameters):
-    """Every number of the plant; those shared with the coiled muscle are described in `MuscleParameters`.
+class McKibbenParameters(FrictionParameters):
+    """Every number of the plant; those shared with other muscles are described in its base classes.
 
     Attributes
     ----------
@@ -142,8 +142,6 @@ class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
     rng : numpy.random.Generator
         The session's randomness: the regulator's supply. The plant spawns its own generator from it.
     """
-
-    OUTPUTS = ("pressure", "voltage", "current", "force", "length", "position")
 
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
         rated = parameters.pressure_gain * parameters.rated_voltage / _BAR

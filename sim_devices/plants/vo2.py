@@ -18,12 +18,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
 from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
-from sim_devices.plants.grid import NotNegative, Seed, Signed, check_temperature, fluctuation
+from sim_devices.plants.grid import Floats, NotNegative, Record, Seed, Signed, check_temperature, fluctuation, record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +162,7 @@ class VO2Parameters(CooledParameters):
             raise ValueError(f"minor_share must lie in [0, 1], not {self.minor_share}")
 
 
-def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def relay_thresholds(parameters: VO2Parameters) -> tuple[Floats, Floats]:
     """Make the specimen: the thresholds of its relays.
 
     The relays are a low-discrepancy sample of the two populations, shifted by the specimen's seed:
@@ -240,18 +239,6 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
         If `initial_temperature` is not a temperature.
     """
 
-    OUTPUTS = (
-        "plate_temperature",
-        "film_temperature",
-        "sink_temperature",
-        "plate_rate",
-        "current",
-        "voltage",
-        "r_fraction",
-        "curvature",
-        "tip_deflection",
-    )
-
     def __init__(
         self,
         parameters: VO2Parameters,
@@ -281,7 +268,7 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
         kernels.settle_film(self.film_temperature, self._parts)
 
-    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+    def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._command, self._parts)
 
     @property
@@ -364,7 +351,7 @@ def arc_deflection(curvature: float, length: float) -> float:
     return length * half * ratio * ratio
 
 
-def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
+def _coefficients(parameters: VO2Parameters) -> Record:
     """Prepare the numbers that the compiled loop needs every step."""
     p = parameters
     step = p.step
@@ -376,29 +363,28 @@ def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
     sine = shrink * math.sin(swing * step) / swing
     wander_decay, wander_kick = fluctuation(p.wander_sd, p.wander_time, step)
     drift_decay, drift_kick = fluctuation(p.drift_sd, p.drift_time, step)
-    values = {
-        kernels.STEP: step,
-        kernels.LOOP_EE: cosine + decay * sine,
-        kernels.LOOP_EV: -sine,
-        kernels.LOOP_VE: p.loop_frequency**2 * sine,
-        kernels.LOOP_VV: cosine - decay * sine,
-        kernels.SLEW: p.slew_limit,
-        kernels.SLEW_DECAY: math.exp(-2.0 * decay * step),
-        kernels.CURRENT_DECAY: math.exp(-step / p.current_lag),
-        kernels.SEEBECK: p.seebeck,
-        kernels.RESISTANCE: p.resistance,
-        kernels.CONDUCTANCE: p.conductance,
-        kernels.PLATE_LOSS: p.plate_loss,
-        kernels.PLATE_CAPACITY: p.plate_capacity,
-        kernels.SINK_CAPACITY: p.sink_capacity,
-        kernels.SINK_LOSS: 1.0 / p.sink_resistance,
-        kernels.AMBIENT: p.ambient_temperature,
-        kernels.WANDER_DECAY: wander_decay,
-        kernels.WANDER_KICK: wander_kick,
-        kernels.DRIFT_DECAY: drift_decay,
-        kernels.DRIFT_KICK: drift_kick,
-        kernels.OFFSET: p.session_offset,
-        kernels.COUPLING: p.coupling,
-        kernels.RELAY_STEP: p.relay_step,
-    }
-    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])
+    return record(
+        step=step,
+        loop_ee=cosine + decay * sine,
+        loop_ev=-sine,
+        loop_ve=p.loop_frequency**2 * sine,
+        loop_vv=cosine - decay * sine,
+        slew=p.slew_limit,
+        slew_decay=math.exp(-2.0 * decay * step),
+        current_decay=math.exp(-step / p.current_lag),
+        seebeck=p.seebeck,
+        resistance=p.resistance,
+        conductance=p.conductance,
+        plate_loss=p.plate_loss,
+        plate_capacity=p.plate_capacity,
+        sink_capacity=p.sink_capacity,
+        sink_loss=1.0 / p.sink_resistance,
+        ambient=p.ambient_temperature,
+        wander_decay=wander_decay,
+        wander_kick=wander_kick,
+        drift_decay=drift_decay,
+        drift_kick=drift_kick,
+        offset=p.session_offset,
+        coupling=p.coupling,
+        relay_step=p.relay_step,
+    )

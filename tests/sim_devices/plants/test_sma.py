@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plant_outputs import snapshot
 
 from sim_devices.plants import _sma_kernels as kernels
 from sim_devices.plants.sma import SMAParameters, SMAWire, grain_table
@@ -57,7 +58,7 @@ def naive_position(wire, temperature, stress, martensite, oriented):
     share = martensite.mean()
     strain = stress * 1e6 * (share / p.martensite_modulus + (1.0 - share) / p.austenite_modulus)
     strain += p.expansion * (temperature - 25.0) + p.transformation_strain * oriented.mean()
-    strain -= wire._coefficients[kernels.REST_STRAIN]
+    strain -= wire._coefficients["rest_strain"]
     return p.rest_length * strain + stress * 1e6 * p.area / p.series_stiffness
 
 
@@ -276,7 +277,7 @@ class TestGrains:
                 wire.hang(load)
             if k % 90 == 0:
                 wire.apply(float(script.uniform(0.0, 3.0)))
-            target = load / wire._coefficients[kernels.AREA]
+            target = load / wire._coefficients["area"]
             wire.advance(0.1)
             parts = math.ceil(abs(target - stress) / 4.0)
             for part in range(1, parts + 1):
@@ -343,9 +344,9 @@ class TestClamped:
         wire.clamp(1.5e-3)
         wire.apply(1.6)
         wire.advance(300.0)
-        before = wire.snapshot()
+        before = snapshot(wire)
         wire.advance(600.0)
-        after = wire.snapshot()
+        after = snapshot(wire)
         assert after.force == pytest.approx(before.force, abs=1e-6)
         assert after.oriented_fraction == before.oriented_fraction
 
