@@ -24,21 +24,14 @@ from drivers.modbus import exception_text, pack, swapped, unpack
 
 
 class Register(NamedTuple):
-    """A register, or the first of several alike.
-
-    Attributes
-    ----------
-    name : str
-        Name in the map, with # for the number of a channel.
-    address : int
-        Modbus address.
-    form : str
-        Type of its value by its letter in `struct`: f FLOAT32, I UINT32, H UINT16.
-    """
+    """A register, or the first of several alike."""
 
     name: str
+    """Name in the map, with # for the number of a channel."""
     address: int
+    """Modbus address."""
     form: str
+    """Type of its value by its letter in `struct`: f FLOAT32, I UINT32, H UINT16."""
 
     def of(self, channel: int) -> Register:
         """Return the register of a channel."""

@@ -120,19 +120,13 @@ Kind = Literal["S8", "U8", "S16", "U16", "S32", "U32", "text"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of the object dictionary.
-
-    Attributes
-    ----------
-    kind : {"S8", "U8", "S16", "U16", "S32", "U32", "text"}
-        Type of the value.
-    readable, writable : bool
-        Which ways it can be transferred.
-    """
+    """One row of the object dictionary."""
 
     kind: Kind
+    """Type of the value."""
     readable: bool = True
     writable: bool = False
+    """Which ways it can be transferred."""
 
 
 def _dictionary() -> dict[tuple[int, int], Entry]:

@@ -69,25 +69,18 @@ FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
 
 
 class Thermal(NamedTuple):
-    """All numbers of the thermal part; the first three and the factors are changed in place.
-
-    Attributes
-    ----------
-    rise : ndarray
-        Node temperatures, K.
-    increment : ndarray
-        Change of them over the latest step that is known, K.
-    state, command, c, nodes, factors : ndarray
-        State, commands, coefficients, node table and factorised matrix.
-    """
+    """All numbers of the thermal part; the first three and the factors are changed in place."""
 
     rise: Floats
+    """Node temperatures, K."""
     increment: Floats
+    """Change of them over the latest step that is known, K."""
     state: Floats
     command: Floats
     c: Record
     nodes: Floats
     factors: Floats
+    """State, commands, coefficients, node table and factorised matrix."""
 
 
 @njit(cache=True)

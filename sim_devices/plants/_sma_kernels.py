@@ -35,26 +35,18 @@ Flags = NDArray[np.bool_]
 
 
 class Parts(NamedTuple):
-    """All numbers of a wire, as the compiled loops take them.
-
-    Attributes
-    ----------
-    state, c : ndarray
-        State, and coefficients.
-    grains : ndarray
-        Grain table, `GRAIN_ROWS` rows.
-    martensite, oriented : ndarray
-        Committed grain states.
-    scratch : ndarray
-        Two rows of stresses, MPa.
-    """
+    """All numbers of a wire, as the compiled loops take them."""
 
     state: Floats
     c: Record
+    """State, and coefficients."""
     grains: Floats
+    """Grain table, `GRAIN_ROWS` rows."""
     martensite: Flags
     oriented: Flags
+    """Committed grain states."""
     scratch: Floats
+    """Two rows of stresses, MPa."""
 
 
 @njit(cache=True)

@@ -32,29 +32,20 @@ Flags = NDArray[np.bool_]
 
 
 class Parts(NamedTuple):
-    """All numbers of the film and its plate, as the compiled loops take them.
-
-    Attributes
-    ----------
-    state, c : ndarray
-        State and coefficients.
-    counters : ndarray
-        Relay counters.
-    up, down : ndarray
-        Up- and down-thresholds, °C, each sorted.
-    down_relay : ndarray
-        Relay number of each element of `down`.
-    on : ndarray
-        Relay states.
-    """
+    """All numbers of the film and its plate, as the compiled loops take them."""
 
     state: Floats
     c: Record
+    """State and coefficients."""
     counters: Integers
+    """Relay counters."""
     up: Floats
     down: Floats
+    """Up- and down-thresholds, °C, each sorted."""
     down_relay: Integers
+    """Relay number of each element of `down`."""
     on: Flags
+    """Relay states."""
 
 
 @njit(cache=True)

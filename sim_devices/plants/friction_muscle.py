@@ -58,23 +58,16 @@ _RELAXED = 1e-12
 
 
 class Parts(NamedTuple):
-    """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place.
-
-    Attributes
-    ----------
-    state, law, c : record
-        State, law at the present drive, and coefficients.
-    contacts : ndarray
-        Contact table, three rows.
-    forces : ndarray
-        Forces of the contacts, N.
-    """
+    """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place."""
 
     state: Record
     law: Record
     c: Record
+    """State, law at the present drive, and coefficients."""
     contacts: Floats
+    """Contact table, three rows."""
     forces: Floats
+    """Forces of the contacts, N."""
 
 
 @njit(cache=True)
@@ -317,27 +310,18 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionParameters(MuscleParameters):
-    """Numbers that both muscles have.
-
-    Attributes
-    ----------
-    contact_count : int
-        Number of dry contacts, at least 1.
-    contact_stiffness : float
-        Stiffness of all contacts together before any has slipped, N/m.
-    contact_spread : float
-        Standard deviation of the logarithm of a contact's share of the yield force.
-    force_limit : float
-        Largest load, N.
-    force_step : float
-        Largest sub-step of the force, N.
-    """
+    """Numbers that both muscles have."""
 
     contact_count: int = 40
+    """Number of dry contacts, at least 1."""
     contact_stiffness: float
+    """Stiffness of all contacts together before any has slipped, N/m."""
     contact_spread: NotNegative
+    """Standard deviation of the logarithm of a contact's share of the yield force."""
     force_limit: float
+    """Largest load, N."""
     force_step: float = 0.1
+    """Largest sub-step of the force, N."""
 
     @property
     def largest_load(self) -> float:

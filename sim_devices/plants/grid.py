@@ -60,15 +60,10 @@ class Numbers:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantParameters(Numbers):
-    """Numbers of a plant.
-
-    Attributes
-    ----------
-    step : float
-        Step of the time grid, s.
-    """
+    """Numbers of a plant."""
 
     step: float
+    """Step of the time grid, s."""
 
 
 P = TypeVar("P", bound=PlantParameters)

@@ -26,37 +26,25 @@ COMMAND_SIZE = 5
 
 @dataclass(frozen=True, kw_only=True)
 class MuscleParameters(PlantParameters):
-    """Numbers that all muscles have.
-
-    Attributes
-    ----------
-    specimen_seed : int
-        Seed of the grains or contacts. The specimen does not depend on the session's seed.
-    rest_length : float
-        Length of the unloaded muscle as made, cold or empty, m.
-    series_stiffness : float
-        Stiffness of frame and load cell in series with the muscle, N/m.
-    pretension : float
-        Load under which the muscle is first driven when it is conditioned, N.
-    step : float
-        Step of the internal time grid, s.
-    length_step : float
-        Largest sub-step of the position, m.
-    rated_voltage, maximum_voltage : float
-        Voltage to which the muscle is conditioned and highest effective voltage, V. Higher commands are refused.
-    resistance : float
-        Electrical resistance that the supply sees, ohm; constant.
-    """
+    """Numbers that all muscles have."""
 
     specimen_seed: Seed = 2017
+    """Seed of the grains or contacts. The specimen does not depend on the session's seed."""
     rest_length: float
+    """Length of the unloaded muscle as made, cold or empty, m."""
     series_stiffness: float = 20e3
+    """Stiffness of frame and load cell in series with the muscle, N/m."""
     pretension: NotNegative = 0.3
+    """Load under which the muscle is first driven when it is conditioned, N."""
     step: float = 0.1
+    """Step of the internal time grid, s."""
     length_step: float = 0.1e-3
+    """Largest sub-step of the position, m."""
     rated_voltage: float = 3.0
     maximum_voltage: float = 5.0
+    """Voltage to which the muscle is conditioned and highest effective voltage, V. Higher commands are refused."""
     resistance: float
+    """Electrical resistance that the supply sees, ohm; constant."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,34 +66,24 @@ class MuscleParameters(PlantParameters):
 
 @dataclass(frozen=True, kw_only=True)
 class HeatedParameters(MuscleParameters):
-    """Numbers of a muscle that the voltage heats.
-
-    Attributes
-    ----------
-    ambient_temperature : float
-        Mean temperature of the room, °C.
-    time_constant, fan_time_constant : float
-        Thermal time constants in still air and with the fan on, s. The fan raises the heat loss, so that the
-        steady temperature rise falls in the same ratio.
-    rise : float
-        Steady temperature rise in still air at the rated voltage, K. It goes as the voltage squared.
-    temperature_step : float
-        Largest sub-step of the temperature, K.
-    ambient_sd, ambient_time : float
-        Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default, switches it off;
-        0.3 K is sensible for dynamic tests.
-    ambient_gain : float
-        Relative change of the heating gain with the deviation of the room temperature, 1/K.
-    """
+    """Numbers of a muscle that the voltage heats."""
 
     ambient_temperature: Signed = 25.0
+    """Mean temperature of the room, °C."""
     time_constant: float
     fan_time_constant: float
+    """Thermal time constants in still air and with the fan on, s. The fan raises the heat loss, so that the steady
+    temperature rise falls in the same ratio."""
     rise: float
+    """Steady temperature rise in still air at the rated voltage, K. It goes as the voltage squared."""
     temperature_step: float = 1.0
+    """Largest sub-step of the temperature, K."""
     ambient_sd: NotNegative = 0.0
     ambient_time: float = 120.0
+    """Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default, switches it off;
+    0.3 K is sensible for dynamic tests."""
     ambient_gain: Signed = 0.004
+    """Relative change of the heating gain with the deviation of the room temperature, 1/K."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -40,73 +40,54 @@ class SMAParameters(HeatedParameters):
     The values that come from the paper are the wire's length (105 mm) and diameter, the rated voltage, the time
     constant in still air (about 5 s), the pretension and the ranges that the rest was tuned to. All others are
     assumed: the fan's time constant, 0.20 mm by 105 mm of NiTi with about 3 ohm, and 261 °C at 5 V.
-
-    Attributes
-    ----------
-    grain_count : int
-        Number of grains; at least 1.
-    austenite_finish, austenite_finish_spread : float
-        Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes
-        austenite.
-    width, width_spread : float
-        Mean and standard deviation of a grain's transformation hysteresis, K; at least 3 K each.
-    slope, slope_spread : float
-        Mean and standard deviation of the Clausius-Clapeyron slope, MPa/K.
-    unoriented_share : float
-        Share of the stress that stabilises an unoriented grain against austenite, in (0, 1].
-    detwin, detwin_spread : float
-        Mean and standard deviation of the stress that orients martensite, MPa; at least 5 MPa each.
-    orient, orient_spread : float
-        Mean and standard deviation of the stress above which a grain that cools to martensite comes out
-        oriented, MPa. Negative is a trained grain.
-    orient_correlation : float
-        Correlation of orientation and detwinning stress, in [-1, 1].
-    retwin, retwin_spread : float
-        Mean and standard deviation of the stress below which martensite loses its orientation, MPa; at
-        least 10 MPa below the detwinning stress.
-    martensite_modulus, austenite_modulus : float
-        Elastic moduli, Pa.
-    transformation_strain : float
-        Strain of a completely oriented wire.
-    expansion : float
-        Coefficient of thermal expansion, 1/K.
-    diameter : float
-        Diameter of the wire, m (paper: 0.20 mm).
-    stress_limit : float
-        Largest stress that is solved for, Pa; 600 MPa are 18.85 N. A load beyond it is refused, and
-        the force of a wire that is stretched further stays there.
-    stress_step : float
-        Largest sub-step of the stress, Pa.
     """
 
-    grain_count: int = 2000
-    austenite_finish: float = 48.0
-    austenite_finish_spread: NotNegative = 15.0
-    width: float = 11.0
-    width_spread: NotNegative = 3.0
-    slope: float = 7.0
-    slope_spread: NotNegative = 0.8
-    unoriented_share: float = 0.4
-    detwin: Signed = 110.0
-    detwin_spread: NotNegative = 60.0
-    orient: Signed = -5.0
-    orient_spread: NotNegative = 60.0
-    orient_correlation: Signed = 0.6
-    retwin: Signed = -40.0
-    retwin_spread: NotNegative = 35.0
-    martensite_modulus: float = 28e9
-    austenite_modulus: float = 55e9
-    transformation_strain: NotNegative = 0.045
-    expansion: NotNegative = 6.6e-6
     rest_length: float = 105e-3
-    diameter: float = 0.20e-3
-    stress_limit: float = 600e6
-    stress_step: float = 4e6
     length_step: float = 0.03e-3
     time_constant: float = 5.0
     fan_time_constant: float = 2.0
     rise: float = 85.0
     resistance: float = 3.05
+    grain_count: int = 2000
+    """Number of grains; at least 1."""
+    austenite_finish: float = 48.0
+    austenite_finish_spread: NotNegative = 15.0
+    """Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes austenite."""
+    width: float = 11.0
+    width_spread: NotNegative = 3.0
+    """Mean and standard deviation of a grain's transformation hysteresis, K; at least 3 K each."""
+    slope: float = 7.0
+    slope_spread: NotNegative = 0.8
+    """Mean and standard deviation of the Clausius-Clapeyron slope, MPa/K."""
+    unoriented_share: float = 0.4
+    """Share of the stress that stabilises an unoriented grain against austenite, in (0, 1]."""
+    detwin: Signed = 110.0
+    detwin_spread: NotNegative = 60.0
+    """Mean and standard deviation of the stress that orients martensite, MPa; at least 5 MPa each."""
+    orient: Signed = -5.0
+    orient_spread: NotNegative = 60.0
+    """Mean and standard deviation of the stress above which a grain that cools to martensite comes out oriented, MPa.
+    Negative is a trained grain."""
+    orient_correlation: Signed = 0.6
+    """Correlation of orientation and detwinning stress, in [-1, 1]."""
+    retwin: Signed = -40.0
+    retwin_spread: NotNegative = 35.0
+    """Mean and standard deviation of the stress below which martensite loses its orientation, MPa; at least 10 MPa
+    below the detwinning stress."""
+    martensite_modulus: float = 28e9
+    austenite_modulus: float = 55e9
+    """Elastic moduli, Pa."""
+    transformation_strain: NotNegative = 0.045
+    """Strain of a completely oriented wire."""
+    expansion: NotNegative = 6.6e-6
+    """Coefficient of thermal expansion, 1/K."""
+    diameter: float = 0.20e-3
+    """Diameter of the wire, m (paper: 0.20 mm)."""
+    stress_limit: float = 600e6
+    """Largest stress that is solved for, Pa; 600 MPa are 18.85 N. A load beyond it is refused, and the force of a
+    wire that is stretched further stays there."""
+    stress_step: float = 4e6
+    """Largest sub-step of the stress, Pa."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -29,11 +29,6 @@ class RatiometricSensor:
         Deviation of the supply of one instance from 5 V, V rms; drawn once.
     rng : numpy.random.Generator
         Source of the noise and of the error of the supply.
-
-    Attributes
-    ----------
-    supply_volts : float
-        Voltage of the supply in V; for faults and drift.
     """
 
     position: Callable[[], float]
@@ -44,6 +39,7 @@ class RatiometricSensor:
     _: KW_ONLY
     rng: np.random.Generator
     supply_volts: float = field(init=False)
+    """Voltage of the supply in V; for faults and drift."""
 
     def __post_init__(self) -> None:
         self.supply_volts = 5.0 + self.supply_error * self.rng.standard_normal()

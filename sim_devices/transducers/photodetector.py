@@ -64,18 +64,12 @@ class TwoCurrentPSD:
     rng : numpy.random.Generator
         Source of the noise.
 
-    Attributes
-    ----------
-    light : float
-        Share of the light that reaches the detector, 0 to 1; for faults and drift.
-
     Notes
     -----
     A spot beyond the end of the detector gives no current at all. The amplifiers saturate at 0 and 10 V.
     """
 
     SATURATION: ClassVar[float] = 10.0
-
     deflection: Callable[[], float]
     metres_per_metre: float = 185.0
     psd_length: float = 0.037
@@ -84,6 +78,7 @@ class TwoCurrentPSD:
     _: KW_ONLY
     rng: np.random.Generator
     light: float = field(default=1.0, init=False)
+    """Share of the light that reaches the detector, 0 to 1; for faults and drift."""
 
     def first(self) -> float:
         """Return the voltage in V of current 1 at this instant."""
