@@ -85,20 +85,6 @@ class TestSpecimen:
         wire = make()
         assert 0.5 < wire.oriented_fraction < wire.martensite_fraction < 1.0
 
-    @pytest.mark.parametrize(
-        "wrong",
-        [
-            {"grain_count": 0},
-            {"unoriented_share": 1.5},
-            {"orient_correlation": -1.1},
-            {"ambient_sd": -0.1},
-            {"martensite_modulus": 60e9},
-        ],
-    )
-    def test_wrong_parameters_are_refused(self, wrong):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            SMAParameters(**wrong)
-
 
 class TestRanges:
     def test_force_at_constant_length(self):

@@ -70,23 +70,6 @@ class TestSpecimen:
         other = relay_thresholds(dataclasses.replace(QUIET, specimen_seed=7))
         assert not np.array_equal(other[0], relay_thresholds(QUIET)[0])
 
-    @pytest.mark.parametrize(
-        "wrong",
-        [
-            {"relay_count": 0},
-            {"step": math.nan},
-            {"loop_damping": 1.0},
-            {"correlation": -1.0},
-            {"minor_share": 1.5},
-            {"wander_sd": -0.1},
-            {"maximum_current": 7.0},
-            {"ambient_temperature": math.nan},
-        ],
-    )
-    def test_wrong_parameters_are_refused(self, wrong):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            VO2Parameters(**wrong)
-
     def test_parameters_are_frozen(self):
         with pytest.raises(dataclasses.FrozenInstanceError):
             QUIET.coupling = 2.0
