@@ -125,8 +125,6 @@ def balance(load: ShaftLoad, near: float, reach: float, drive: Callable[[float],
 
     Parameters
     ----------
-    load : ShaftLoad
-        The load.
     near : float
         Angle where the shaft is, rad.
     reach : float

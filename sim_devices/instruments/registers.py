@@ -81,10 +81,7 @@ class RegisterInstrument(ABC):
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return `count` registers from `address` on, of one instant; reading half a value is allowed.
 
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be read.
+        Raises `RegisterError` if one of them does not exist or cannot be read.
         """
         with self._request():
             values: dict[int, tuple[int, ...]] = {}
@@ -101,11 +98,8 @@ class RegisterInstrument(ABC):
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values.
 
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be written, or if a value is not allowed; the values
-            before it have been written then.
+        Raises `RegisterError` if one of them does not exist or cannot be written, or if a value is not allowed; the
+        values before it have been written then.
         """
         with self._request():
             position = 0

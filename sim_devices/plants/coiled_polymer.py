@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, Record, coefficients
-from sim_devices.plants.grid import NotNegative, Signed
+from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, coefficients
+from sim_devices.plants.grid import NotNegative, Record, Signed
 from sim_devices.plants.muscle import MILLIMETRE, HeatedParameters
 
 
@@ -97,10 +97,8 @@ class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
 
     Parameters
     ----------
-    parameters : CoiledPolymerParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from it.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
 
     def __init__(self, parameters: CoiledPolymerParameters, rng: np.random.Generator) -> None:

@@ -332,11 +332,6 @@ class FrictionParameters(MuscleParameters):
 def contact_table(parameters: FrictionParameters) -> Floats:
     """Make the specimen: the properties of its contacts.
 
-    Parameters
-    ----------
-    parameters : FrictionParameters
-        Parameters of the population.
-
     Returns
     -------
     ndarray
@@ -356,8 +351,6 @@ def coefficients(parameters: FrictionParameters, deviation: float, time: float, 
 
     Parameters
     ----------
-    parameters : FrictionParameters
-        The numbers.
     deviation, time : float
         Standard deviation (bar or K) and correlation time (s) of supply or room.
     **own : float
@@ -400,14 +393,10 @@ class FrictionMuscle(Muscle[F]):
 
     Parameters
     ----------
-    parameters : FrictionParameters
-        The numbers.
     coefficients : record
         Coefficients of the compiled loops.
     cold, rated : float
         Drive at 0 V and at the rated voltage: bar or °C.
-    rng : numpy.random.Generator
-        The session's randomness. The plant spawns its own generator from it and never draws from `rng` itself.
     """
 
     def __init__(

@@ -41,10 +41,7 @@ Record = Any
 class Numbers:
     """Numbers that are finite, and positive unless their type says otherwise.
 
-    Raises
-    ------
-    ValueError
-        If a number is not allowed.
+    Raises `ValueError` if a number is not allowed.
     """
 
     def __post_init__(self) -> None:
@@ -74,8 +71,6 @@ class GridPlant(ABC, Generic[P]):
 
     Parameters
     ----------
-    parameters : PlantParameters
-        The numbers of the plant.
     rng : numpy.random.Generator
         The session's randomness. The plant spawns its own generator from it and never draws from `rng` itself, so
         that other users of `rng` do not disturb the trajectory.

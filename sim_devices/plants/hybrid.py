@@ -71,11 +71,8 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
     Parameters
     ----------
-    parameters : HybridParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from it
-        and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
 
     def __init__(self, parameters: HybridParameters, rng: np.random.Generator) -> None:
@@ -255,13 +252,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
 
 class PeltierTerminals:
-    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them.
-
-    Parameters
-    ----------
-    plant : HybridCantilever
-        The plant.
-    """
+    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them."""
 
     def __init__(self, plant: HybridCantilever) -> None:
         self._plant = plant

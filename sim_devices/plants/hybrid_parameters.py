@@ -67,11 +67,6 @@ class Bimorph(Numbers):
 def piezo_sensitivity(bimorph: Bimorph) -> float:
     """Compute the tip deflection per volt (Rakotondrabe and Ivan, eq. 10, after Smits and Choi 1992).
 
-    Parameters
-    ----------
-    bimorph : Bimorph
-        The strip.
-
     Returns
     -------
     float
@@ -85,11 +80,6 @@ def thermal_sensitivity(bimorph: Bimorph) -> float:
 
     Rakotondrabe and Ivan, eq. 10, with the thickness of the piezo layer that the printed coefficient lacks:
     an electric field is a voltage over that thickness, an expansion is not.
-
-    Parameters
-    ----------
-    bimorph : Bimorph
-        The strip.
 
     Returns
     -------
@@ -215,11 +205,6 @@ class HybridParameters(CooledParameters):
 
 def piezo_dynamics(parameters: HybridParameters) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Split D(s)/D(0) together with the creep into modes.
-
-    Parameters
-    ----------
-    parameters : HybridParameters
-        The numbers.
 
     Returns
     -------

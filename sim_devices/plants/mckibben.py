@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, Record, coefficients
-from sim_devices.plants.grid import NotNegative
+from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, coefficients
+from sim_devices.plants.grid import NotNegative, Record
 from sim_devices.plants.muscle import MILLIMETRE
 
 _BAR = 1e5
@@ -118,10 +118,8 @@ class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
 
     Parameters
     ----------
-    parameters : McKibbenParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the regulator's supply. The plant spawns its own generator from it.
+        The session's randomness: the regulator's supply; see `GridPlant`.
     """
 
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:

@@ -108,11 +108,6 @@ class Muscle(GridPlant[M]):
     once: first the load or the position is moved there, at the pressure or temperature of the step before, then
     the muscle is inflated or heated. So neither the number nor the size of the calls of `advance` changes the
     trajectory, the noise included. There is no sensor noise here and no protection either.
-
-    Parameters
-    ----------
-    parameters, rng
-        See `GridPlant`.
     """
 
     def __init__(self, parameters: M, rng: np.random.Generator) -> None:

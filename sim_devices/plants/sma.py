@@ -121,11 +121,6 @@ class SMAParameters(HeatedParameters):
 def grain_table(parameters: SMAParameters) -> Floats:
     """Make the specimen: the properties of its grains.
 
-    Parameters
-    ----------
-    parameters : SMAParameters
-        Parameters of the population.
-
     Returns
     -------
     ndarray
@@ -168,11 +163,8 @@ class SMAWire(Muscle[SMAParameters]):
 
     Parameters
     ----------
-    parameters : SMAParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from
-        it and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
 
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:

@@ -130,11 +130,6 @@ def relay_thresholds(parameters: VO2Parameters) -> tuple[Floats, Floats]:
     The relays are a low-discrepancy sample of the two populations, shifted by the specimen's seed:
     a smooth density without the graininess of a random one.
 
-    Parameters
-    ----------
-    parameters : VO2Parameters
-        Parameters of the populations.
-
     Returns
     -------
     tuple of ndarray
@@ -186,11 +181,8 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
 
     Parameters
     ----------
-    parameters : VO2Parameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: wander and drift. The plant spawns its own generator from it and
-        never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: wander and drift; see `GridPlant`.
     initial_temperature : float, optional
         Temperature of the plate at the start, °C; the room's by default. The film arrives there from
         negative saturation (cold), the heat sink is at room temperature, the output is off.
