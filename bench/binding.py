@@ -265,10 +265,7 @@ def check_roles(
 ) -> None:
     """Check that each role is bound to devices and signals that the rig has, in the unit that it says.
 
-    Raises
-    ------
-    ConfigurationError
-        If one is not; names file, key and what is allowed.
+    Raises ConfigurationError if one is not; names file, key and what is allowed.
     """
     for name, table in roles.items():
         if table.device:

@@ -52,10 +52,7 @@ class ControllerSetup:
     def inverse(self) -> Inverse[Any]:
         """Return the inverse of a model with memory.
 
-        Raises
-        ------
-        DataError
-            If the model has no memory.
+        Raises DataError if the model has no memory.
         """
         if self.model.operator.memoryless:
             raise DataError(

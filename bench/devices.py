@@ -197,10 +197,7 @@ class Status:
     def wait(self) -> None:
         """Let time pass until the change is complete.
 
-        Raises
-        ------
-        DeviceError
-            If the change failed or took longer than its timeout.
+        Raises DeviceError if the change failed or took longer than its timeout.
         """
         while not self.update():
             self._clock.sleep(self._interval)
@@ -291,10 +288,7 @@ class Device(ABC):
     def measure(self) -> dict[str, float]:
         """Measure every signal as well as the instrument can; values by signal name.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument reports a fault, is out of its range, or does not answer.
+        Raises DeviceError if the instrument reports a fault, is out of its range, or does not answer.
         """
 
     def glance(self) -> dict[str, float]:
@@ -328,10 +322,7 @@ class Device(ABC):
     def safe(self) -> None:
         """Bring the device into its safe state; what that is, each role says.
 
-        Raises
-        ------
-        DeviceError
-            If the safe state could not be confirmed, after everything was tried.
+        Raises DeviceError if the safe state could not be confirmed, after everything was tried.
         """
 
     @abstractmethod

@@ -147,13 +147,7 @@ class Engine:
         }
 
     def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
-        """Carry a protocol out, from its first step to the safe state.
-
-        Returns
-        -------
-        Outcome
-            How it ended; exceptions end up in its `error`.
-        """
+        """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
         start = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
         error: Exception | None = None
@@ -547,10 +541,8 @@ class Engine:
 def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan) -> None:
     """Check the plan of a dry run against the rig's devices and limits.
 
-    Raises
-    ------
-    ConfigurationError
-        If the rig lacks something, or a set-point would leave a device's limits; nothing has moved.
+    Raises ConfigurationError if the rig lacks something, or a set-point would leave a device's limits; nothing has
+    moved.
     """
     rig.check_needs(definition.name, definition.names)
     rig.check_needs(definition.name, sorted(expected.watched))

@@ -63,10 +63,7 @@ class ModelFile:
     def operator(self) -> Operator[Any]:
         """The model, if it is one of one input and one output.
 
-        Raises
-        ------
-        DataError
-            If it is another.
+        Raises DataError if it is another.
         """
         if not isinstance(self.model, Operator):
             raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one of one input")
@@ -87,10 +84,8 @@ class ModelFile:
     def save(self, path: str | Path) -> None:
         """Write the file.
 
-        Raises
-        ------
-        DataError
-            If it cannot be written, or could not be loaded again because the class of the model is not registered.
+        Raises DataError if it cannot be written, or could not be loaded again because the class of the model is not
+        registered.
         """
         content = self.to_json()
         text = json.dumps(content, indent=1, ensure_ascii=False)
@@ -151,10 +146,7 @@ def is_model(content: object) -> bool:
 def parse_model(content: object, source: str) -> ModelFile:
     """Make a model of the content of its file.
 
-    Raises
-    ------
-    DataError
-        If it is not one, is damaged, or its version or kind is unknown; names `source`.
+    Raises DataError if it is not one, is damaged, or its version or kind is unknown; names `source`.
     """
     if not isinstance(content, dict) or not is_model(content):
         raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")

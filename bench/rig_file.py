@@ -186,13 +186,8 @@ class RigFile:
 def packaged_rigs() -> dict[str, registry.Entry]:
     """Return the rigs of all installed packages by name, each with the entry that brings it.
 
-    An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is
-    left out.
-
-    Raises
-    ------
-    ConfigurationError
-        If two packages bring a rig of the same name.
+    An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is left
+    out. Raises ConfigurationError if two packages bring a rig of the same name.
     """
     found: dict[str, registry.Entry] = {}
     for entry in registry.entries("rigs").values():

@@ -330,10 +330,7 @@ class GeneralActuator(GeneralSensor, Actuator):
     def send(self, value: float) -> Status:
         """Send a set-point that is within the limits, and switch the output on if it is off.
 
-        Returns
-        -------
-        Status
-            Completes when the device has arrived; `Status.completed` where it does so at once.
+        The status completes when the device has arrived; return `Status.completed` where it does so at once.
         """
 
     @abstractmethod

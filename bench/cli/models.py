@@ -15,9 +15,19 @@ from bench.errors import ConfigurationError
 app = typer.Typer()
 
 
+DataArgument = Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
+ContinueMemory = Annotated[
+    bool,
+    typer.Option(
+        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+    ),
+]
+
+
 @app.command("identify")
 def identify_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
     model: Annotated[str, typer.Option(metavar="NAME", help="Model to fit; `bench list` shows the names.")],
@@ -105,19 +115,14 @@ def identify_(
 
 @app.command("predict")
 def predict_(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
+    model_path: ModelArgument,
+    file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for input and prediction.")],
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
@@ -265,7 +270,7 @@ class PolicyOption(Enum):
 
 @app.command()
 def invert(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    model_path: ModelArgument,
     file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
@@ -273,12 +278,7 @@ def invert(
         PolicyOption,
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Compute the set-points that bring a model's output to one target after another.

@@ -45,10 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Find the devices.
 
-    Raises
-    ------
-    pytest.UsageError
-        If an option is missing, the rig cannot be read, or it has no such device.
+    Raises pytest.UsageError if an option is missing, the rig cannot be read, or it has no such device.
     """
     device, rig, set_points = (session.config.getoption(name) for name in ("device", "rig", "set_points"))
     if device is None or rig is None:

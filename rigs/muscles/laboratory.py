@@ -215,10 +215,7 @@ class MuscleLaboratory(EmulatedLaboratory):
     def operate(self, task: str, value: float) -> None:
         """Hang a load of `value` N on the muscle, or fasten its end to the stage.
 
-        Raises
-        ------
-        ConfigurationError
-            If it is another task, or the muscle does not bear the load.
+        Raises ConfigurationError if it is another task, or the muscle does not bear the load.
         """
         if task not in (LOAD, STAGE):
             raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
