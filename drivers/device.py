@@ -56,14 +56,8 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
     settings : DriverSettings
         The device's part of the rig file; each driver has its own, as `Settings`.
-    clock : Clock
-        The clock of the run.
-    line : Line
-        The open line to the instrument.
     """
 
     _identity: Identity

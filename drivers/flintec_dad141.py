@@ -388,10 +388,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def tare(self) -> None:
         """Make the present force read zero from now on, as soon as the instrument finds the signal still.
 
-        Raises
-        ------
-        DeviceError
-            If the signal is out of range or does not become still, or the instrument does not take the tare.
+        Raises `DeviceError` if the signal is out of range or does not become still, or the instrument does not take
+        the tare.
         """
         end = self._clock.now() + self._settings.still_timeout
         while not self._checked_block().qualifier & _NO_MOTION:
@@ -408,10 +406,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def clear_tare(self) -> None:
         """Read gross force again.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument keeps its tare.
+        Raises `DeviceError` if the instrument keeps its tare.
         """
         self._line.command(_RESET_TARE)
         self._await_tare(False)

@@ -287,10 +287,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         The torque is off then and the number of turns is lost: the angle is that within one turn, and a drum is off
         by whole circumferences.
 
-        Raises
-        ------
-        DeviceError
-            If the servo does not come back within 5 s, or comes back with an error.
+        Raises `DeviceError` if the servo does not come back within 5 s, or comes back with an error.
         """
         self._reboot(_START_TIMEOUT)
         self._start()

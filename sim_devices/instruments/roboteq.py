@@ -120,19 +120,13 @@ Kind = Literal["S8", "U8", "S16", "U16", "S32", "U32", "text"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of the object dictionary.
-
-    Attributes
-    ----------
-    kind : {"S8", "U8", "S16", "U16", "S32", "U32", "text"}
-        Type of the value.
-    readable, writable : bool
-        Which ways it can be transferred.
-    """
+    """One row of the object dictionary."""
 
     kind: Kind
+    """Type of the value."""
     readable: bool = True
     writable: bool = False
+    """Which ways it can be transferred."""
 
 
 def _dictionary() -> dict[tuple[int, int], Entry]:
@@ -182,10 +176,6 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
     Parameters
     ----------
-    name, world
-        See `EmulatedDevice`.
-    load : HeatingLoad
-        The heated load.
     output : {"average", "rms"}
         Whether an LC filter is between output and load, so that it sees the average, or none.
     voltage_limits : tuple of float
@@ -293,10 +283,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def entry(self, index: int, sub: int) -> Entry:
         """Get a row of the object dictionary.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object or no such subindex of it.
+        Raises `RequestRefusedError` if there is no such object or no such subindex of it.
         """
         row = DICTIONARY.get((index, sub))
         if row is None:
@@ -306,10 +293,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def read_object(self, index: int, sub: int = 0) -> int | str:
         """Return the value of an object, in the unit of the manual.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object, or it can only be written.
+        Raises `RequestRefusedError` if there is no such object, or it can only be written.
         """
         with self._world.lock:
             row = self.entry(index, sub)
@@ -321,10 +305,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def write_object(self, index: int, value: int, sub: int = 0) -> None:
         """Set an object.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object, it can only be read, or the value is out of its range.
+        Raises `RequestRefusedError` if there is no such object, it can only be read, or the value is out of its
+        range.
         """
         with self._world.lock:
             row = self.entry(index, sub)

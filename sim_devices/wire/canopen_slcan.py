@@ -47,13 +47,7 @@ _SEGMENT = 7  # bytes in a segment
 
 
 class CanopenSlcanServer:
-    """The serial side of an slcan adapter with one emulated controller on its bus.
-
-    Parameters
-    ----------
-    device : EmulatedRoboteq
-        The device that acts on the requests.
-    """
+    """The serial side of an slcan adapter with one emulated controller on its bus."""
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
@@ -136,13 +130,7 @@ class CanopenSlcanServer:
 
 
 class SdoServer:
-    """The service data objects of one node (CiA 301).
-
-    Parameters
-    ----------
-    device : EmulatedRoboteq
-        Whose objects they are.
-    """
+    """The service data objects of one node (CiA 301)."""
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device

@@ -40,11 +40,6 @@ class MeComServer:
 
     Answers `?VR`, `VS`, `?VL`, `?VM`, `?IF`, `ES`, `RS` and `CS`; a change of speed is acknowledged and has
     no effect, as an emulated line has no speed of its own.
-
-    Parameters
-    ----------
-    device : EmulatedTEC
-        The device that acts on the requests.
     """
 
     def __init__(self, device: EmulatedTEC) -> None:

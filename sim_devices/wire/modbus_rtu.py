@@ -64,8 +64,6 @@ class ModbusRtuServer:
 
     Parameters
     ----------
-    bank : RegisterBank
-        The instrument.
     address : int
         Address of the instrument on its line, 1 to 247.
 

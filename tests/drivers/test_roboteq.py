@@ -110,19 +110,6 @@ class Script:
         ]
 
 
-@pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
-def script(clock):
-    script = Script()
-    register("scripted-supply", script, clock)
-    yield script
-    unregister("scripted-supply")
-
-
 def make_settings(**changes):
     keys = {"port": PORT, "output": "average", "voltage_limits": (0, 12), "heartbeat": 60}
     return RoboteqSupply.Settings(**keys | changes)
