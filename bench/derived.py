@@ -7,8 +7,8 @@ A rig file asks for them by tables::
     constants = { gain = "2.5e-3 1/V" }
     unit = "1"
 
-    [derived.curvature]
-    kind = "beam-curvature"             # registered in `bench.derived_signals`, or module:Class
+    [derived.bending]
+    kind = "beam_bending:Bending"       # module:Class, or registered in `bench.derived_signals`
     source = "spot_position"
     length = 300e-6
 
@@ -23,7 +23,7 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,8 @@ _OPERATORS = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
+    # On whole numbers Python's own power may take for ever, on negative ones it may be complex.
+    ast.Pow: math.pow,
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
@@ -51,16 +52,17 @@ _FUNCTIONS: dict[str, Callable[..., float]] = {
     "cos": math.cos,
     "tan": math.tan,
     "atan": math.atan,
-    "min": min,
-    "max": max,
+    "min": lambda *values: min(values),
+    "max": lambda *values: max(values),
 }
 _ON_QUANTITIES: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tan")},
     "atan": np.arctan,
-    "min": np.minimum,
-    "max": np.maximum,
+    "min": lambda first, *others: reduce(np.minimum, others, first),
+    "max": lambda first, *others: reduce(np.maximum, others, first),
 }
 """The same functions on quantities with units."""
+_NODES = (ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, *_OPERATORS)
 
 
 @dataclass(frozen=True)
@@ -131,17 +133,33 @@ class Expression(DerivedSignal):
     @field_validator("expression")
     @classmethod
     def _can_be_parsed(cls, text: str) -> str:
-        # The parser passes on whatever Python's own grammar objects to.
+        # The parser passes on every error of Python's own grammar.
         try:
-            SimpleEval().parse(text)
+            tree = ast.parse(text.strip(), mode="eval")
         except Exception as error:
             raise ValueError(f"is not an arithmetic expression: {error}") from None
+        functions = set()
+        for node in ast.walk(tree):
+            part = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
+            is_number = not isinstance(node, ast.Constant) or type(node.value) in (int, float)
+            if not (isinstance(node, _NODES) and is_number):
+                raise ValueError(f"{part!r} is no arithmetic; allowed are + - * / **, numbers, names and functions")
+            if isinstance(node, ast.Call):
+                if not isinstance(node.func, ast.Name) or node.func.id not in _FUNCTIONS or node.keywords:
+                    raise ValueError(f"{part!r} is none of the functions {', '.join(_FUNCTIONS)}")
+                functions.add(node.func)
+            elif isinstance(node, ast.Name) and node.id in _FUNCTIONS and node not in functions:
+                raise ValueError(f"{part!r} is a function and needs its arguments in parentheses")
         return text
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Signals that the expression names."""
-        names = [node.id for node in ast.walk(SimpleEval().parse(self.expression)) if isinstance(node, ast.Name)]
+        names = [
+            node.id
+            for node in ast.walk(ast.parse(self.expression.strip(), mode="eval"))
+            if isinstance(node, ast.Name)
+        ]
         return tuple(name for name in dict.fromkeys(names) if name not in self.constants and name not in _FUNCTIONS)
 
     def bind(self, name: str, units: Mapping[str, str]) -> Derived:
@@ -149,15 +167,17 @@ class Expression(DerivedSignal):
         constants = {key: _quantity(f"constants.{key}", str(value)) for key, value in self.constants.items()}
         quantities = constants | {source: _quantity(source, f"1 {units[source]}") for source in self.sources}
         wanted = _quantity("unit", f"1 {self.unit}")
-        check = SimpleEval(operators=_OPERATORS, functions=_ON_QUANTITIES, names=quantities)
-        # Only the units matter here; the library raises many kinds of errors.
+        operators = {**_OPERATORS, ast.Pow: _power_of_quantity}
+        check = SimpleEval(operators=operators, functions=_ON_QUANTITIES, names=quantities)
+        # Only the units matter here, so a value may be infinite; the library raises many kinds of errors.
         try:
-            found = _units().Quantity(check.eval(self.expression))
+            with np.errstate(all="ignore"):
+                found = _units().Quantity(check.eval(self.expression))
         except Exception as error:
             raise ValueError(f"expression = {self.expression!r}: {error}") from None
         if not found.is_compatible_with(wanted):
             raise ValueError(f"expression = {self.expression!r} is in {found.units:~P}, not in unit = {self.unit!r}")
-        # Everything is computed in SI base units, whatever the sources are in.
+        # Everything is computed in SI base units, independent of the units of the sources.
         factors = {key: float(_in_base_units(quantity)) for key, quantity in quantities.items()}
         scale = 1.0 / float(_in_base_units(wanted))
         evaluator = SimpleEval(operators=_OPERATORS, functions=_FUNCTIONS)
@@ -176,6 +196,14 @@ class Expression(DerivedSignal):
         return Derived(Signal(name, self.unit, description, self.precision), sources, compute)
 
 
+def _power_of_quantity(base: Any, exponent: Any) -> Any:  # noqa: ANN401 - quantities or numbers
+    if isinstance(base, int | float):
+        base = np.float64(base)
+    elif not base.dimensionless and not isinstance(exponent, int | float):
+        raise ValueError(f"a power of {base.units:~P} needs a number as its exponent")
+    return base**exponent
+
+
 @cache
 def _units() -> Any:  # noqa: ANN401 - the library's registry has no useful type
     # It takes a second to import, which only rigs with expressions should pay for.
@@ -187,9 +215,14 @@ def _units() -> Any:  # noqa: ANN401 - the library's registry has no useful type
 def _quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the library's
     number, _, unit = text.strip().partition(" ")
     try:
-        return _units().Quantity(float(number), unit.replace("°C", "K") or "1")
+        # Numpy's numbers divide by zero without an exception.
+        quantity = _units().Quantity(np.float64(number), unit.replace("°C", "K") or "1")
+        origin = _units().Quantity(0.0, quantity.units).to_base_units().magnitude
     except Exception as error:
         raise ValueError(f"{key} = {text!r}: expected a number and a unit, such as '300e-6 m': {error}") from None
+    if not np.isfinite(quantity.magnitude) or origin != 0.0:
+        raise ValueError(f"{key} = {text!r}: expected a finite number and a unit whose scale begins at 0")
+    return quantity
 
 
 def _in_base_units(quantity: Any) -> float:  # noqa: ANN401 - a quantity of the library's

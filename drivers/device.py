@@ -1,4 +1,4 @@
-"""Devices that own their line: opening it, checking which instrument answers, and releasing it."""
+"""Devices that own their line: opening it, checking the identity of the instrument, and releasing it."""
 
 from __future__ import annotations
 

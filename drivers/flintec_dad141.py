@@ -423,7 +423,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 known = " or ".join(str(each) for each in settings.device_ids)
                 raise self._wrong(
                     swapped(words, lambda order: _integer(order) in settings.device_ids)
-                    or f"is no DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or "
+                    or f"is not a DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or "
                     "add the number to `device_ids` if it is one"
                 )
             high, low = line.read(_FIRMWARE, 2)
@@ -435,7 +435,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             self._check_order()
         except _RefusedError as error:
             reason = str(error).removeprefix(f"{self.name}: ")
-            raise self._wrong(f"is no DAD 141.1: {reason}; check the address") from error
+            raise self._wrong(f"is not a DAD 141.1: {reason}; check the address") from error
         minor, major = low >> 8, low & 0xFF
         return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
 
@@ -498,7 +498,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             )
         if not (math.isfinite(block.gross) and math.isfinite(block.net)):
             raise DeviceError(
-                self.name, f"sent a weight that is no number (gross {block.gross}, net {block.net}); check its set-up"
+                self.name,
+                f"sent a weight that is not finite (gross {block.gross}, net {block.net}); check its set-up",
             )
         return block
 

@@ -1,4 +1,4 @@
-"""The Dynamixel MX-28 with Protocol 2.0 firmware (39 and newer): what its uses as a servo and with a drum share.
+"""The Dynamixel MX-28 with Protocol 2.0 firmware (39 and newer): the common base of servo and drum.
 
 Source: ROBOTIS e-Manual, MX-28(2.0) (control table, units, hardware errors, bus watchdog).
 

@@ -183,11 +183,11 @@ class LabJackT7:
             raise
         except DeviceError as error:
             reason = str(error).removeprefix(f"{self._name}: ")
-            raise self._wrong(f"is no LabJack T-series: register TEST gave {reason}") from error
+            raise self._wrong(f"is not a LabJack T-series: register TEST gave {reason}") from error
         if words != _TEST_WORDS:
             raise self._wrong(
                 swapped(words, lambda order: list(order) == _TEST_WORDS)
-                or f"is no LabJack T-series: register TEST is 0x{words[0]:04X}{words[1]:04X}, not 0x00112233"
+                or f"is not a LabJack T-series: register TEST is 0x{words[0]:04X}{words[1]:04X}, not 0x00112233"
             )
         (value,) = self.read(TEST_FLOAT32)
         if value != _TEST_FLOAT:

@@ -11,7 +11,7 @@ Assumptions, where these say nothing:
   times that the manual gives for each setting. Setting 0, the anti-aliasing filter of 17 Hz alone, is emulated
   in the same way, although it falls by 60 dB a decade. Filter mode 1 (FIR) is stored and changes nothing.
 - The noise of amplifier and cell is white before the filter.
-- Conversions come when somebody asks, not 600 times a second; between two of them the force ran straight.
+- Conversions are made on request, not 600 times a second; between two of them the force is interpolated linearly.
 - Integer weights are the displayed digits without the decimal point. The ADC value is the filtered signal with
   24 bits.
 - The range bits say that the gross weight is beyond the largest or the smallest value to be displayed; the

@@ -13,14 +13,14 @@ Assumptions, where the manuals are silent or were not at hand:
 
 - Only runtime commands (objects 0x2000 to 0x20FF) feed the watchdog: the user manual says so of the serial
   commands with `!`, of which these objects are the CANopen form. Queries do not.
-- After the watchdog has expired, the first command of the channel that is not 0 resumes the power of before,
+- After the watchdog has expired, the first command of the channel that is not 0 resumes the previous power,
   and its own value counts only when it is sent again. This is the worst reading of "motor operation will
   resume at whichever speed motors were running prior"; a command of 0 resumes nothing.
 - The power follows the command at once (a real device has a ramp), and is 0 as long as a fault stands.
 - The amps limit acts when the power is applied, by scaling it down, and holds until it is applied anew.
 - A command beyond ±1000 ‰ is refused rather than clipped.
 - The device starts its node by itself (autostart); a reset by NMT clears command and emergency stop.
-- Flags have 16 bits (0x2111, 0x2112, as the manual has it; the data sheet says 8) and 32 bits (0x2122).
+- Flags have 16 bits (0x2111, 0x2112, according to the manual; the data sheet says 8) and 32 bits (0x2122).
 - The wording of device name, hardware and software version.
 
 Kept in the dictionary without effect: the consumer heartbeat times (0x1016).

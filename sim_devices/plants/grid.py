@@ -1,4 +1,4 @@
-"""Plants on a fixed time grid, whose answers do not depend on how time is cut into calls."""
+"""Plants on a fixed time grid, whose results do not depend on how calls divide the time."""
 
 from __future__ import annotations
 

@@ -6,11 +6,11 @@ the channel, `L` opens it for listening, `Sn` selects the bit rate; `t` and `T` 
 a 29-bit identifier, `r` and `R` remote frames. Closing a closed channel, opening an open one and empty lines are
 obeyed, as python-can sends all of these.
 
-The node serves SDO as CiA 301 has it: expedited download and upload, segmented upload of texts, aborts; network
+The node serves SDO as in CiA 301: expedited download and upload, segmented upload of texts, aborts; network
 management commands and its heartbeat. It takes the simplified command bytes of Roboteq CANBus Networking Manual
 V2.0, whose bits e and s are 0, as well, and answers them by the standard ones.
 
-Assumptions: a frame that is sent at another bit rate than the bus has is lost without a word; segmented and
+Assumptions: a frame that is sent at another bit rate than that of the bus is lost without an error; segmented and
 block downloads are refused; a remote frame is not answered.
 """
 

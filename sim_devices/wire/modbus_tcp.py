@@ -2,7 +2,7 @@
 
 A small server of our own rather than pymodbus's, which was tried in its version 3.16: of several requests in
 one segment it answers the first only, and after a frame with a foreign protocol identifier it keeps waiting
-with the bytes in its buffer, so that the client is neither served again nor told. It also shares its framing
+with the bytes in its buffer, so that the client is no longer served and gets no error. It also shares its framing
 with the client that the drivers use, where a misunderstanding would hide on both ends of the wire. A round
 trip takes 0.03 to 0.1 ms, no more than with that server. One thread serves all clients in turn: no event
 loop, nothing to leak.

@@ -410,7 +410,7 @@ def test_connecting_under_torque_switches_it_off(bench):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pty")
-def test_over_a_pty_in_the_time_of_the_room(pseudo_terminal):
+def test_over_a_pty_in_wall_clock_time(pseudo_terminal):
     clock = WallClock()
     instrument = EmulatedMX28("servo", World(Pendulum(), clock))
     with pseudo_terminal(Dynamixel2Server([instrument])) as path:

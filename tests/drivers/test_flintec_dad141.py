@@ -307,7 +307,7 @@ def only(register: int, words: list[int]) -> Callable[[int, list[int]], list[int
     [
         (lambda _, words: words[::-1], "words of a value in swapped order"),
         (lambda _, words: bytes_swapped(words), "bytes of a word in swapped order"),
-        (only(0x202C, [0, 7210]), "is no DAD 141.1: its identity is 7210, not 1410 or 5136; .*device_ids"),
+        (only(0x202C, [0, 7210]), "is not a DAD 141.1: its identity is 7210, not 1410 or 5136; .*device_ids"),
         (only(0x202E, [0x0A01, 0]), "0x0A010000 for its firmware"),
         (only(0x202E, [0, 0]), "0x00000000 for its firmware"),
         (only(0x2020, [12000, 0]), "same weight as 12 and, as an integer, 786432000"),
@@ -328,7 +328,9 @@ def test_a_device_without_these_registers_is_refused(bench):
         raise RegisterError(2, "not here")
 
     bench.bank.alter = refuse
-    with pytest.raises(DeviceConnectionError, match=r"is no DAD 141\.1: Modbus exception 2 \(illegal data address\)"):
+    with pytest.raises(
+        DeviceConnectionError, match=r"is not a DAD 141\.1: Modbus exception 2 \(illegal data address\)"
+    ):
         bench.cell()
 
 
@@ -555,7 +557,7 @@ def test_a_weight_that_is_no_number(bench, position, value):
     words[position : position + 2] = struct.unpack(">2H", struct.pack(">f", value))
     bench.bank.alter = only(0x3500, words)
     for take in (cell.measure, cell.glance, cell.tare):
-        with pytest.raises(DeviceError, match="no number"):
+        with pytest.raises(DeviceError, match="not finite"):
             take()
 
 

@@ -566,7 +566,7 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
     [
         (lambda _, words: words[::-1], "swapped order"),
         (lambda _, words: [(w & 0xFF) << 8 | w >> 8 for w in words], "bytes of a word in swapped"),
-        (lambda _, words: [0] * len(words), "no LabJack T-series: register TEST is 0x00000000"),
+        (lambda _, words: [0] * len(words), "is not a LabJack T-series: register TEST is 0x00000000"),
         (lambda address, words: [0] * len(words) if address == 55124 else words, "TEST_FLOAT32 is 0"),
         (lambda address, words: [0x4080, 0] if address == 60000 else words, "LabJack T4, not a T7"),
         (lambda address, words: [0x4110, 0] if address == 60000 else words, "another product.*is 9"),
@@ -587,7 +587,7 @@ def test_a_device_without_test_registers_is_refused(bench):
 
     with (
         ModbusTcpServer(Altered(bench.t7, refuse)) as server,
-        pytest.raises(DeviceConnectionError, match=r"no LabJack T-series.*exception 2"),
+        pytest.raises(DeviceConnectionError, match=r"is not a LabJack T-series.*exception 2"),
     ):
         T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
 

@@ -296,7 +296,7 @@ def test_a_long_silence_costs_no_more_than_a_short_one(setting):
     assert cell.load.splits < 80
 
 
-def test_on_the_clock_of_the_room_it_costs_no_more():
+def test_on_the_wall_clock_it_costs_no_more():
     cell = Cell(clock=WallClock())
     for _ in range(20):
         cell.clock.sleep(0.01)
