@@ -115,11 +115,6 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         Temperature around it, °C.
     rng : numpy.random.Generator, optional
         Noise of the encoder; without it the readings are free of noise.
-
-    Attributes
-    ----------
-    eeprom_writes : int
-        How many items were written to the EEPROM, which wears it.
     """
 
     def __init__(
@@ -146,7 +141,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._readings: dict[int, Callable[[], float]] = {
             69: lambda: self._registered is not None,
             70: lambda: self._hardware_error,
-            120: lambda: int(self._world.time * 1e3) % 32768,
+            120: lambda: int(self.world.time * 1e3) % 32768,
             122: lambda: self._moving,
             123: self._moving_status,
             124: self._present_pwm,
@@ -159,6 +154,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             146: lambda: self._temperature,
         }
         self.eeprom_writes = 0
+        """How many items were written to the EEPROM, which wears it."""
         self._angle = position
         self._velocity = self._output = 0.0
         self._turns = 0
@@ -176,7 +172,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     @property
     def position(self) -> float:
         """Angle of the shaft itself, rad, as a plant sees it; asking does not let time pass."""
-        with self._world.lock:
+        with self.world.lock:
             self._follow()
             return self._angle
 
@@ -185,10 +181,10 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
         The load is left out of account: a plant that is one takes `position`.
         """
-        with self._world.lock:
+        with self.world.lock:
             if self._trajectory is None:
                 return self._angle
-            return self._trajectory.at(self._world.time + seconds)[0]
+            return self._trajectory.at(self.world.time + seconds)[0]
 
     @property
     def bus_id(self) -> int:
@@ -218,12 +214,12 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     @property
     def answering(self) -> bool:
         """Whether packets reach the servo and it is not restarting."""
-        with self._world.at_present():
-            return self._plugged_in and math.isinf(self._restart_due)
+        with self.world.at_present():
+            return self.plugged_in and math.isinf(self._restart_due)
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the bus watchdog: a packet has arrived."""
-        with self._world.at_present():
+        with self.world.at_present():
             self._follow()
             self._protect()
             self._feed()
@@ -233,7 +229,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
         Raises `RequestRefusedError` if there are none to return, or one of the addresses is not defined.
         """
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             if length == 0:
                 raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
@@ -251,7 +247,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         Raises `RequestRefusedError` if an item is not defined, incomplete, read-only or locked, or a value is out of
         its range; nothing is written then.
         """
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             for item, value in self._decoded(address, data):
                 self._store(item, value)
@@ -268,7 +264,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def register_write(self, address: int, data: bytes) -> None:
         """Keep a write for `action`; it is checked now and then. Errors are those of `write_bytes`."""
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             self._decoded(address, data)
             self._registered = (address, data)
@@ -278,7 +274,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
         Raises `RequestRefusedError` if there is nothing, or the reasons of `write_bytes`.
         """
-        with self._world.lock:
+        with self.world.lock:
             if self._registered is None:
                 raise RequestRefusedError(ErrorNumber.INSTRUCTION)
             registered, self._registered = self._registered, None
@@ -286,10 +282,10 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def reboot(self) -> None:
         """Restart: the torque goes off, RAM and the number of turns are lost, no answer for `REBOOT_TIME`."""
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             self._switch_off()
-            self._restart_due = self._world.time + REBOOT_TIME
+            self._restart_due = self.world.time + REBOOT_TIME
 
     def clear(self, parameters: bytes) -> None:
         """Forget the number of turns (firmware 42 and newer).
@@ -297,7 +293,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         Raises `RequestRefusedError` if the firmware is older, the parameters are not 01 44 58 4C 22, or the shaft
         moves.
         """
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             if self.firmware < LOWEST_FIRMWARE_THAT_CLEARS:
                 raise RequestRefusedError(ErrorNumber.INSTRUCTION)
@@ -322,7 +318,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         RequestRefusedError
             If the option is none of these.
         """
-        with self._world.lock:
+        with self.world.lock:
             kept = {255: (0, 6), 1: (0, 6, 7), 2: (0, 6, 7, 8)}.get(option)
             if kept is None:
                 raise RequestRefusedError(ErrorNumber.DATA_RANGE)
@@ -337,7 +333,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def trip(self, error: HardwareError) -> None:
         """Raise a hardware error."""
-        with self._world.at_present():
+        with self.world.at_present():
             self._follow()
             self._raise_error(error)
 
@@ -345,14 +341,14 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """Change the input voltage, V; it must be positive."""
         if not volts > 0.0:
             raise ValueError(f"volts: expected a positive voltage, got {volts}")
-        with self._world.at_present():
+        with self.world.at_present():
             self._follow()
             self._supply_voltage = volts
             self._protect()
 
     def heat(self, celsius: float) -> None:
         """Bring the servo to a temperature, °C, from which it goes on by itself."""
-        with self._world.at_present():
+        with self.world.at_present():
             self._follow()
             self._temperature = celsius
             self._protect()
@@ -365,7 +361,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def expire(self) -> None:
         """Carry out what is due."""
-        now = self._world.time
+        now = self.world.time
         self._follow()
         if now >= self._watchdog_due:
             self._watchdog_due = math.inf
@@ -408,7 +404,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
                 self.write_item(64, 1)
             self.write_item(116, counts)
             self._setpoint = value
-            timeout = self._trajectory.end - self._world.time if self._trajectory is not None else 0.0
+            timeout = self._trajectory.end - self.world.time if self._trajectory is not None else 0.0
         return Status(self.name, self._clock, lambda: self._arrived(counts), timeout=timeout + 5.0)
 
     @property
@@ -469,7 +465,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     @property
     def _moving(self) -> bool:
-        if self._trajectory is not None and self._world.time < self._trajectory.end:
+        if self._trajectory is not None and self.world.time < self._trajectory.end:
             return True
         return abs(self._velocity) > self._values[24] * VELOCITY_UNIT
 
@@ -490,7 +486,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         trajectory = self._trajectory
         if trajectory is None or self._values[11] not in (POSITION, EXTENDED):
             return 0
-        ongoing = 0x02 if self._world.time < trajectory.end else 0
+        ongoing = 0x02 if self.world.time < trajectory.end else 0
         arrived = not ongoing and abs(self._angle - trajectory.target) <= ARRIVAL_TOLERANCE
         profile = 0
         if self._values[112]:
@@ -502,7 +498,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """Return angle and velocity that the profile asks for now."""
         if self._trajectory is None:
             return self._angle, 0.0
-        return self._trajectory.at(self._world.time)
+        return self._trajectory.at(self.world.time)
 
     def _encoded(self, item: Item) -> bytes:
         reading = self._readings.get(item.address)
@@ -570,7 +566,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def _feed(self) -> None:
         watched = self._values[64] and self._values[98] > 0
-        self._watchdog_due = self._world.time + self._values[98] * WATCHDOG_UNIT if watched else math.inf
+        self._watchdog_due = self.world.time + self._values[98] * WATCHDOG_UNIT if watched else math.inf
 
     def _power_on(self) -> None:
         self._restart_due = self._overload_due = math.inf
@@ -594,7 +590,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """Stop the shaft where it is, and hold."""
         self._values[116] = self._counts(self._angle)
         self._values[104] = 0
-        self._trajectory = Trajectory(self._world.time, self._angle, self._angle)
+        self._trajectory = Trajectory(self.world.time, self._angle, self._angle)
         self._velocity = 0.0
         self._schedule()
 
@@ -602,7 +598,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """Plan the motion that mode and goals ask for."""
         if not self._values[64]:
             return
-        values, now = self._values, self._world.time
+        values, now = self._values, self.world.time
         angle, velocity = self._reference()
         share = abs(values[100]) / FULL_PWM
         top = self._top_speed * share
@@ -626,7 +622,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._schedule()
 
     def _schedule(self) -> None:
-        now = self._world.time
+        now = self.world.time
         if self._trajectory is not None and now < self._trajectory.end:
             self._step_due = min(now + MOTION_INTERVAL, self._trajectory.end)
         else:
@@ -634,7 +630,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     def _follow(self) -> None:
         """Bring the shaft to where it is now."""
-        now = self._world.time
+        now = self.world.time
         elapsed = now - self._followed_at
         self._followed_at = now
         if elapsed > 0.0:

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from bench.devices import Device
+from bench.devices import Device, Identity
 from bench.errors import DeviceConnectionError
 from sim_devices.world import World
 
@@ -37,16 +37,18 @@ class EmulatedDevice(Device):
         Noise of the readings; without it they are free of noise.
     """
 
+    _identity: Identity
+
     def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
         super().__init__(name, world.clock)
-        self._world = world
+        self.world = world
         self._rng = rng
         self._setpoint = math.nan
 
     @property
-    def world(self) -> World:
-        """The emulated laboratory."""
-        return self._world
+    def identity(self) -> Identity:
+        """Maker, model, serial number and firmware."""
+        return self._identity
 
     @property
     def setpoint(self) -> float:
@@ -66,32 +68,27 @@ class EmulatedInstrument(EmulatedDevice):
 
     def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
         super().__init__(name, world, rng)
-        self._plugged_in = True
+        self.plugged_in = True
         self._corrupt_next = self._drop_next = False
-
-    @property
-    def plugged_in(self) -> bool:
-        """Whether requests reach the instrument."""
-        return self._plugged_in
 
     @property
     def answering(self) -> bool:
         """Whether the instrument answers requests at the clock's present time."""
-        return self._plugged_in
+        return self.plugged_in
 
     def attend(self) -> None:
         """Bring the instrument to the clock's present time: a request has arrived."""
-        self._world.advance()
+        self.world.advance()
 
     def unplug(self) -> None:
         """Block requests and answers; the instrument keeps working, and its watchdog expires."""
-        with self._world.at_present():
-            self._plugged_in = False
+        with self.world.at_present():
+            self.plugged_in = False
 
     def plug_in(self) -> None:
         """Undo `unplug`."""
-        with self._world.at_present():
-            self._plugged_in = True
+        with self.world.at_present():
+            self.plugged_in = True
 
     def corrupt_next_answer(self) -> None:
         """Damage the next answer on the line; the instrument has acted all the same."""
@@ -119,7 +116,7 @@ class EmulatedInstrument(EmulatedDevice):
     @contextmanager
     def _request(self) -> Iterator[None]:
         """Serve a request of the role: hold the lock, at the clock's present time."""
-        with self._world.lock:
+        with self.world.lock:
             if not self.answering:
                 raise DeviceConnectionError(self.name, "does not answer: it is unplugged or restarting")
             self.attend()

@@ -122,11 +122,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
     firmware : tuple of int
         Major and minor version that the instrument reports.
 
-    Attributes
-    ----------
-    frozen : bool
-        A fault: the converter stands still, and with it everything that is read.
-
     Raises
     ------
     ValueError
@@ -167,6 +162,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self.serial_number = serial_number
         self.firmware = firmware
         self.frozen = False
+        """A fault: the converter stands still, and with it everything that is read."""
         self._force = force
         self._newtons_per_unit = newtons_per_unit
         self._zero_newtons = zero_newtons

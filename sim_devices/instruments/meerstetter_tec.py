@@ -102,11 +102,6 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         Firmware version times 100 that the device reports.
     rng : numpy.random.Generator, optional
         Noise of the object temperature; without it the readings are free of noise.
-
-    Attributes
-    ----------
-    flash_writes : int
-        How many parameters were written to the flash; a real one endures about 100 000.
     """
 
     def __init__(
@@ -144,6 +139,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             1200: self._stability,
         }
         self.flash_writes = 0
+        """How many parameters were written to the flash; a real one endures about 100 000."""
         self._status = DeviceStatus.READY
         self._error = self._error_instance = self._error_parameter = 0
         self._output: tuple[str, float, float] | None = None
@@ -168,13 +164,13 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     @property
     def status(self) -> DeviceStatus:
         """The state of the device at the clock's present time; does not feed the watchdog."""
-        with self._world.at_present():
+        with self.world.at_present():
             return self._status
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the watchdog: a request has arrived."""
-        with self._world.at_present():
-            now = self._world.time
+        with self.world.at_present():
+            now = self.world.time
             if now > self._supervised_at:
                 self._supervise(now)
             self._feed(now)
@@ -197,7 +193,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
         Raises `RequestRefusedError` if there is no such parameter or instance.
         """
-        with self._world.lock:
+        with self.world.lock:
             self.parameter(number, instance)
             self.attend()
             return self._read(number)
@@ -208,7 +204,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         Raises `RequestRefusedError` if there is no such parameter or instance, it is read-only, or the value is out
         of its range.
         """
-        with self._world.lock:
+        with self.world.lock:
             row = self.parameter(number, instance)
             self.attend()
             if not row.writable:
@@ -222,22 +218,22 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
                 self._saved[number] = kept
                 self.flash_writes += 1
             if number == 2060:
-                self._feed(self._world.time)
+                self._feed(self.world.time)
             self._apply()
 
     def emergency_stop(self) -> None:
         """Switch the output off and stay in error 11 (command `ES`)."""
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             self._trip(11)
 
     def reset(self) -> None:
         """Restart from the flash after 0.2 s (command `RS`); the output goes off at once."""
-        with self._world.lock:
+        with self.world.lock:
             self.attend()
             self._status = DeviceStatus.RESET_PENDING
             self._watchdog_due = math.inf
-            self._restart_due = self._world.time + RESET_DELAY
+            self._restart_due = self.world.time + RESET_DELAY
             self._apply()
 
     # Faults.
@@ -252,7 +248,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         parameter : int
             The parameter that parameter 107 will name.
         """
-        with self._world.at_present():
+        with self.world.at_present():
             self._trip(error_number, parameter)
 
     # Timed events.
@@ -263,7 +259,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     def expire(self) -> None:
         """Carry out what is due."""
-        now = self._world.time
+        now = self.world.time
         if now >= self._watchdog_due:
             self._watchdog_due = math.inf
             self._trip(183, 2060)
@@ -274,11 +270,6 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             self._supervise(now)
 
     # The role of a TEC amplifier.
-
-    @property
-    def identity(self) -> Identity:
-        """Maker, model, serial number and firmware."""
-        return self._identity
 
     @property
     def mode(self) -> TECMode:
@@ -385,7 +376,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         if self._status is not DeviceStatus.RUN or self._values[2000] != CONTROLLER:
             return 0
         # A comparison with nan, outside of the window, is false.
-        return 2 if self._world.time - self._in_window_since >= self._values[4041] else 1
+        return 2 if self.world.time - self._in_window_since >= self._values[4041] else 1
 
     def _feed(self, now: float) -> None:
         watched = self._values[2060] > 0.0 and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
@@ -402,7 +393,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
                 if row.volatile and number >= 50000:
                     self._values[number] = stored(row, row.default)
         if self._values[6310] > 0.0:
-            self._restart_due = self._world.time + self._values[6310]
+            self._restart_due = self.world.time + self._values[6310]
         self._apply()
 
     def _restart(self) -> None:
@@ -410,7 +401,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._values |= {number: self._saved[number] for number, row in PARAMETERS.items() if row.writable}
         self._error = self._error_instance = self._error_parameter = 0
         self._status = DeviceStatus.READY
-        self._feed(self._world.time)
+        self._feed(self.world.time)
         self._apply()
 
     def _apply(self) -> None:
@@ -430,7 +421,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         if output == self._output:
             return
         was_on, self._output = self._output is not None, output
-        now = self._world.time
+        now = self.world.time
         self._in_window_since = math.nan
         self._started_at = now
         if output is None:

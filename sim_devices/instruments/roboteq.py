@@ -192,8 +192,6 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         CANopen node, 1 to 126.
     bitrate : int
         Speed of the bus, bit/s.
-    device_name : str
-        Value of object 0x1008.
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
@@ -212,7 +210,6 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         power_limit: int = _FULL,
         node: int = 1,
         bitrate: int = 125_000,
-        device_name: str = "Roboteq SDC2160",
         rng: np.random.Generator | None = None,
     ) -> None:
         super().__init__(name, world, rng)
@@ -225,10 +222,9 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._power_limit = power_limit
         self.node = node
         self.bitrate = bitrate
-        self._texts = {0x1008: device_name, 0x1009: "1.0", 0x100A: "v2.0 11/20/2019"}
-        self._identity = Identity(
-            "Roboteq", device_name.removeprefix("Roboteq").strip(), "unknown", self._texts[0x100A]
-        )
+        self._texts = {0x1008: "Roboteq SDC2160", 0x1009: "1.0", 0x100A: "v2.0 11/20/2019"}
+        # The objects have no serial number.
+        self._identity = Identity("Roboteq", "SDC2160", "unknown", self._texts[0x100A])
         self._commands = [0] * CHANNELS
         self._held = False
         self._trips = Fault(0)
@@ -271,13 +267,13 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     @property
     def power(self) -> int:
         """The applied power at the clock's present time, ‰; does not feed the watchdog."""
-        with self._world.at_present():
+        with self.world.at_present():
             return self._power
 
     @property
     def voltage(self) -> float:
         """The voltage that the load sees at the clock's present time, V."""
-        with self._world.at_present():
+        with self.world.at_present():
             return self._applied_voltage
 
     def entry(self, index: int, sub: int) -> Entry:
@@ -295,9 +291,9 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
         Raises `RequestRefusedError` if there is no such object, or it can only be written.
         """
-        with self._world.lock:
+        with self.world.lock:
             row = self.entry(index, sub)
-            self._world.advance()
+            self.world.advance()
             if not row.readable:
                 raise RequestRefusedError(AbortCode.WRITE_ONLY)
             return self._texts[index] if row.kind == "text" else self._readings[index](sub)
@@ -308,22 +304,22 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         Raises `RequestRefusedError` if there is no such object, it can only be read, or the value is out of its
         range.
         """
-        with self._world.lock:
+        with self.world.lock:
             row = self.entry(index, sub)
-            self._world.advance()
+            self.world.advance()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
                 self._heartbeat_milliseconds = value
-                self._heartbeat_since = self._world.time
+                self._heartbeat_since = self.world.time
             else:
                 self._command(index, sub, value)
 
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
-        with self._world.at_present():
+        with self.world.at_present():
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -348,7 +344,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             count = math.floor((now - self._heartbeat_since) / period + 1e-6)
             self._heartbeat_since += count * period
             due += [self._state] * min(count, _LONGEST_HEARTBEAT_BACKLOG)
-        return due if self._plugged_in else []
+        return due if self.plugged_in else []
 
     # Faults.
 
@@ -359,13 +355,13 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
     @battery_voltage.setter
     def battery_voltage(self, volts: float) -> None:
-        with self._world.at_present():
+        with self.world.at_present():
             self._battery = volts
             self._apply()
 
     def trip(self, fault: Fault | ChannelFlag) -> None:
         """Report a fault, which drops the output, or a flag of the first channel."""
-        with self._world.at_present():
+        with self.world.at_present():
             if isinstance(fault, Fault):
                 self._trips |= fault
             else:
@@ -374,20 +370,20 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
     def clear(self) -> None:
         """Take the causes of all faults away."""
-        with self._world.at_present():
+        with self.world.at_present():
             self._trips, self._channel_trips = Fault(0), ChannelFlag(0)
             self._apply()
 
     def power_cycle(self) -> None:
         """Interrupt the supply of the device: it starts anew, and says so by its boot-up message."""
-        with self._world.at_present():
+        with self.world.at_present():
             self._restart(power=True)
 
     def plug_in(self) -> None:
         """Undo `unplug`; the heartbeats of meanwhile are lost."""
-        with self._world.at_present():
+        with self.world.at_present():
             self.heartbeats()
-            self._plugged_in = True
+            self.plugged_in = True
 
     def _corrupted(self, answer: bytes) -> bytes:
         """Cut the adapter's line in its middle."""
@@ -406,11 +402,6 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._apply()
 
     # The role of a voltage supply.
-
-    @property
-    def identity(self) -> Identity:
-        """Maker, model, serial number (which the objects do not have) and firmware."""
-        return self._identity
 
     @property
     def output(self) -> str:
@@ -487,7 +478,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         elif 1 <= value <= CHANNELS:
             self._commands[value - 1] = 0
         self._held = False
-        self._watchdog_due = self._world.time + self._watchdog if self._watchdog > 0.0 else math.inf
+        self._watchdog_due = self.world.time + self._watchdog if self._watchdog > 0.0 else math.inf
         self._apply()
 
     def _restart(self, *, power: bool) -> None:
@@ -499,7 +490,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self._apply()
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = True
-        self._heartbeat_since = self._world.time
+        self._heartbeat_since = self.world.time
 
     def _faults(self) -> Fault:
         faults = self._trips

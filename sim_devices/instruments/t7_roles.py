@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Literal
 
-from bench.devices import Identity, Limits, Status
+from bench.devices import Limits, Status
 from bench.errors import DeviceError
 from bench.roles import PositionSensor, Switch, TemperatureSensor, VoltageSupply
 from sim_devices.instruments.emulated import EmulatedDevice
@@ -61,11 +61,7 @@ class _T7Device(EmulatedDevice):
     def __init__(self, name: str, instrument: EmulatedT7) -> None:
         super().__init__(name, instrument.world)
         self._instrument = instrument
-
-    @property
-    def identity(self) -> Identity:
-        """Identity of the instrument."""
-        return self._instrument.identity
+        self._identity = instrument.identity
 
 
 class _T7Reader(_T7Device):

@@ -1,8 +1,7 @@
 """Compiled inner loops of the hybrid cantilever plant.
 
-The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
-a microsecond and a fast loop asks for the deflection twenty thousand times a second. The constants below
-name the places in these arrays. Temperatures here are rises above the mean room temperature, in K;
+The constants below name the places in the plain arrays of the state, which pass into a compiled function within a
+microsecond; coefficients go by name. Temperatures here are rises above the mean room temperature, in K;
 everything else is in SI units, and a positive current heats the beam.
 """
 
@@ -90,12 +89,12 @@ def take_commands(rise: Floats, state: Floats, command: Floats, c: Record) -> bo
     if command[CLOSED] == 0.0:
         state[CURRENT] = command[COMMAND]
         return False
-    heat = c.loop_proportional * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
-    pumped = c.seebeck * (c.kelvin + rise[FACE])
-    square = pumped * pumped + 2.0 * c.resistance * heat
+    heat = c[0].loop_proportional * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
+    pumped = c[0].seebeck * (c[0].kelvin + rise[FACE])
+    square = pumped * pumped + 2.0 * c[0].resistance * heat
     # Of the two currents that give this heat the smaller; below the strongest cooling there is none.
     wanted = 2.0 * heat / (pumped + math.sqrt(max(square, 0.0)))
-    limit = min(command[LIMIT], c.maximum_current)
+    limit = min(command[LIMIT], c[0].maximum_current)
     state[CURRENT] = min(max(wanted, -limit), limit)
     saturated: bool = square < 0.0 or abs(wanted) > limit
     return saturated
@@ -104,11 +103,11 @@ def take_commands(rise: Floats, state: Floats, command: Floats, c: Record) -> bo
 @njit(cache=True)
 def factorise(current: float, c: Record, nodes: Floats, factors: Floats) -> None:
     """Factorise the matrix of a step, which is tridiagonal and depends on the current alone."""
-    half = 0.5 * c.seebeck * current
+    half = 0.5 * c[0].seebeck * current
     before = 0.0
     for j in range(NODES):
         after = 0.5 * nodes[LINK, j]
-        diagonal = nodes[CAPACITY, j] / c.step + 0.5 * nodes[AIR, j] + before + after
+        diagonal = nodes[CAPACITY, j] / c[0].step + 0.5 * nodes[AIR, j] + before + after
         if j == BACK:
             diagonal += half
         elif j == FACE:
@@ -136,7 +135,7 @@ def look_ahead(thermal: Thermal) -> None:
         error = command[TARGET] - rise[FACE]
         # A saturated loop integrates only what leads out of saturation.
         if not saturated or error * state[CURRENT] < 0.0:
-            state[INTEGRAL] += c.loop_integral * error
+            state[INTEGRAL] += c[0].loop_integral * error
     current = state[CURRENT]
     room = state[ROOM]
     if current != state[FACTORED]:
@@ -146,12 +145,12 @@ def look_ahead(thermal: Thermal) -> None:
     for j in range(BEAM, NODES):
         excess = rise[j] + 0.5 * increment[j] - room
         increment[j] = -nodes[EXCESS, j] * math.sqrt(math.sqrt(abs(excess))) * excess
-    joule = 0.5 * c.resistance * current * current
-    pumped = c.seebeck * current
+    joule = 0.5 * c[0].resistance * current * current
+    pumped = c[0].seebeck * current
     for j in range(BEAM):
         increment[j] = 0.0
-    increment[BACK] = joule - pumped * (c.kelvin + rise[BACK])
-    increment[FACE] = joule + pumped * (c.kelvin + rise[FACE])
+    increment[BACK] = joule - pumped * (c[0].kelvin + rise[BACK])
+    increment[FACE] = joule + pumped * (c[0].kelvin + rise[FACE])
 
     # Heat into each node, and forward elimination on the way.
     inflow = 0.0
@@ -180,7 +179,7 @@ def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
         ahead = False
         for j in range(NODES):
             rise[j] += increment[j]
-        state[FLUCTUATION] = c.room_decay * state[FLUCTUATION] + c.room_kick * normals[row]
+        state[FLUCTUATION] = c[0].room_decay * state[FLUCTUATION] + c[0].room_kick * normals[row]
     take_commands(rise, state, command, c)
 
 
@@ -194,10 +193,10 @@ def bending(fraction: float, rise: Floats, increment: Floats, c: Record, nodes: 
     bent = 0.0
     warm = 0.0
     for j in range(BEAM, NODES):
-        d = rise[j] + fraction * increment[j] + c.straight
-        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c.quadratic + d * c.cubic))
+        d = rise[j] + fraction * increment[j] + c[0].straight
+        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c[0].quadratic + d * c[0].cubic))
         warm += nodes[WEIGHT, j] * d
-    return c.sensitivity * bent, 1.0 + c.warm_gain * warm
+    return c[0].sensitivity * bent, 1.0 + c[0].warm_gain * warm
 
 
 @njit(cache=True)

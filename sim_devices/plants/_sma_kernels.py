@@ -1,8 +1,7 @@
 """Compiled inner loops of the SMA wire plant.
 
-The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
-a microsecond and the plant is advanced hundreds of thousands of times a run. The constants below name
-the places in these arrays. Here stresses are in MPa, forces in N, lengths in mm and temperatures in °C.
+The constants below name the places in the plain arrays of the state, which pass into a compiled function within a
+microsecond; coefficients go by name. Here stresses are in MPa, forces in N, lengths in mm and temperatures in °C.
 """
 
 from __future__ import annotations
@@ -88,9 +87,11 @@ def wire_length(
 ) -> float:
     """Elongation of the wire from its resting length, mm."""
     share = martensites / count
-    strain = stress * (share / c.martensite_modulus + (1.0 - share) / c.austenite_modulus)
-    strain += c.expansion * (temperature - c.expansion_reference) + c.transformation_strain * orienteds / count
-    length: float = c.rest_length * (strain - c.rest_strain)
+    strain = stress * (share / c[0].martensite_modulus + (1.0 - share) / c[0].austenite_modulus)
+    strain += (
+        c[0].expansion * (temperature - c[0].expansion_reference) + c[0].transformation_strain * orienteds / count
+    )
+    length: float = c[0].rest_length * (strain - c[0].rest_strain)
     return length
 
 
@@ -100,7 +101,7 @@ def end_position(
 ) -> float:
     """Position of the moving end of a taut wire: its elongation and that of frame and load cell, mm."""
     length = wire_length(temperature, stress, martensites, orienteds, count, c)
-    position: float = length + stress * c.area * c.series_compliance
+    position: float = length + stress * c[0].area * c[0].series_compliance
     return position
 
 
@@ -118,7 +119,7 @@ def switching_stresses(temperature: float, parts: Parts) -> None:
             switch = hot
             orient = grains[RETWIN, g]
         else:
-            switch = min(hot / c.unoriented_share, cold)
+            switch = min(hot / c[0].unoriented_share, cold)
             orient = grains[DETWIN, g]
         scratch[0, g] = switch
         scratch[1, g] = max(switch, orient)
@@ -137,7 +138,7 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
     """
     c, scratch = parts.c, parts.scratch
     count = parts.martensite.size
-    limit = float(c.stress_limit)
+    limit = float(c[0].stress_limit)
     below = np.zeros(2, dtype=np.int64)
     inside = np.zeros(2, dtype=np.int64)
     low = 0.0
@@ -208,7 +209,7 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
 def commit(temperature: float, stress: float, parts: Parts) -> None:
     """Take over temperature and stress and bring the grains there."""
     state, c, grains, martensite, oriented, _ = parts
-    martensites, orienteds = update_grains(temperature, stress, c.unoriented_share, grains, martensite, oriented)
+    martensites, orienteds = update_grains(temperature, stress, c[0].unoriented_share, grains, martensite, oriented)
     state[TEMPERATURE] = temperature
     state[STRESS] = stress
     state[MARTENSITE] = martensites
@@ -221,7 +222,7 @@ def load_to(stress: float, parts: Parts) -> None:
     state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[STRESS]
-    steps = math.ceil(abs(stress - begin) / c.stress_step)
+    steps = math.ceil(abs(stress - begin) / c[0].stress_step)
     for k in range(1, steps + 1):
         commit(temperature, begin + (stress - begin) * k / steps, parts)
     state[STRESS] = stress
@@ -234,7 +235,7 @@ def stretch_to(position: float, parts: Parts) -> None:
     state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[POSITION]
-    steps = math.ceil(abs(position - begin) / c.length_step)
+    steps = math.ceil(abs(position - begin) / c[0].length_step)
     for k in range(1, steps + 1):
         place = begin + (position - begin) * k / steps
         stress = solve_stress(place, temperature, state[STRESS], parts)
@@ -248,7 +249,7 @@ def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
     state, c = parts.state, parts.c
     begin = state[TEMPERATURE]
     position = state[POSITION]
-    steps = math.ceil(abs(temperature - begin) / c.temperature_step)
+    steps = math.ceil(abs(temperature - begin) / c[0].temperature_step)
     for k in range(1, steps + 1):
         warm = begin + (temperature - begin) * k / steps
         stress = state[STRESS]
@@ -275,14 +276,14 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
         if clamped:
             stretch_to(command[PLACE], parts)
         else:
-            load_to(command[LOAD] / c.area, parts)
-        offset = c.ambient_decay * state[AMBIENT_OFFSET] + c.ambient_kick * normals[row]
+            load_to(command[LOAD] / c[0].area, parts)
+        offset = c[0].ambient_decay * state[AMBIENT_OFFSET] + c[0].ambient_kick * normals[row]
         state[AMBIENT_OFFSET] = offset
-        rise = c.heating * (1.0 + c.ambient_gain * offset) * command[VOLTAGE] * command[VOLTAGE]
-        decay = c.still_decay
+        rise = c[0].heating * (1.0 + c[0].ambient_gain * offset) * command[VOLTAGE] * command[VOLTAGE]
+        decay = c[0].still_decay
         if command[FAN] != 0.0:
-            rise *= c.fan_share
-            decay = c.fan_decay
-        steady = c.ambient + offset + rise
+            rise *= c[0].fan_share
+            decay = c[0].fan_decay
+        steady = c[0].ambient + offset + rise
         warm = steady + (state[TEMPERATURE] - steady) * decay
         heat_to(warm, clamped, parts)

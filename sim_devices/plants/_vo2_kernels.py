@@ -1,8 +1,7 @@
 """Compiled inner loops of the VO2 cantilever plant.
 
-The plant keeps its state in plain arrays, because passing a few arrays into a compiled function costs
-a microsecond and the plant is advanced hundreds of thousands of times a run. The constants below name
-the places in these arrays. All temperatures are in degrees Celsius except inside the Peltier terms.
+The constants below name the places in the plain arrays of the state, which pass into a compiled function within a
+microsecond; coefficients go by name. All temperatures are in degrees Celsius except inside the Peltier terms.
 """
 
 from __future__ import annotations
@@ -90,9 +89,9 @@ def settle_film(film: float, parts: Parts) -> None:
     sub-step act one grid step later, as an avalanche does.
     """
     state, c, counters, up, down, down_relay, on = parts
-    relay_step = c.relay_step
+    relay_step = c[0].relay_step
     while True:
-        wanted = film + c.coupling * (counters[ON_COUNT] / up.size - 0.5)
+        wanted = film + c[0].coupling * (counters[ON_COUNT] / up.size - 0.5)
         move = wanted - state[DRIVE]
         if abs(move) <= relay_step:
             state[DRIVE] = wanted
@@ -105,20 +104,20 @@ def settle_film(film: float, parts: Parts) -> None:
 @njit(cache=True)
 def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
     """Evaluate the heat balance: rate of the plate temperature (K/s) under a current (A, positive heats)."""
-    heat = c.seebeck * (plate + ZERO_CELSIUS) * current + 0.5 * c.resistance * current * current
-    heat -= c.conductance * (plate - sink) + c.plate_loss * (plate - c.ambient)
-    rate: float = heat / c.plate_capacity
+    heat = c[0].seebeck * (plate + ZERO_CELSIUS) * current + 0.5 * c[0].resistance * current * current
+    heat -= c[0].conductance * (plate - sink) + c[0].plate_loss * (plate - c[0].ambient)
+    rate: float = heat / c[0].plate_capacity
     return rate
 
 
 @njit(cache=True)
 def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
     """Find the current (A) that gives the plate a rate: inverse of `plate_rate`, the root of smaller magnitude."""
-    heat = c.plate_capacity * rate
-    heat += c.conductance * (plate - sink) + c.plate_loss * (plate - c.ambient)
-    pumped = c.seebeck * (plate + ZERO_CELSIUS)
+    heat = c[0].plate_capacity * rate
+    heat += c[0].conductance * (plate - sink) + c[0].plate_loss * (plate - c[0].ambient)
+    pumped = c[0].seebeck * (plate + ZERO_CELSIUS)
     # The rate never asks for more cooling than the Peltier maximum: a negative root is rounding only.
-    root = math.sqrt(max(pumped * pumped + 2.0 * c.resistance * heat, 0.0))
+    root = math.sqrt(max(pumped * pumped + 2.0 * c[0].resistance * heat, 0.0))
     current: float = 2.0 * heat / (pumped + root)
     return current
 
@@ -127,7 +126,7 @@ def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
 def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Record) -> float:
     """Limit a rate (K/s) to the slew limit and the heat flow that the current limit (A, may be infinite) allows."""
     # Beyond this current the Joule heat outgrows the pumping and more current cools less.
-    best_cooling = c.seebeck * (plate + ZERO_CELSIUS) / c.resistance
+    best_cooling = c[0].seebeck * (plate + ZERO_CELSIUS) / c[0].resistance
     rate = min(max(rate, -slew), slew)
     rate = min(rate, plate_rate(plate, limit, sink, c))
     return max(rate, plate_rate(plate, -min(limit, best_cooling), sink, c))
@@ -136,28 +135,28 @@ def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: flo
 @njit(cache=True)
 def step_plate(state: Floats, command: Floats, c: Record) -> None:
     """Advance plate, current and sink by one grid step."""
-    step = c.step
+    step = c[0].step
     plate = state[PLATE]
     rate = state[RATE]
     current = state[CURRENT]
     sink = state[SINK]
 
-    taken = c.seebeck * (sink + ZERO_CELSIUS) * current - 0.5 * c.resistance * current * current
-    taken -= c.conductance * (plate - sink)
-    sink += step * (-taken - c.sink_loss * (sink - c.ambient)) / c.sink_capacity
+    taken = c[0].seebeck * (sink + ZERO_CELSIUS) * current - 0.5 * c[0].resistance * current * current
+    taken -= c[0].conductance * (plate - sink)
+    sink += step * (-taken - c[0].sink_loss * (sink - c[0].ambient)) / c[0].sink_capacity
 
     if command[CLOSED] == 0.0:
-        current = command[COMMAND] + (current - command[COMMAND]) * c.current_decay
+        current = command[COMMAND] + (current - command[COMMAND]) * c[0].current_decay
         ahead = plate_rate(plate + step * rate, current, sink, c)
         plate += 0.5 * step * (rate + ahead)
         rate = plate_rate(plate, current, sink, c)
     else:
         error = command[TARGET] - plate
-        wanted = c.loop_ve * error + c.loop_vv * rate
-        moved = command[TARGET] - (c.loop_ee * error + c.loop_ev * rate)
+        wanted = c[0].loop_ve * error + c[0].loop_vv * rate
+        moved = command[TARGET] - (c[0].loop_ee * error + c[0].loop_ev * rate)
         # A mode change may hand over more speed or current than the limits allow: it decays into them.
-        slew = c.slew + max(abs(rate) - c.slew, 0.0) * c.slew_decay
-        limit = command[LIMIT] + max(abs(current) - command[LIMIT], 0.0) * c.current_decay
+        slew = c[0].slew + max(abs(rate) - c[0].slew, 0.0) * c[0].slew_decay
+        limit = command[LIMIT] + max(abs(current) - command[LIMIT], 0.0) * c[0].current_decay
         reached = limited_rate(wanted, slew, limit, plate + step * rate, sink, c)
         plate = moved if reached == wanted else plate + 0.5 * step * (rate + reached)
         # Once more where the plate has come to, so that the current never leaves its limit.
@@ -176,7 +175,7 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     state, c = parts.state, parts.c
     for row in range(normals.shape[0]):
         step_plate(state, command, c)
-        state[WANDER] = c.wander_decay * state[WANDER] + c.wander_kick * normals[row, 0]
-        state[DRIFT] = c.drift_decay * state[DRIFT] + c.drift_kick * normals[row, 1]
-        film = state[PLATE] + state[WANDER] + state[DRIFT] + c.offset
+        state[WANDER] = c[0].wander_decay * state[WANDER] + c[0].wander_kick * normals[row, 0]
+        state[DRIFT] = c[0].drift_decay * state[DRIFT] + c[0].drift_kick * normals[row, 1]
+        film = state[PLATE] + state[WANDER] + state[DRIFT] + c[0].offset
         settle_film(film, parts)

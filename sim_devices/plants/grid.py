@@ -34,7 +34,7 @@ Seed = Annotated[int, "zero or positive"]
 Floats = NDArray[np.float64]
 
 Record = Any
-"""A record of named numbers, a scalar of a structured dtype."""
+"""A record of named numbers of a structured dtype, or an array of one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +126,8 @@ class GridPlant(ABC, Generic[P]):
 
 
 def record(**values: float) -> Record:
-    """Return numbers as a record, which a compiled loop takes in a few microseconds and reads by their names."""
-    return np.array([tuple(values.values())], [(name, np.float64) for name in values])[0]
+    """Return numbers as an array of one record: a compiled loop takes it faster than the record, and by name."""
+    return np.array([tuple(values.values())], [(name, np.float64) for name in values])
 
 
 def fluctuation(deviation: float, time: float, step: float) -> tuple[float, float]:

@@ -201,7 +201,7 @@ class SMAWire(Muscle[SMAParameters]):
     @property
     def force(self) -> float:
         """Tension of the wire, N; 0 to about 11.3 N at constant length between 0 and 3 V."""
-        return float(self._state[kernels.STRESS] * self._coefficients["area"])
+        return float(self._state[kernels.STRESS] * self._coefficients["area"][0])
 
     @property
     def length(self) -> float:
@@ -252,7 +252,7 @@ class SMAWire(Muscle[SMAParameters]):
         self._load(0.0)
 
     def _load(self, newton: float) -> None:
-        kernels.load_to(newton / self._coefficients["area"], self._parts)
+        kernels.load_to(newton / self._coefficients["area"][0], self._parts)
 
     def _heat(self, celsius: float, clamped: bool) -> None:
         kernels.heat_to(celsius, clamped, self._parts)

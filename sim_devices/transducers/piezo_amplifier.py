@@ -39,8 +39,6 @@ class PiezoAmplifier:
         Input in V at which the output is 0 V.
     settling_time : float
         Time constant of the output in s.
-    capacitance : float
-        Capacitance of the load in F, for the current.
     volts_per_volt, amperes_per_volt : float
         Output voltage and current per volt of their monitors.
     scale_error : float
@@ -54,6 +52,7 @@ class PiezoAmplifier:
     SATURATION = 45.0
     STEP = 0.125
     STATUS = 5.0
+    CAPACITANCE = 20e-9  # of the load, F, for the current
 
     def __init__(
         self,
@@ -63,7 +62,6 @@ class PiezoAmplifier:
         gain: float = 20.0,
         offset_volts: float = 0.0,
         settling_time: float = 0.2e-3,
-        capacitance: float = 20e-9,
         volts_per_volt: float = 20.0,
         amperes_per_volt: float = 0.01,
         scale_error: float = 1e-3,
@@ -75,7 +73,6 @@ class PiezoAmplifier:
         self._gain = gain * (1 + scale_error * rng.standard_normal())
         self._offset = offset_volts
         self._time_constant = settling_time
-        self._capacitance = capacitance
         self._volts_per_volt = volts_per_volt * (1 + scale_error * rng.standard_normal())
         self._amperes_per_volt = amperes_per_volt
         self._noise = noise_volts
@@ -122,7 +119,7 @@ class PiezoAmplifier:
 
     def current_monitor(self) -> float:
         """Return the voltage in V of the current monitor at this instant."""
-        amperes = self._capacitance * (self._target - self.voltage) / self._time_constant
+        amperes = self.CAPACITANCE * (self._target - self.voltage) / self._time_constant
         return amperes / self._amperes_per_volt + self._noise * self._rng.standard_normal()
 
     def status(self) -> float:

@@ -62,8 +62,6 @@ class ModbusTcpServer:
 
     Parameters
     ----------
-    host : str
-        Address to listen on; anything but loopback lets other machines in.
     port : int
         Port to listen on; 0 lets the system choose.
 
@@ -75,16 +73,15 @@ class ModbusTcpServer:
 
     _SEND_TIMEOUT = 1.0  # a client that does not read its replies for so long is dropped
 
-    def __init__(self, bank: RegisterBank, *, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, bank: RegisterBank, *, port: int = 0) -> None:
         self._bank = bank
-        self._host = host
         self._port = port
         self._thread: threading.Thread | None = None
 
     @property
     def address(self) -> str:
         """Where clients connect, as `tcp://127.0.0.1:PORT`."""
-        return f"tcp://{self._host}:{self._port}"
+        return f"tcp://127.0.0.1:{self._port}"
 
     @property
     def port(self) -> int:
@@ -103,7 +100,7 @@ class ModbusTcpServer:
         """
         if self._thread is not None:
             raise RuntimeError(f"the server at {self.address} runs already")
-        self._listener = socket.create_server((self._host, self._port))
+        self._listener = socket.create_server(("127.0.0.1", self._port))
         self._port = self._listener.getsockname()[1]
         self._waker, wakened = socket.socketpair()
         self._thread = threading.Thread(

@@ -58,7 +58,7 @@ def naive_position(wire, temperature, stress, martensite, oriented):
     share = martensite.mean()
     strain = stress * 1e6 * (share / p.martensite_modulus + (1.0 - share) / p.austenite_modulus)
     strain += p.expansion * (temperature - 25.0) + p.transformation_strain * oriented.mean()
-    strain -= wire._coefficients["rest_strain"]
+    strain -= wire._coefficients["rest_strain"][0]
     return p.rest_length * strain + stress * 1e6 * p.area / p.series_stiffness
 
 
@@ -263,7 +263,7 @@ class TestGrains:
                 wire.hang(load)
             if k % 90 == 0:
                 wire.apply(float(script.uniform(0.0, 3.0)))
-            target = load / wire._coefficients["area"]
+            target = load / wire._coefficients["area"][0]
             wire.advance(0.1)
             parts = math.ceil(abs(target - stress) / 4.0)
             for part in range(1, parts + 1):
