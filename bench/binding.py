@@ -1,4 +1,4 @@
-"""Slots: what a protocol asks for, bound to the devices and signals of a rig.
+"""Slots of a protocol, bound to the devices and signals of a rig.
 
 A rig file binds a slot by a table::
 
@@ -6,7 +6,7 @@ A rig file binds a slot by a table::
     device = "plate"                    # takes the set-points
     reading = "plate_temperature"       # signal that says what it did; the device's first signal if not given
     unit = "°C"                         # of the reading, checked when the device is connected
-    range = [21.0, 84.0]                # set-points that protocols use unless told otherwise
+    range = [21.0, 84.0]                # default range of protocols
     rest = 21.0                         # where it idles
 
     [roles.drive.reset]                 # how the memory is reset: held at `setpoint` until steady, or for `seconds`
@@ -69,7 +69,7 @@ class RoleTable(_Table):
     reading: str = Field(default="", description="signal that says what the device did")
     signal: str = Field(default="", description="signal, for a role that only measures")
     unit: str | None = Field(default=None, description="unit of the reading or signal, checked when connected")
-    range: Range | None = Field(default=None, description="range that protocols use unless they are told otherwise")
+    range: Range | None = Field(default=None, description="default range of protocols")
     rest: float | None = Field(default=None, description="set-point at which the device idles")
     dwell: float | None = Field(
         default=None, gt=0, le=86400, description="hold at each set-point before a reading, s"
@@ -78,10 +78,10 @@ class RoleTable(_Table):
     rate: float | None = Field(default=None, gt=0, description="fastest change that the specimen follows, per s")
     prompt: str = Field(
         default="Set {value:g} {unit}",
-        description="what an operator does to set this by hand; {value} and {unit} stand in",
+        description="instruction to an operator who sets this by hand, with {value} and {unit}",
     )
     task: str = Field(default="", description="the same for an emulated laboratory; the role's name if not given")
-    tolerance: float = Field(default=0.05, gt=0, le=1, description="of what is set by hand, as a fraction")
+    tolerance: float = Field(default=0.05, gt=0, le=1, description="tolerance of a value set by hand, as a fraction")
     reset: ResetTable | None = Field(default=None, description="how the memory of the specimen is reset")
 
     @model_validator(mode="after")
@@ -277,16 +277,13 @@ def check_roles(
 ) -> None:
     """Check that each role is bound to devices and signals that the rig has, in the unit that it says.
 
-    Raises
-    ------
-    ConfigurationError
-        If one is not; names file, key and what is allowed.
+    Raises ConfigurationError if one is not; names file, key and what is allowed.
     """
     for name, table in roles.items():
         if table.device:
             actuators = [key for key, device in devices.items() if isinstance(device, Actuator)]
             if table.device not in actuators:
-                what = "takes no set-point" if table.device in devices else "is no device of this rig"
+                what = "takes no set-point" if table.device in devices else "is not a device of this rig"
                 raise ConfigurationError(
                     f"{path}: roles.{name}.device = {table.device!r} {what}; "
                     f"allowed: {', '.join(actuators) or 'none'}"

@@ -1,4 +1,4 @@
-"""Studies: series of runs on emulated rigs, with what they give as values, tables and figures.
+"""Studies: series of runs on emulated rigs, and their results as values, tables and figures.
 
 A package registers a `Study` as an entry point of the group `bench.studies`; `bench reproduce NAME` carries it out.
 """
@@ -74,10 +74,7 @@ class Campaign:
     ) -> RunResult:
         """Carry out one protocol, on another rig than the campaign's if one is given.
 
-        Raises
-        ------
-        BenchError
-            If it did not complete, or the safe state was not confirmed; its record is kept.
+        Raises BenchError if it did not complete, or the safe state was not confirmed; its record is kept.
         """
         definition = find_protocol(protocol)
         result = carry_out(
@@ -184,6 +181,9 @@ def reproduce(
 ) -> dict[str, Any]:
     """Carry out a study, export the recordings of its runs, and print its tables.
 
+    The result has `seed`, the values of the study, `laboratory_seconds`, `wall_seconds`, `folder`, `figures` and
+    `recordings`.
+
     Parameters
     ----------
     name : str
@@ -196,15 +196,8 @@ def reproduce(
         Seed of the noise of the emulated laboratory, and of random sequences.
     out : Path
         Where that folder is made.
-    live : bool
-        Whether to serve the live view.
-    console : Console
-        Where to print.
-
-    Returns
-    -------
-    dict
-        `seed`, the values of the study, `laboratory_seconds`, `wall_seconds`, `folder`, `figures`, `recordings`.
+    live, console
+        As in `Campaign`.
 
     Raises
     ------
@@ -237,10 +230,7 @@ def reproduce(
 def reached_targets(run: RunResult, signal: str) -> TargetResults:
     """Return how well a run brought a signal to its targets.
 
-    Raises
-    ------
-    DataError
-        If it had no targets.
+    Raises DataError if it had no targets.
     """
     with Record(run.folder) as record:
         results = target_results(record, signal)

@@ -30,7 +30,7 @@ class Clock(ABC):
     epoch : datetime
         Time of day (UTC) at which `now()` was zero.
     runs_by_itself : bool
-        Whether time passes while nobody sleeps.
+        Whether time passes without `sleep`.
     interrupted : callable
         Asked during every sleep; when it returns True the sleep ends early.
     """
@@ -74,7 +74,7 @@ class Clock(ABC):
 
 
 class WallClock(Clock):
-    """The time of the room: a second is a second."""
+    """Wall-clock time: a second is a second."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,12 +94,12 @@ class WallClock(Clock):
 
 
 class ScaledClock(Clock):
-    """The time of the room, `factor` times as fast, for people who watch an emulated rig.
+    """Wall-clock time, `factor` times as fast, for people who watch an emulated rig.
 
     Parameters
     ----------
     factor : float
-        Laboratory seconds in a second of the room; positive.
+        Laboratory seconds per wall-clock second; positive.
 
     Raises
     ------
@@ -120,14 +120,14 @@ class ScaledClock(Clock):
         return self._wall.now() * self.factor
 
     def sleep(self, seconds: float) -> None:
-        """Wait `seconds / factor` seconds of the room."""
+        """Wait `seconds / factor` wall-clock seconds."""
         _check_finite(seconds)
         self._wall.interrupted = self.interrupted
         self._wall.sleep(seconds / self.factor)
 
 
 class VirtualClock(Clock):
-    """A clock that jumps: sleeping costs no time of the room at all.
+    """A clock that jumps: sleeping takes no wall-clock time.
 
     Only one thread should let time pass, the one that carries the run out; any thread may read the time.
     """
@@ -159,18 +159,18 @@ class VirtualClock(Clock):
 
 
 class Stopwatch:
-    """Seconds of the room since it was made, for saying how long work took; never for control."""
+    """Wall-clock seconds since it was made, to report how long work took; never for control."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
 
     def seconds(self) -> float:
-        """Return the seconds of the room that have passed."""
+        """Return the elapsed wall-clock seconds."""
         return time.perf_counter() - self._start
 
 
-def room_date() -> datetime:
-    """Return the time of day in the room (UTC), for names and metadata; never for control."""
+def wall_time() -> datetime:
+    """Return the wall-clock date and time in UTC, for names and metadata; never for control."""
     return datetime.now(UTC)
 
 
@@ -180,7 +180,7 @@ def make_clock(name: str) -> Clock:
     Parameters
     ----------
     name : {"wall", "virtual", "xN"}
-        `x20` is a clock twenty times as fast as the room's; N may be any positive number.
+        `x20` is a clock twenty times as fast as the wall clock; N may be any positive number.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from bench.control.latched import Latched
 from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
-from bench.results.model_file import ModelFile, load_model
+from bench.model_file import ModelFile, load_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +52,7 @@ class ControllerSetup:
     def inverse(self) -> Inverse[Any]:
         """Return the inverse of a model with memory.
 
-        Raises
-        ------
-        DataError
-            If the model has no memory.
+        Raises DataError if the model has no memory.
         """
         if self.model.operator.memoryless:
             raise DataError(

@@ -133,7 +133,7 @@ class Expression(DerivedSignal):
     @field_validator("expression")
     @classmethod
     def _can_be_parsed(cls, text: str) -> str:
-        # The parser passes on whatever Python's own grammar objects to.
+        # The parser passes on every error of Python's own grammar.
         try:
             tree = ast.parse(text.strip(), mode="eval")
         except Exception as error:
@@ -177,7 +177,7 @@ class Expression(DerivedSignal):
             raise ValueError(f"expression = {self.expression!r}: {error}") from None
         if not found.is_compatible_with(wanted):
             raise ValueError(f"expression = {self.expression!r} is in {found.units:~P}, not in unit = {self.unit!r}")
-        # Everything is computed in SI base units, whatever the sources are in.
+        # Everything is computed in SI base units, independent of the units of the sources.
         factors = {key: float(_in_base_units(quantity)) for key, quantity in quantities.items()}
         scale = 1.0 / float(_in_base_units(wanted))
         evaluator = SimpleEval(operators=_OPERATORS, functions=_FUNCTIONS)

@@ -1,15 +1,15 @@
-"""What every device on the bench is and promises; `bench.roles` has the roles that it can play.
+"""The base classes of devices and their promises; the roles are in `bench.roles`.
 
 A protocol asks for slots, and a rig file binds them to devices. A driver (real wire) and an emulated instrument
 implement the same role, and one contract test suite runs against both.
 
 Promises of every device
 ------------------------
-- Quantities are in SI units; temperatures are in degrees Celsius, as the field has them.
+- Quantities are in SI units; temperatures are in degrees Celsius, as is usual in the field.
 - The `measure` method takes the best reading that the instrument gives at rest, `glance` a quick one for
   watching. Both raise `DeviceError` if the instrument reports a fault, and never return a stale or an
   invalid number.
-- `safe` brings the device into its safe state, whatever its state is; calling it again changes nothing.
+- `safe` brings the device into its safe state from any state; calling it again changes nothing.
   It tries everything that can make the device safer, and raises only after that.
 - `stop` ends a motion and holds, `close` releases the line; neither replaces `safe`.
 - Methods may be called from one thread at a time.
@@ -55,7 +55,7 @@ class Signal:
     Attributes
     ----------
     name : str
-        Unique within the rig, such as `tec_temperature`.
+        Unique within the rig, such as `plate_temperature`.
     unit : str
         Unit of the values, such as `°C`, `A`, `1/m`; `1` for a plain number.
     description : str
@@ -97,14 +97,14 @@ class Limits:
 
 
 class BlueskyReading(TypedDict):
-    """One value as `bluesky.protocols.Reading` has it; the timestamp is seconds since 1970 UTC."""
+    """One value in the form of `bluesky.protocols.Reading`; the timestamp is seconds since 1970 UTC."""
 
     value: float
     timestamp: float
 
 
 class DataKey(TypedDict):
-    """What a value is, as event-model's `DataKey` has it."""
+    """Description of a value in the form of event-model's `DataKey`."""
 
     source: str
     dtype: str
@@ -184,7 +184,7 @@ class Status:
                 return True
             try:
                 arrived = self._arrived()
-            # Whatever it is, whoever waits has to hear of it.
+            # Every waiting thread must receive the exception.
             except Exception as error:
                 self._finish(error)
             else:
@@ -197,10 +197,7 @@ class Status:
     def wait(self) -> None:
         """Let time pass until the change is complete.
 
-        Raises
-        ------
-        DeviceError
-            If the change failed or took longer than its timeout.
+        Raises DeviceError if the change failed or took longer than its timeout.
         """
         while not self.update():
             self._clock.sleep(self._interval)
@@ -210,7 +207,7 @@ class Status:
     def add_callback(self, callback: Callable[[Any], None]) -> None:
         """Have `callback(status)` called once at the end.
 
-        The bench itself asks by `update` or `wait`. Whoever waits by callback, as a bluesky RunEngine does,
+        The bench itself polls by `update` or `wait`. A caller that waits by callback, as a bluesky RunEngine does,
         gets a thread that asks for it.
         """
         with self._lock:
@@ -231,7 +228,7 @@ class Status:
         self._done = True
         callbacks, self._callbacks = self._callbacks, []
         with ExitStack() as stack:
-            # Each is told, also after one that raises.
+            # Each is called, also after one that raises.
             for callback in reversed(callbacks):
                 stack.callback(callback, self)
 
@@ -291,10 +288,7 @@ class Device(ABC):
     def measure(self) -> dict[str, float]:
         """Measure every signal as well as the instrument can; values by signal name.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument reports a fault, is out of its range, or does not answer.
+        Raises DeviceError if the instrument reports a fault, is out of its range, or does not answer.
         """
 
     def glance(self) -> dict[str, float]:
@@ -308,7 +302,7 @@ class Device(ABC):
         return {name: {"value": value, "timestamp": timestamp} for name, value in values.items()}
 
     def describe(self) -> dict[str, DataKey]:
-        """Say what `read` delivers, as bluesky has it."""
+        """Describe what `read` returns, in the form that bluesky expects."""
         source = f"{self.identity.model}:{self.identity.serial_number}"
         return {
             signal.name: {
@@ -328,10 +322,7 @@ class Device(ABC):
     def safe(self) -> None:
         """Bring the device into its safe state; what that is, each role says.
 
-        Raises
-        ------
-        DeviceError
-            If the safe state could not be confirmed, after everything was tried.
+        Raises DeviceError if the safe state could not be confirmed, after everything was tried.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Carries a protocol out on a rig.
+"""Runs a protocol on a rig.
 
 For each step: checks the set-points, sends them, ticks through the hold (telemetry, interlocks, faults), takes the
 reading, writes the journal, and then notifies the observers. However the run ends, every device is brought into its
@@ -147,19 +147,13 @@ class Engine:
         }
 
     def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
-        """Carry a protocol out, from its first step to the safe state.
-
-        Returns
-        -------
-        Outcome
-            How it ended; exceptions end up in its `error`.
-        """
+        """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
         start = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
         error: Exception | None = None
         try:
             self._carry_out(definition, parameters)
-        # Whatever is raised, every way out leads through the safe state.
+        # Every exit path leads through the safe state, after any exception.
         except Exception as caught:
             error = caught
         finally:
@@ -339,7 +333,7 @@ class Engine:
         if self._rig.laboratory is not None:
             self._rig.laboratory.operate(message.task, message.value)
         elif self._ask is None:
-            raise AbortError(f"nobody is there to do it: {message.text}")
+            raise AbortError(f"no operator is present to do it: {message.text}")
         elif self._await_answer(self._ask, f"{message.text}; then") != RESUME:
             raise AbortError("ended by the operator at a prompt")
         # Kept in any case: it shows what was wrong.
@@ -381,13 +375,13 @@ class Engine:
     def _check_signals(self, *names: str) -> None:
         for name in names:
             if name not in self._names:
-                raise ConfigurationError(f"{name} is no signal of this rig; there are: {', '.join(self._names)}")
+                raise ConfigurationError(f"{name} is not a signal of this rig; there are: {', '.join(self._names)}")
 
     def _actuator(self, name: str) -> Actuator:
         actuators = self._rig.actuators
         if name not in actuators:
             known = ", ".join(actuators) or "none"
-            raise ConfigurationError(f"{name} is no device that takes a set-point; there are: {known}")
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
         return actuators[name]
 
     def _send(self, setpoints: Mapping[str, float]) -> list[Status]:
@@ -482,7 +476,7 @@ class Engine:
         if not self._interrupts.pause_requested:
             return
         if self._ask is None:
-            raise AbortError("ended by Ctrl-C; nobody is there to be asked whether to resume")
+            raise AbortError("ended by Ctrl-C; no operator is present to resume")
         self._event("WARN", "pause", "paused before the next step, at the operator's wish")
         answer = self._await_answer(self._ask, "paused:")
         self._interrupts.pause_requested = False
@@ -547,10 +541,8 @@ class Engine:
 def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan) -> None:
     """Check the plan of a dry run against the rig's devices and limits.
 
-    Raises
-    ------
-    ConfigurationError
-        If the rig lacks something, or a set-point would leave a device's limits; nothing has moved.
+    Raises ConfigurationError if the rig lacks something, or a set-point would leave a device's limits; nothing has
+    moved.
     """
     rig.check_needs(definition.name, definition.names)
     rig.check_needs(definition.name, sorted(expected.watched))

@@ -22,8 +22,8 @@ from rich.console import Console
 
 from bench.clock import make_clock
 from bench.errors import BenchError, DeviceError
+from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
-from bench.results.model_file import ModelFile, load_model
 from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
 from bench.results.models import predict as predict_file
 from bench.results.report import report_run
@@ -82,7 +82,7 @@ def run(
     progress: bool = False,
     **parameters: Any,  # noqa: ANN401 - each protocol names and types its own
 ) -> RunFolder:
-    """Carry out a protocol on a rig, record it, and leave every device in its safe state.
+    """Carry out a protocol on a rig, record it, make every device safe, and return what was recorded.
 
     Parameters
     ----------
@@ -102,11 +102,6 @@ def run(
         Whether to print the progress.
     **parameters
         Parameters of the protocol; the others have the rig's defaults or its own.
-
-    Returns
-    -------
-    RunFolder
-        What was recorded.
 
     Raises
     ------
@@ -224,12 +219,10 @@ def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = Fals
 
     Parameters
     ----------
-    model : IdentifiedFile, ModelFile, Path or str
-        The model.
+    model, continue_memory
+        As for `predict`.
     targets : array_like, shape (N,)
         Targets in the unit of the model's output.
-    continue_memory : bool
-        Whether to start from the memory at the end of the model's own data, not from its initial state.
 
     Raises
     ------
@@ -242,10 +235,7 @@ def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = Fals
 def load(path: str | Path) -> RunFolder | ModelFile:
     """Return a run (a folder or its journal) or a model (a `.json` file).
 
-    Raises
-    ------
-    DataError
-        If it is neither, or cannot be read.
+    Raises DataError if it is neither, or cannot be read.
     """
     if Path(path).suffix == ".json":
         return load_model(Path(path))

@@ -1,4 +1,4 @@
-"""What the operating system and the operator's keyboard ask of a run that goes on."""
+"""Signals of the operating system and the operator's keyboard during a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Interrupts:
     Parameters
     ----------
     notify : callable
-        Tells the operator what was understood. Called in the midst of whatever goes on: it must not wait for
+        Tells the operator what was understood. Called at any point of the program: it must not wait for
         a lock, as the lines that were interrupted may hold it; printing through a console does.
 
     Attributes
@@ -63,7 +63,7 @@ class Interrupts:
             self._former[number] = signal.SIG_DFL if former is None else former
 
     def _tell(self, text: str) -> None:
-        # Nothing may be raised here, as this comes in the midst of whatever is going on.
+        # Nothing may be raised here, as a signal arrives at any point of the program.
         with suppress(Exception):
             self._notify(text)
 

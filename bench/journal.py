@@ -290,10 +290,7 @@ class Table:
     def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is optional
         """Return a pandas `DataFrame`, with the units in its `attrs`.
 
-        Raises
-        ------
-        ConfigurationError
-            If pandas is not installed.
+        Raises ConfigurationError if pandas is not installed.
         """
         try:
             import pandas as pd
@@ -487,10 +484,8 @@ def run_card(meta: Mapping[str, Any]) -> str:
 def check_names(names: Sequence[str]) -> None:
     """Check that signals can be columns of a journal.
 
-    Raises
-    ------
-    ConfigurationError
-        If two have one name, or one has that of a column which the journal itself needs; case does not count.
+    Raises ConfigurationError if two have one name, or one has that of a column which the journal itself needs; case
+    does not count.
     """
     seen = dict.fromkeys(_OWN_COLUMNS, "is the name of a column of the journal")
     for name in names:

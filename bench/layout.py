@@ -1,4 +1,4 @@
-"""What the dashboard of a rig draws: the table `[dashboard]` of its rig file."""
+"""The layout of a rig's dashboard: the table `[dashboard]` of its rig file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts by name: what the bench and other packages register as entry points.
+"""Parts by name: the entry points that the bench and other packages register.
 
 A package registers its parts in its `pyproject.toml`::
 
@@ -68,10 +68,7 @@ class Entry:
     def load(self) -> Any:  # noqa: ANN401 - each group has a type of its own
         """Import it.
 
-        Raises
-        ------
-        ConfigurationError
-            If it cannot be imported; names entry, package and reason.
+        Raises ConfigurationError if it cannot be imported; names entry, package and reason.
         """
         try:
             return metadata.EntryPoint(self.name, self.reference, f"bench.{self.group}").load()
@@ -87,10 +84,7 @@ class Entry:
 def entries(group: Group) -> Mapping[str, Entry]:
     """Return what is registered in a group, by name, in alphabetical order.
 
-    Raises
-    ------
-    ConfigurationError
-        If two packages register the same name.
+    Raises ConfigurationError if two packages register the same name.
     """
     if group not in get_args(Group):
         raise ValueError(f"group: expected one of {', '.join(get_args(Group))}, got {group!r}")
@@ -109,10 +103,7 @@ def entries(group: Group) -> Mapping[str, Entry]:
 def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a type of its own
     """Return a registered part.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none of this name, or it cannot be imported.
+    Raises ConfigurationError if there is none of this name, or it cannot be imported.
     """
     known = entries(group)
     if name not in known:
@@ -126,10 +117,7 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
 def check_own_packages() -> None:
     """Check that the bench's own folders are not hidden by others of the same name on the import path.
 
-    Raises
-    ------
-    ConfigurationError
-        If one is; names both folders.
+    Raises ConfigurationError if one is; names both folders.
     """
     home = Path(__file__).resolve().parents[1]
     for name in _OWN_FOLDERS:

@@ -138,10 +138,7 @@ class Rig:
     def slots(self, definition: ProtocolDefinition) -> Slots:
         """Return the slots of a protocol, bound as the rig file says.
 
-        Raises
-        ------
-        ConfigurationError
-            If one is not bound, or bound to something of another kind.
+        Raises ConfigurationError if one is not bound, or bound to something of another kind.
         """
         used = {name: kind for name, kind in definition.may_use.items() if name in self.file.roles}
         wanted = {**definition.slots, **used}
@@ -154,10 +151,7 @@ class Rig:
     def check_needs(self, protocol: str, needs: Sequence[str]) -> None:
         """Check that the devices and signals that a protocol names are there.
 
-        Raises
-        ------
-        ConfigurationError
-            If a device or a signal is missing.
+        Raises ConfigurationError if a device or a signal is missing.
         """
         have = {*self.devices, *self._by_name}
         missing = [need for need in needs if need not in have]

@@ -1,4 +1,4 @@
-"""A rig file: what is connected, how it is bound to roles, and within which limits.
+"""A rig file: devices, slots, derived signals, interlocks and limits.
 
 A rig file is TOML::
 
@@ -63,12 +63,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bench import registry
 from bench.binding import RoleTable
 from bench.clock import Clock
+from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
 from bench.layout import DashboardLayout
 from bench.safety import Interlock
-from bench.validation import problems
 
 
 class _Table(BaseModel):
@@ -186,13 +186,8 @@ class RigFile:
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
     """Return the rigs of all installed packages by name, each with the entry that brings it.
 
-    An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is
-    left out, and joins `problems`.
-
-    Raises
-    ------
-    ConfigurationError
-        If two packages bring a rig of the same name.
+    An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is left
+    out, and joins `problems`. Raises ConfigurationError if two packages bring a rig of the same name.
     """
     found: dict[str, registry.Entry] = {}
     for entry in registry.entries("rigs").values():
@@ -330,7 +325,7 @@ def _validate(path: str, text: str, bases: Mapping[str, str], content: Mapping[s
         try:
             kind = _load("derived_signals", table.get("kind", "expression"), f"{key}kind")
             if not (isinstance(kind, type) and issubclass(kind, DerivedSignal)):
-                raise ConfigurationError(f"{key}kind = {table['kind']!r}: is no DerivedSignal")
+                raise ConfigurationError(f"{key}kind = {table['kind']!r}: is not a DerivedSignal")
             derived[name] = kind.model_validate(table)
         except ValidationError as error:
             found.extend(problems(error, kind or DerivedSignal, key))

@@ -330,15 +330,12 @@ class GeneralActuator(GeneralSensor, Actuator):
     def send(self, value: float) -> Status:
         """Send a set-point that is within the limits, and switch the output on if it is off.
 
-        Returns
-        -------
-        Status
-            Completes when the device has arrived; `Status.completed` where it does so at once.
+        The status completes when the device has arrived; return `Status.completed` where it does so at once.
         """
 
     @abstractmethod
     def switch_off(self) -> None:
-        """Switch the output off, whatever state the device is in; raise `DeviceError` if that is not confirmed."""
+        """Switch the output off from any state; raise `DeviceError` if that is not confirmed."""
 
     def set(self, value: float) -> Status:
         """Send a set-point; raises `LimitError` if it is outside of the limits, and then nothing is sent."""

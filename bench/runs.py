@@ -19,7 +19,7 @@ from typing import Any
 from rich.console import Console
 
 from bench.binding import Slots
-from bench.clock import Stopwatch, make_clock, room_date
+from bench.clock import Stopwatch, make_clock, wall_time
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
@@ -83,7 +83,7 @@ class RunResult:
     outcome : Outcome
         How it ended.
     wall_seconds : float
-        Seconds of the room, connecting and closing included.
+        Wall-clock seconds, connecting and closing included.
     """
 
     folder: Path
@@ -92,7 +92,7 @@ class RunResult:
 
     @property
     def time_ratio(self) -> float:
-        """Laboratory time over time of the room."""
+        """Laboratory time over wall-clock time."""
         return self.outcome.laboratory_seconds / self.wall_seconds
 
 
@@ -125,7 +125,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
                 f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
-                "run it in a terminal, where somebody can answer"
+                "run it in a terminal, where an operator can answer"
             )
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
@@ -200,18 +200,18 @@ def _metadata(
             "name": platform.node(),
             "system": platform.platform(),
             "python": platform.python_version(),
-            "started": room_date().isoformat(),
+            "started": wall_time().isoformat(),
         },
     }
 
 
 def _say_at_once(text: str) -> None:
-    # In a signal's handler: a console has locks, and whatever was interrupted may hold them.
+    # In a signal handler: a console has locks, and the interrupted code may hold them.
     os.write(2, f"\n{text}\n".encode())
 
 
 def _make_folder(parent: Path, name: str) -> Path:
-    stamp = room_date().strftime("%Y%m%d-%H%M%S")
+    stamp = wall_time().strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
         folder = parent / f"{name}-{stamp}{suffix}"
         try:

@@ -1,4 +1,4 @@
-"""Devices that own their line: opening it, checking which instrument answers, and releasing it."""
+"""Devices that own their line: opening it, checking the identity of the instrument, and releasing it."""
 
 from __future__ import annotations
 
@@ -56,14 +56,8 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
     settings : DriverSettings
         The device's part of the rig file; each driver has its own, as `Settings`.
-    clock : Clock
-        The clock of the run.
-    line : Line
-        The open line to the instrument.
     """
 
     _identity: Identity

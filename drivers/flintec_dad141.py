@@ -388,10 +388,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def tare(self) -> None:
         """Make the present force read zero from now on, as soon as the instrument finds the signal still.
 
-        Raises
-        ------
-        DeviceError
-            If the signal is out of range or does not become still, or the instrument does not take the tare.
+        Raises `DeviceError` if the signal is out of range or does not become still, or the instrument does not take
+        the tare.
         """
         end = self._clock.now() + self._settings.still_timeout
         while not self._checked_block().qualifier & _NO_MOTION:
@@ -408,10 +406,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def clear_tare(self) -> None:
         """Read gross force again.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument keeps its tare.
+        Raises `DeviceError` if the instrument keeps its tare.
         """
         self._line.command(_RESET_TARE)
         self._await_tare(False)
@@ -428,7 +423,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 known = " or ".join(str(each) for each in settings.device_ids)
                 raise self._wrong(
                     swapped(words, lambda order: _integer(order) in settings.device_ids)
-                    or f"is no DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or "
+                    or f"is not a DAD 141.1: its identity is {_integer(words)}, not {known}; check the address, or "
                     "add the number to `device_ids` if it is one"
                 )
             high, low = line.read(_FIRMWARE, 2)
@@ -440,7 +435,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             self._check_order()
         except _RefusedError as error:
             reason = str(error).removeprefix(f"{self.name}: ")
-            raise self._wrong(f"is no DAD 141.1: {reason}; check the address") from error
+            raise self._wrong(f"is not a DAD 141.1: {reason}; check the address") from error
         minor, major = low >> 8, low & 0xFF
         return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
 
@@ -503,7 +498,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             )
         if not (math.isfinite(block.gross) and math.isfinite(block.net)):
             raise DeviceError(
-                self.name, f"sent a weight that is no number (gross {block.gross}, net {block.net}); check its set-up"
+                self.name,
+                f"sent a weight that is not finite (gross {block.gross}, net {block.net}); check its set-up",
             )
         return block
 

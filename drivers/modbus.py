@@ -1,4 +1,4 @@
-"""What the drivers of Modbus instruments share: names of exceptions, and values in 16-bit registers."""
+"""Shared by the drivers of Modbus instruments: names of exceptions, and values in 16-bit registers."""
 
 from __future__ import annotations
 

@@ -29,10 +29,7 @@ class SerialSettings(DriverSettings):
 def open_port(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401 - pyserial is untyped
     """Open a serial port; `options` are pyserial's beside speed and timeouts.
 
-    Raises
-    ------
-    DeviceConnectionError
-        If the port cannot be opened.
+    Raises `DeviceConnectionError` if the port cannot be opened.
     """
     try:
         return serial.serial_for_url(

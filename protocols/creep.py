@@ -1,4 +1,4 @@
-"""Creep: whether the response goes on changing while the drive stands still."""
+"""Creep: how the response changes while the drive is constant."""
 
 from __future__ import annotations
 

@@ -5,29 +5,20 @@ from __future__ import annotations
 from itertools import pairwise
 
 from bench.identification import excitation
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
-
-_DRIVE = unit_of("drive")
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, RampParameters, reset
 
 
-class Parameters(LoadedParameters):
+class Parameters(RampParameters):
     """What can be set."""
 
-    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
-    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point, the first reversal")
+    high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point, the first reversal")
     center: float = parameter(
         from_slot("drive", lambda drive: drive.at(0.5), "middle of the range of drive"),
-        unit=_DRIVE,
+        unit=DRIVE,
         help="set-point about which the oscillation decays",
     )
     half_cycles: int = parameter(36, unit="1", low=1, high=1000, help="number of half-cycles after the first rise")
-    increment: float = parameter(
-        from_slot("drive", "increment"), unit=_DRIVE, help="difference of neighbouring set-points"
-    )
-    dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
-    )
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)

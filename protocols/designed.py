@@ -6,24 +6,17 @@ import numpy as np
 
 from bench.hysteresis import uniform_levels
 from bench.identification import covering_sequence, design
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
-
-_DRIVE = unit_of("drive")
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, SweepParameters, reset
 
 
-class Parameters(LoadedParameters):
+class Parameters(SweepParameters):
     """What can be set."""
 
-    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
-    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point")
-    plane_low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lower end of the Preisach plane")
-    plane_high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="upper end of the Preisach plane")
+    plane_low: float = parameter(from_slot("drive", "low"), unit=DRIVE, help="lower end of the Preisach plane")
+    plane_high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="upper end of the Preisach plane")
     levels: int = parameter(40, unit="1", low=2, high=200, help="levels of the sequence, as the model's or finer")
     per_cell: int = parameter(2, unit="1", low=1, high=20, help="set-points from one level to the next")
-    dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
-    )
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
-from bench.controllers import ControllerSetup, controller_names, load_model_for, make_controller
+from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
+from protocols.preparation import (
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    ControlledParameters,
+    load_checked_model,
+    reset_unknown_memory,
+)
 
 _DRIVE = unit_of("drive")
-_RESET_SECONDS = 8.0
-"""Least time of the reset, s."""
 
 
-class Parameters(LoadedParameters):
+class Parameters(ControlledParameters):
     """What can be set."""
 
-    model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
     controller: str = parameter(
-        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('follow'))}"
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("follow")
     )
     reference: str = parameter("", unit="", help="CSV file with columns `time` and `reference`; a sine if not given")
     low: float = parameter(from_slot("response", "low"), unit=unit_of("response"), help="lowest value of the sine")
@@ -33,10 +37,6 @@ class Parameters(LoadedParameters):
     duration: float = parameter(800.0, unit="s", low=1, high=1e7, help="how long the sine is followed")
     rate: float = parameter(2.0, unit="1/s", low=0.01, high=50, help="set-points and readings per second")
     fastest: float = parameter(from_slot("drive", "rate"), unit=f"{_DRIVE}/s", help="what the drive can follow")
-    reset: float = parameter(
-        from_slot("drive", "saturating"), unit=unit_of("drive"), help="where the memory is reset"
-    )
-    hottest: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point allowed")
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
@@ -48,8 +48,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     of the specimen is unknown at the start, so it is reset first, by negative saturation at `reset`.
     """
     drive, response = slots["drive"], slots["response"]
-    model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=response.unit)
-    check_reset(model, drive, parameters.reset)
+    model = load_checked_model(parameters, slots)
     times, values = _reference(parameters)
     if not model.operator.memoryless:
         slope = fastest_slope(model.operator.inverse(), times, values)
@@ -61,33 +60,27 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     limits = (parameters.reset, parameters.hottest)
     duration = float(times[-1])
 
-    reading = yield from reset(
-        slots, parameters.reset, _RESET_SECONDS, load=parameters.load, why=unknown_memory(drive, parameters.reset)
-    )
+    reading = yield from reset_unknown_memory(parameters, slots)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     setup = ControllerSetup(model=model, limits=limits, state=state)
     follower = make_controller("follow", parameters.controller, setup)
+
+    def follow(reference: Callable[[float], float], seconds: float, timeout: float, label: str) -> Control:
+        return Control(
+            task=FollowReference(follower, reference, 1.0 / parameters.rate, seconds),
+            actuator=drive.device,
+            drive=drive.signal,
+            response=response.signal,
+            limits=limits,
+            timeout=timeout,
+            label=label,
+        )
+
     yield Phase(f"approach, {parameters.controller}")
     # The way to the first value is no part of the reference.
-    yield Control(
-        task=FollowReference(follower, lambda _: float(values[0]), 1.0 / parameters.rate, 20.0),
-        actuator=drive.device,
-        drive=drive.signal,
-        response=response.signal,
-        limits=limits,
-        timeout=60.0,
-        label="approach",
-    )
+    yield follow(lambda _: float(values[0]), 20.0, 60.0, "approach")
     yield Phase(f"follow, {parameters.controller}")
-    yield Control(
-        task=FollowReference(follower, lambda t: float(np.interp(t, times, values)), 1.0 / parameters.rate, duration),
-        actuator=drive.device,
-        drive=drive.signal,
-        response=response.signal,
-        limits=limits,
-        timeout=duration + 60.0,
-        label=FOLLOW,
-    )
+    yield follow(lambda t: float(np.interp(t, times, values)), duration, duration + 60.0, FOLLOW)
 
 
 def _reference(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,13 @@
-"""What general protocols do before they measure: the load, and the reset of the memory."""
+"""Preparation of general protocols: the load, and the reset of the memory."""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
 from typing import TypeAlias, TypeVar
 
-from bench.controllers import saturated_below
+from bench.controllers import load_model_for, saturated_below
 from bench.devices import Actuator, Signal
+from bench.model_file import ModelFile
 from bench.protocol import (
     Dwell,
     Message,
@@ -22,7 +23,6 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
-from bench.results.model_file import ModelFile
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""
@@ -33,7 +33,10 @@ R = TypeVar("R")
 Part: TypeAlias = Generator[Message, Reading, R]
 """A part of a protocol that returns something, such as its last reading."""
 
-_SETTLE_LOAD = Dwell(5.0)
+SETTLE_LOAD = Dwell(5.0)
+"""What follows when an operator has changed the load."""
+
+DRIVE = unit_of("drive")
 
 
 class LoadedParameters(ProtocolParameters):
@@ -44,39 +47,65 @@ class LoadedParameters(ProtocolParameters):
     )
 
 
+class SweepParameters(LoadedParameters):
+    """What can be set where the drive sweeps its range, set-point by set-point."""
+
+    low: float = parameter(from_slot("drive", "low"), unit=DRIVE, help="lowest set-point, where the memory is reset")
+    high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point")
+    dwell: float = parameter(
+        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+    )
+
+
+class RampParameters(SweepParameters):
+    """What can be set where ramps join the set-points."""
+
+    increment: float = parameter(
+        from_slot("drive", "increment"), unit=DRIVE, help="largest difference of neighbouring set-points"
+    )
+
+
+class ControlledParameters(LoadedParameters):
+    """What can be set where a controller by a model drives the specimen."""
+
+    model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
+    reset: float = parameter(from_slot("drive", "saturating"), unit=DRIVE, help="where the memory is reset")
+    hottest: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point allowed")
+
+
+def load_checked_model(parameters: ControlledParameters, slots: Slots) -> ModelFile:
+    """Return the model in the units of the slots.
+
+    Raises DataError as `load_model_for`, and ValueError if the reset does not saturate the specimen of the model.
+    """
+    drive, setpoint = slots["drive"], parameters.reset
+    model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=slots["response"].unit)
+    if not saturated_below(model.operator, setpoint):
+        raise ValueError(
+            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; "
+            "choose it lower, or identify the model with a plane that begins higher"
+        )
+    return model
+
+
 def hang_load(slots: Slots, load: float) -> Part[None]:
     """Have a load hung on the specimen, if the rig has such a slot, and check by its signal that this was done."""
     if "load" in slots and load:
-        slot = slots["load"]
-        tolerance = slot.table.tolerance_of(load)
-        yield Prompt(
-            text=slot.table.prompt.format(value=load, unit=slot.unit),
-            task=slot.table.task or slot.name,
-            value=load,
-            settle=_SETTLE_LOAD,
-            signal=slot.signal,
-            low=load - tolerance,
-            high=load + tolerance,
-        )
+        yield from prompt_for_load(slots["load"], load, slots["load"].table.tolerance_of(load))
 
 
-def check_reset(model: ModelFile, drive: Slot, setpoint: float) -> None:
-    """Check that a set-point saturates the specimen of a model.
-
-    Raises
-    ------
-    ValueError
-        If it does not.
-    """
-    if not saturated_below(model.operator, setpoint):
-        raise ValueError(
-            f"reset = {setpoint:g} {drive.unit} does not saturate the model's Preisach plane; choose it lower"
-        )
-
-
-def unknown_memory(drive: Slot, setpoint: float) -> str:
-    """Return the note that a run begins with where the memory is unknown."""
-    return f"the memory of the specimen is unknown: it is reset to negative saturation at {setpoint:g} {drive.unit}"
+def prompt_for_load(slot: Slot, load: float, tolerance: float) -> Part[Reading]:
+    """Prompt for a load on the specimen, and verify by its signal, within a tolerance, that this was done."""
+    reading = yield Prompt(
+        text=slot.table.prompt.format(value=load, unit=slot.unit),
+        task=slot.table.task or slot.name,
+        value=load,
+        settle=SETTLE_LOAD,
+        signal=slot.signal,
+        low=load - tolerance,
+        high=load + tolerance,
+    )
+    return reading
 
 
 def reset(slots: Slots, setpoint: float, minimum: float, *, load: float = 0.0, why: str = "") -> Part[Reading]:
@@ -102,3 +131,10 @@ def reset(slots: Slots, setpoint: float, minimum: float, *, load: float = 0.0, w
         yield Note(why)
     reading = yield Step({drive.device: setpoint}, drive.settle(minimum), label="reset")
     return reading
+
+
+def reset_unknown_memory(parameters: ControlledParameters, slots: Slots) -> Part[Reading]:
+    """Reset the memory of a specimen of which nothing is known, and say so in the log."""
+    setpoint = parameters.reset
+    why = f"the memory of the specimen is unknown: it is reset to negative saturation at {setpoint:g} "
+    return (yield from reset(slots, setpoint, 8.0, load=parameters.load, why=why + slots["drive"].unit))

@@ -1,38 +1,28 @@
-"""Validation: a random sequence of set-points that no model was fitted to."""
+"""Validation: a random sequence of set-points that was not used for identification."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bench.identification import excitation
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, reset
-
-_DRIVE = unit_of("drive")
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, RampParameters, reset
 
 
-class Parameters(LoadedParameters):
+class Parameters(RampParameters):
     """What can be set."""
 
-    low: float = parameter(from_slot("drive", "low"), unit=_DRIVE, help="lowest set-point, where the memory is reset")
-    high: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point")
     inner_low: float = parameter(
         from_slot("drive", lambda drive: drive.at(0.3), "30 % of the range of drive"),
-        unit=_DRIVE,
+        unit=DRIVE,
         help="lower end of the range of most targets",
     )
     inner_high: float = parameter(
         from_slot("drive", lambda drive: drive.at(0.8), "80 % of the range of drive"),
-        unit=_DRIVE,
+        unit=DRIVE,
         help="upper end of the range of most targets",
     )
     count: int = parameter(600, unit="1", low=10, high=100000, help="number of set-points")
-    increment: float = parameter(
-        from_slot("drive", "increment"), unit=_DRIVE, help="largest difference of neighbouring set-points"
-    )
-    dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
-    )
     sequence_seed: int = parameter(5, unit="1", low=0, help="seed of the sequence, independent of the rig's seed")
 
 

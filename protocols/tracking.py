@@ -1,4 +1,4 @@
-"""Tracking: bring the output to one target after another, by a controller of choice."""
+"""Tracking: bring the output to a sequence of targets, with a selectable controller."""
 
 from __future__ import annotations
 
@@ -8,29 +8,25 @@ import numpy as np
 
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
-from bench.controllers import (
-    ControllerSetup,
-    controller_names,
-    load_model_for,
-    make_controller,
-)
+from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LoadedParameters, check_reset, reset, unknown_memory
+from protocols.preparation import (
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    ControlledParameters,
+    load_checked_model,
+    reset_unknown_memory,
+)
 
-_DRIVE = unit_of("drive")
-_RESET_SECONDS = 8.0
-"""Least time of the reset, s."""
 
-
-class Parameters(LoadedParameters):
+class Parameters(ControlledParameters):
     """What can be set."""
 
-    model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
     controller: str = parameter(
-        "closed-loop-inverse", unit="", help=f"which controller: {', '.join(controller_names('target'))}"
+        "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("target")
     )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
     targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")
@@ -42,17 +38,13 @@ class Parameters(LoadedParameters):
     )
     count: int = parameter(60, unit="1", low=2, high=10000, help="number of generated targets")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
-    reset: float = parameter(
-        from_slot("drive", "saturating"), unit=unit_of("drive"), help="where the memory is reset"
-    )
-    hottest: float = parameter(from_slot("drive", "high"), unit=_DRIVE, help="highest set-point allowed")
     readings: int = parameter(10, unit="1", low=1, high=1000, help="readings at each target once it is reached")
     timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
-    """Bring the response to one target after another.
+    """Bring the response to a sequence of targets.
 
     The targets are a decaying oscillation and a random part between `low` and `high`, or those of a file. When
     the controller has done what it can, `readings` readings are taken, 0.1 s apart: their mean less the target
@@ -60,8 +52,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     negative saturation at `reset`.
     """
     drive, response = slots["drive"], slots["response"]
-    model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=response.unit)
-    check_reset(model, drive, parameters.reset)
+    model = load_checked_model(parameters, slots)
     if parameters.targets:
         targets = read_columns(Path(parameters.targets), ["target"], at_least=1).values["target"]
     else:
@@ -69,9 +60,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         targets = tracking_targets(rng, parameters.low, parameters.high, parameters.count)
     limits = (parameters.reset, parameters.hottest)
 
-    reading = yield from reset(
-        slots, parameters.reset, _RESET_SECONDS, load=parameters.load, why=unknown_memory(drive, parameters.reset)
-    )
+    reading = yield from reset_unknown_memory(parameters, slots)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state)
     controller = make_controller("target", parameters.controller, setup)

@@ -22,8 +22,6 @@ class EmulatedLaboratory:
         Its name in messages.
     servers : mapping of str to server
         The instruments by the name of their port: serial ones, and those on TCP.
-    clock : Clock
-        The clock of the run.
     """
 
     def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpServer], clock: Clock) -> None:
@@ -35,10 +33,7 @@ class EmulatedLaboratory:
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name.
 
-        Raises
-        ------
-        ValueError
-            If another laboratory of this process has the same ports open; it keeps them.
+        Raises `ValueError` if another laboratory of this process has the same ports open; it keeps them.
         """
         ports = {}
         with ExitStack() as opened:
@@ -56,10 +51,7 @@ class EmulatedLaboratory:
     def operate(self, task: str, value: float) -> None:  # noqa: ARG002
         """Refuse a task.
 
-        Raises
-        ------
-        ConfigurationError
-            Always.
+        Raises `ConfigurationError` always.
         """
         raise ConfigurationError(f"the {self._title} cannot carry out {task!r}; nothing is done by hand there")
 

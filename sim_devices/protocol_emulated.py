@@ -29,10 +29,7 @@ def install() -> None:
 def register(name: str, server: WireServer, clock: Clock) -> str:
     """Put an emulated instrument at `emulated://NAME` and return that address.
 
-    Raises
-    ------
-    ValueError
-        If the name is taken.
+    Raises `ValueError` if the name is taken.
     """
     if name in _servers:
         raise ValueError(f"name: {_SCHEME}{name} is taken by another emulated instrument of this process")
@@ -59,10 +56,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     def open(self) -> None:
         """Connect to the instrument.
 
-        Raises
-        ------
-        serial.SerialException
-            If the port is open already, or no emulated instrument has this name.
+        Raises `serial.SerialException` if the port is open already, or no emulated instrument has this name.
         """
         if self.is_open:
             raise SerialException("Port is already open.")
@@ -87,10 +81,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes; fewer only after the timeout has passed on the clock.
 
-        Raises
-        ------
-        serial.SerialException
-            If bytes are missing and there is no timeout: a real port would wait for ever.
+        Raises `serial.SerialException` if bytes are missing and there is no timeout: a real port would wait for ever.
         """
         clock = self._clock_of_open_port()
         if len(self._received) < size and self._timeout is None:
@@ -144,23 +135,3 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def _update_break_state(self) -> None:
         pass
-
-    @property
-    def cts(self) -> bool:
-        """Always clear to send."""
-        return True
-
-    @property
-    def dsr(self) -> bool:
-        """Always ready."""
-        return True
-
-    @property
-    def ri(self) -> bool:
-        """Never rings."""
-        return False
-
-    @property
-    def cd(self) -> bool:
-        """Carrier is there."""
-        return True

@@ -40,8 +40,6 @@ class World:
     ----------
     plant : Plant
         The physics that the instruments look at and act on.
-    clock : Clock
-        The clock of the run.
 
     Attributes
     ----------

@@ -16,8 +16,8 @@ LADDER = re.compile(
 )
 # Names of the rigs, and of their specimens, devices and signals.
 OF_A_RIG = re.compile(
-    r"\b([Vv][Oo]2|(micro)?cantilever|sma|SMA|nitinol|[Mm]c[Kk]ibben|(artificial )?muscles?|[Hh]ybrid|piezo|psd|peltier"
-    r"|tec_\w+|curvature_\w+|supply_voltage|wire_end\w*|load_cell_\w+|displacement_position)\b"
+    r"\b([Vv][Oo]2|(micro)?cantilever|sma|SMA|nitinol|[Mm]c[Kk]ibben|(artificial )?muscles?|[Hh]ybrid|piezo|psd"
+    r"|peltier|tec_\w+|curvature_\w+|supply_voltage|wire_end\w*|load_cell_\w+|displacement_position)\b"
 )
 WHERE_A_RIG_IS_NAMED = {
     # Executed examples need a rig that is installed.
@@ -29,7 +29,7 @@ WHERE_A_RIG_IS_NAMED = {
     "bench/control/baselines.py": {"VO2"},
     "bench/hysteresis/preisach.py": {"VO2"},
     # A format that files of former versions have.
-    "bench/results/model_file.py": {"hybrid"},
+    "bench/model_file.py": {"hybrid"},
 }
 MACHINE = re.compile(
     r"/(home|root|tmp|Users|work)/\w|\b(pypi|index)\.[a-z]+\.(org|net|com)/simple|localhost:\d{4}/simple"

@@ -22,14 +22,14 @@ from bench.errors import BenchError
 _EPILOG = (
     "Exit codes: 0 done; 1 failed; 2 wrong command, rig file or parameter (nothing has moved); 3 unusable data or "
     "model file; 4 device fault; 5 interlock; 6 not steady in time; 7 safe state not confirmed; 130 ended by the "
-    "operator. Try: bench run damped-oscillation --rig vo2 --clock virtual"
+    "operator. Try: bench list, and bench run PROTOCOL --rig RIG --clock virtual"
 )
 
 app = typer.Typer(
     name="bench",
     cls=RegisteredCommands,
     help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
-    "identify hysteresis models from what was measured, and apply them.",
+    "identify hysteresis models from the measurements, and apply them.",
     epilog=_EPILOG,
     no_args_is_help=True,
     add_completion=False,

@@ -1,4 +1,4 @@
-"""What the commands share: the console, options, and how results and errors are printed."""
+"""Shared by the commands: console, options, and printing of results and errors."""
 
 from __future__ import annotations
 
@@ -62,10 +62,7 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
 def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
     """Split texts of the form `key=value`.
 
-    Raises
-    ------
-    ConfigurationError
-        If one is not of this form, or a key comes twice.
+    Raises ConfigurationError if one is not of this form, or a key comes twice.
     """
     pairs: dict[str, str] = {}
     for text in texts:
@@ -92,10 +89,7 @@ def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
     """Write a result for programs, if a file was asked for.
 
-    Raises
-    ------
-    ConfigurationError
-        If the file cannot be written.
+    Raises ConfigurationError if the file cannot be written.
     """
     if path is None:
         return

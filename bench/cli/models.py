@@ -15,12 +15,22 @@ from bench.errors import ConfigurationError
 app = typer.Typer()
 
 
+DataArgument = Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
+ContinueMemory = Annotated[
+    bool,
+    typer.Option(
+        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+    ),
+]
+
+
 @app.command("identify")
 def identify_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
-    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="What answers.")],
-    model: Annotated[str, typer.Option(metavar="NAME", help="Which model; `bench list` shows them.")],
+    file: DataArgument,
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
+    model: Annotated[str, typer.Option(metavar="NAME", help="Model to fit; `bench list` shows the names.")],
     levels: Annotated[
         int | None,
         typer.Option(min=2, max=1000, help="Discretization levels of the Preisach plane; 20 if not given."),
@@ -41,7 +51,8 @@ def identify_(
     ] = None,
     smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
     skip: Annotated[
-        int, typer.Option(metavar="ROWS", help="First rows that drive the memory but do not count in the fit.")
+        int,
+        typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
     ] = 0,
     initial: Annotated[
         str | None,
@@ -53,15 +64,13 @@ def identify_(
     ] = None,
     options: Annotated[
         list[str] | None,
-        typer.Option(
-            "--option", metavar="KEY=VALUE", help="Another option of the model, a number; may come several times."
-        ),
+        typer.Option("--option", metavar="KEY=VALUE", help="Another numerical option of the model; repeatable."),
     ] = None,
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Where the model file goes.")] = None,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw loops, errors and density there.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
@@ -106,19 +115,14 @@ def identify_(
 
 @app.command("predict")
 def predict_(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")],
-    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="What drives.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the input and the prediction go.")],
+    model_path: ModelArgument,
+    file: DataArgument,
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for input and prediction.")],
     output_column: Annotated[
-        str | None, typer.Option("--output", metavar="COLUMN", help="What was measured, to compare with.")
+        str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
@@ -126,8 +130,8 @@ def predict_(
     Writes a CSV file with the input column and `predicted`.
     """
     from bench.identification import measure_errors
+    from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
-    from bench.results.model_file import load_model
     from bench.results.models import check_unit, errors_json, outside_of_range, predict
 
     model = load_model(model_path)
@@ -161,15 +165,18 @@ def compare_(
         Path, typer.Option("--data", metavar="FILE", help="CSV file with a header, or the folder of a run.")
     ],
     input_column: Annotated[
-        str | None, typer.Option("--input", metavar="COLUMN", help="What drives; the first model's if not given.")
+        str | None, typer.Option("--input", metavar="COLUMN", help="Input column; the first model's if not given.")
     ] = None,
     output_column: Annotated[
-        str | None, typer.Option("--output", metavar="COLUMN", help="What answers; the first model's if not given.")
+        str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
     skip: Annotated[
-        int, typer.Option(min=0, metavar="ROWS", help="First rows that drive the memory but do not count.")
+        int,
+        typer.Option(
+            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+        ),
     ] = 0,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the residuals there.")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Compare models on measurements that they may not have seen.
@@ -236,7 +243,7 @@ def design(
         dwell = dwell if dwell is not None else (drive.dwell if drive else None)
         plane = plane or (file.dashboard.plane if file.dashboard else None)
     if plane is None or operating is None or dwell is None:
-        raise ConfigurationError("give --rig RIG, whose file says them, or --plane, --range and --dwell")
+        raise ConfigurationError("give --rig RIG, or --plane, --range and --dwell")
     result = assess_designs(plane, operating, levels, dwell)
     table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
     for column in ("set-points", "cells covered", "rank / coefficients", "condition", "laboratory time"):
@@ -263,20 +270,15 @@ class PolicyOption(Enum):
 
 @app.command()
 def invert(
-    model_path: Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")],
+    model_path: ModelArgument,
     file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Where the set-points go.")] = Path("setpoints.csv"),
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
     policy: Annotated[
         PolicyOption,
-        typer.Option(help="Which answer, where there are several: nearest, or the paper's direction rule."),
+        typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
-    continue_memory: Annotated[
-        bool,
-        typer.Option(
-            "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
-        ),
-    ] = False,
+    continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
 ) -> None:
     """Compute the set-points that bring a model's output to one target after another.
@@ -285,8 +287,8 @@ def invert(
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value).
     """
+    from bench.model_file import load_model
     from bench.results.data import header_with_unit, read_columns, write_csv
-    from bench.results.model_file import load_model
     from bench.results.models import check_unit, invert_targets
 
     model = load_model(model_path)

@@ -18,11 +18,11 @@ def report(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
     models: Annotated[
         list[Path] | None,
-        typer.Option("--model", metavar="FILE", help="Model file to compare; may come several times."),
+        typer.Option("--model", metavar="FILE", help="Model file to compare; repeatable."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where figures go; the folder `report` of the run if not given."),
+        typer.Option(metavar="DIR", help="Folder for figures; the folder `report` of the run if not given."),
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -30,7 +30,7 @@ def report(
 
     Models that were identified from this run are compared without being named. Works while the run goes on.
     """
-    from bench.results.model_file import load_model
+    from bench.model_file import load_model
     from bench.results.report import report_run
 
     result = report_run(run, [load_model(path) for path in models or []], out, console)
@@ -49,9 +49,9 @@ class ExportFormat(StrEnum):
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
-    format_: Annotated[ExportFormat, typer.Option("--format", help="Which format.")],
+    format_: Annotated[ExportFormat, typer.Option("--format", help="Format of the files.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the files go; the folder of the run if not given.")
+        Path | None, typer.Option(metavar="DIR", help="Folder to write to; the folder of the run if not given.")
     ] = None,
     json_file: JsonOption = None,
 ) -> None:

@@ -65,7 +65,7 @@ class Studies(RegisteredCommands):
             seed: Annotated[
                 int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
             ] = 0,
-            out: Annotated[Path, typer.Option(metavar="DIR", help="Where runs, models and figures go.")] = Path(
+            out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for runs, models and figures.")] = Path(
                 "recordings"
             ),
             live: Annotated[

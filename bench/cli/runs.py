@@ -1,4 +1,4 @@
-"""The commands that list what there is and carry protocols out."""
+"""The commands that list parts and run protocols."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ UNSAFE_EXIT_CODE = 7
 def list_(
     name: Annotated[
         str | None,
-        typer.Argument(help="A rig, a protocol or a model, to see all of it; nothing, to see what there is."),
+        typer.Argument(help="A rig, a protocol or a model to show in full; without it, all names."),
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -96,7 +96,7 @@ def run(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; may come several times."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
     ] = None,
     overrides: Annotated[
         list[str] | None,
@@ -106,16 +106,14 @@ def run(
             help="Replace a value of the rig file, such as devices.NAME.port=/dev/ttyUSB1; may come several times.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in an emulated laboratory.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")] = 0,
     clock: Annotated[
         str,
         typer.Option(
             help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast, up to about 100)."
         ),
     ] = "wall",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the folder of the run is made.")] = Path(
-        "recordings"
-    ),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
     ] = False,
@@ -131,7 +129,7 @@ def run(
     """Carry a protocol out on a rig, record it, and leave every device in its safe state.
 
     The set-points are checked against the rig's limits before anything moves. Ctrl-C pauses at the next
-    step and asks; Ctrl-C again ends at once; so do SIGTERM and SIGHUP. Whatever ends the run, every
+    step and asks; Ctrl-C again ends at once; so do SIGTERM and SIGHUP. However the run ends, every
     device is brought into its safe state, and what was recorded so far is kept.
     """
     from bench.protocol import find_protocol
@@ -142,7 +140,7 @@ def run(
             print_protocol(find_protocol(protocol), rig)
         return
     if rig is None:
-        raise ConfigurationError("--rig is missing: `bench list` shows the packaged rigs")
+        raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
     definition = find_protocol(protocol)
     given = parse_assignments("--set", settings or [])
 

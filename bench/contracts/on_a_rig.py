@@ -45,10 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Find the devices.
 
-    Raises
-    ------
-    pytest.UsageError
-        If an option is missing, the rig cannot be read, or it has no such device.
+    Raises pytest.UsageError if an option is missing, the rig cannot be read, or it has no such device.
     """
     device, rig, set_points = (session.config.getoption(name) for name in ("device", "rig", "set_points"))
     if device is None or rig is None:
@@ -62,8 +59,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     entries = _entries(file, device)
     if not file.emulated and set_points is None and any(issubclass(entry.driver, Actuator) for entry in entries):
         raise pytest.UsageError(
-            f"{file.path} is a real rig, on which {device} will move: "
-            "say between which values by --set-points FIRST SECOND"
+            f"{file.path} is a real rig, on which {device} will move; "
+            "give the two values by --set-points FIRST SECOND"
         )
     session.config.stash[_SUBJECT] = _Subject(file, entries)
 

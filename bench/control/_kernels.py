@@ -45,15 +45,11 @@ def _tabulate(levels: Floats, density: Floats, table: Floats, below: Floats) -> 
 
 @njit(cache=True)
 def adapt(
-    levels: Floats,
-    inverse_step: float,
+    axis: memory.Axis,
     old_density: Floats,
     bias: float,
-    breaks: Floats,
-    quadratics: Floats,
-    left: Floats,
-    height: Floats,
-    inside: float,
+    terms: memory.Terms,
+    start: memory.Start,
     raw: float,
     value: float,
     before: float,
@@ -68,21 +64,20 @@ def adapt(
     outputs at negative and at positive saturation, and the error of the predicted change (NaN without one).
     """
     density = old_density.copy()
+    levels, inverse_step = axis
     order = levels.size - 1
     error = np.nan
+    here = np.empty(1)
+    here[0] = value
     if not np.isnan(before):
-        inputs = np.empty(1)
-        inputs[0] = value
         starts = np.empty(2, np.int64)
-        no_cells, no_changes = np.empty(0, np.int32), np.empty(0)
-        count = _swept_differences(
-            inputs, levels, inverse_step, left, height, inside, starts, no_cells, no_changes, False
-        )
+        none = np.empty(0, np.int32), np.empty(0)
+        count = _swept_differences(here, axis, start, starts, none, False)
         cells, changes = np.empty(count, np.int32), np.empty(count)
-        _swept_differences(inputs, levels, inverse_step, left, height, inside, starts, cells, changes, True)
+        _swept_differences(here, axis, start, starts, (cells, changes), True)
         areas = np.empty(count)
         on = np.zeros(density.size)
-        predicted = _reversible_value(breaks, quadratics, value) - _reversible_value(breaks, quadratics, raw)
+        predicted = _reversible_value(terms, value) - _reversible_value(terms, raw)
         for e in range(count):
             c = cells[e]
             predicted += density[c] * changes[e]
@@ -105,13 +100,11 @@ def adapt(
     table = np.zeros((order, order, 4))
     below = np.empty(order + 1)
     mass = _tabulate(levels, density, table, below)
-    here = np.empty(1)
-    here[0] = value
     offset = bias - mass
-    found = _evaluate(here, levels, inverse_step, table, below, offset, breaks, quadratics, left, height, inside)[0]
+    found = _evaluate(here, (levels, inverse_step, table), below, offset, terms, start)[0]
     if not np.isnan(output):
         bias += bias_step * (output - found)
     offset = bias - mass
-    minus = offset + _reversible_value(breaks, quadratics, levels[0])
-    plus = offset + 2.0 * mass + _reversible_value(breaks, quadratics, levels[-1])
+    minus = offset + _reversible_value(terms, levels[0])
+    plus = offset + 2.0 * mass + _reversible_value(terms, levels[-1])
     return density, table, below, bias, offset, minus, plus, error

@@ -120,17 +120,12 @@ class Adapter:
         if not math.isfinite(output):
             raise ValueError(f"output: expected a finite number, got {output}")
         model, t = self.model, self.model.lattice
-        left, height, inside = state.staircase(t.levels.item(0), t.levels.item(-1))
         density, table, below, bias, offset, minus, plus, error = _kernels.adapt(
-            t.levels,
-            t.inverse_step,
+            (t.levels, t.inverse_step),
             model.density,
             model.bias,
-            t.breaks,
-            t.quadratics,
-            np.array(left, dtype=np.float64),
-            np.array(height, dtype=np.float64),
-            inside,
+            t.terms,
+            model._pieces(state),
             state.input,
             float(value),
             self.output,

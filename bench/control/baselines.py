@@ -75,8 +75,8 @@ class IntegralParameters:
     gain : float
         Input units per second for one output unit of error; negative for an actuator whose output falls.
         On a branch of slope s the closed loop has the time constant 1 / (gain s), which should not be
-        shorter than the input takes to follow: the default gives 0.7 s at 280 (1/m)/K, the steepest of a
-        VO2 film, and 7 s where it is a tenth of that.
+        shorter than the input takes to follow: the default gives 0.7 s at 280 (1/m)/K, the steepest of
+        the film of Zhang et al. 2013, and 7 s where it is a tenth of that.
     period : float
         Time between two corrections, s.
     duration : float

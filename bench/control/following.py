@@ -44,23 +44,9 @@ class _Follower(ControllerBase, ABC):
     """What the followers share: one step at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
-        """Take in a reading and return the set-point for the coming period.
+        """Take in a reading and return the set-point for the coming period; see `Follower.update`.
 
-        Parameters
-        ----------
-        t : float
-            Time, s.
-        measured_input : float
-            What the input's own sensor says, input units; nan if missing.
-        output : float
-            One reading of the output; nan if missing.
-        reference : float
-            Wanted output at the end of the coming period.
-
-        Raises
-        ------
-        ValueError
-            If the reference is not finite.
+        A missing reading is nan. Raises ValueError if the reference is not finite.
         """
         before, self._reference = self._reference, _checks.number("reference", reference)
         step = 0.0 if math.isnan(before) else reference - before
@@ -87,6 +73,8 @@ class OpenLoopFollower(_Follower):
         Numbers of the follower; only `lead` is used.
     """
 
+    _corrects = False
+
     def __init__(
         self,
         inverse: Inverse[Any],
@@ -96,7 +84,9 @@ class OpenLoopFollower(_Follower):
     ) -> None:
         super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
-        self._parameters = parameters or FollowingParameters()
+        self._parameters = p = parameters or FollowingParameters()
+        if self._corrects:
+            self._estimator = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
 
     def _answer_to(self, step: float, output: float) -> float:  # noqa: ARG002
         return self._inverted(step, 0.0)
@@ -129,21 +119,11 @@ class ClosedLoopFollower(OpenLoopFollower):
         Numbers of the follower.
     """
 
-    def __init__(
-        self,
-        inverse: Inverse[Any],
-        state: Any = None,  # noqa: ANN401 - each operator has its own
-        limits: tuple[float, float] | None = None,
-        parameters: FollowingParameters | None = None,
-    ) -> None:
-        super().__init__(inverse, state, limits, parameters)
-        self._estimator: DisturbanceEstimator = DisturbanceEstimator(
-            walk_variance=self._parameters.walk_variance, reading_variance=self._parameters.reading_variance
-        )
+    _corrects = True
 
     def _answer_to(self, step: float, output: float) -> float:
-        known = self._is_known(output)
-        self._estimator.update(output - self._modelled() if known else None)
+        assert self._estimator is not None
+        self._estimator.update(output - self._modelled() if self._is_known(output) else None)
         return self._inverted(step, self._estimator.value)
 
 

@@ -1,4 +1,4 @@
-"""Tracking to the sensor's noise, by turning back a little at the target: the hysteresis then holds it."""
+"""Tracking to the sensor's noise: the input turns back at the target, so that the hysteresis holds the output."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Direction = Literal[-1, 1]
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """Numbers of the latched controller; defaults for a VO2 film (input in °C, output in 1/m).
+    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m).
 
     Parameters
     ----------
@@ -120,8 +120,8 @@ class Latched(Correcting):
     """The closed-loop inverse, and then a lock: accurate to the sensor's noise where others wander.
 
     On a branch where hysterons switch, an unseen wander of the input moves the output by the branch's steep
-    slope (280 (1/m)/K of a VO2 film). Just behind a reversal nothing switches: the output has the small slope
-    of the reversible part alone, and holds. So the controller
+    slope (280 (1/m)/K for the film of Zhang et al. 2013). Just behind a reversal nothing switches: the output has
+    the small slope of the reversible part alone, and holds. So the controller
 
     1. approaches the target from one side, by the model, to a little before it;
     2. creeps on until little is left;
@@ -276,20 +276,7 @@ class Latched(Correcting):
 
 
 def reversible_slope(operator: Preisach, value: float) -> float:
-    """Return the slope of the output behind a reversal, where no hysteron switches.
-
-    Parameters
-    ----------
-    operator : Preisach
-        The model.
-    value : float
-        Input.
-
-    Returns
-    -------
-    float
-        Output units per input unit; 0 without reversible part.
-    """
+    """Return the slope of the output behind a reversal, where no hysteron switches; 0 without reversible part."""
     if operator.reversible is None:
         return 0.0
     breaks, quadratics = operator.reversible.pieces()
@@ -298,23 +285,9 @@ def reversible_slope(operator: Preisach, value: float) -> float:
 
 
 def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: float) -> float | None:
-    """Return the first input in one direction at which the output has come to the target.
+    """Return the first input in one direction (-1 or 1) at which the output has come to the target; None if nowhere.
 
-    Parameters
-    ----------
-    operator : Preisach
-        The model.
-    state : MemoryCurve
-        Memory to start from.
-    direction : {-1, 1}
-        Downwards or upwards.
-    target : float
-        Output; upwards it is met by any output not below it, downwards by any not above it.
-
-    Returns
-    -------
-    float or None
-        Input, the present one if the target is met already; None if it is not met on the way.
+    Upwards the target is met by any output not below it, downwards by any not above it: perhaps by the present one.
     """
     missing = direction * (target - operator.value(state))
     while missing > 0.0:

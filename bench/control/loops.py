@@ -1,4 +1,4 @@
-"""Control tasks: a controller and what it has to reach or follow, carried out sample by sample."""
+"""Control tasks: a controller and its targets or reference, carried out sample by sample."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHORTEST_WAIT = 1e-3
 class ControlTask(Protocol):
     """A controller at work: asked for a command at its beginning and after each reading, until it is done.
 
-    Beside input and output it is given whatever further signals its `Control` names, in that order.
+    Beside input and output it receives the further signals that its `Control` names, in that order.
     """
 
     def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:
@@ -155,7 +155,7 @@ class FollowReference:
         self._sample += 1
         end = self._sample * self._period
         self._setpoint = self._follower.update(t, measured_input, output, self._reference(end))
-        # Counted from the beginning, so that what is late once is not late ever after.
+        # Counted from the beginning, so that one delay does not shift all later samples.
         return Command(self._setpoint, max(SHORTEST_WAIT, self._start + end - t))
 
     @property

@@ -15,7 +15,7 @@ from bench.hysteresis._checks import Floats
 
 
 def notch(frequency: float, rate: float, zero_damping: float, pole_damping: float = 0.7) -> Floats:
-    """Return a notch against a resonance as second-order section, in the form of `scipy.signal.sosfilt`.
+    """Return a notch against a resonance as second-order section, b0, b1, b2, 1, a1, a2, for `sosfilt`.
 
     (s² + 2 zero_damping ω s + ω²) / (s² + 2 pole_damping ω s + ω²), by the bilinear transform, which is exact at
     ω (prewarping). The zeros take the place of the resonant poles, and constants pass unchanged.
@@ -30,11 +30,6 @@ def notch(frequency: float, rate: float, zero_damping: float, pole_damping: floa
         Damping ratio of the zeros, >= 0: that of the resonance.
     pole_damping : float
         Damping ratio of the poles, > 0.
-
-    Returns
-    -------
-    ndarray, shape (6,)
-        b0, b1, b2, 1, a1, a2.
 
     Raises
     ------

@@ -20,7 +20,7 @@ Reference: TypeAlias = Callable[[float], float]
 
 
 def tracking_targets(rng: np.random.Generator, low: float, high: float, count: int = 60) -> Floats:
-    """Return targets that visit a range in large and in small moves, up and down.
+    """Return targets within [low, high], shape (count,), in large and in small moves, up and down.
 
     The first half is a decaying oscillation about the middle of the range, of 2.5 targets a half-cycle so
     that targets fall on its flanks too; it calls up nested minor loops. The second half is uniformly random.
@@ -34,11 +34,6 @@ def tracking_targets(rng: np.random.Generator, low: float, high: float, count: i
         Least and greatest target, output units.
     count : int
         Number of targets, >= 1.
-
-    Returns
-    -------
-    ndarray, shape (count,)
-        Targets within [low, high], output units.
 
     Raises
     ------
@@ -56,7 +51,7 @@ def tracking_targets(rng: np.random.Generator, low: float, high: float, count: i
 
 
 def modulated_sine(times: ArrayLike, low: float, high: float, period: float, depth: float = 0.6) -> Floats:
-    """Return a sine whose amplitude swells and fades, at given times.
+    """Return a sine whose amplitude swells and fades, at given times, shape (N,), output units.
 
     It starts in the middle of the range and rises. Its envelope goes from 1 down to 1 - depth and back
     within 4.3 periods, so that successive reversals differ and minor loops are followed.
@@ -71,11 +66,6 @@ def modulated_sine(times: ArrayLike, low: float, high: float, period: float, dep
         Period of the sine, s.
     depth : float
         Part of the amplitude that the envelope takes away, 0 to 1.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        The reference, output units.
 
     Raises
     ------
@@ -186,10 +176,7 @@ def staircase(
 ) -> SmoothMoves:
     """Return a reference from the start to low, to high and back in equal steps; others as `SmoothMoves`.
 
-    Raises
-    ------
-    ValueError
-        If there is no step, low and high are not increasing, or as `SmoothMoves`.
+    Raises ValueError if there is no step, low and high are not increasing, or as `SmoothMoves`.
     """
     bottom, top = _checks.increasing("low, high", [low, high]).tolist()
     if steps < 1:

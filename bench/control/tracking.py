@@ -1,6 +1,6 @@
 """Tracking controllers: readings in, the next set-point out; no device, no clock.
 
-Two kinds share one vocabulary. A `TargetController` is given one target after another: `aim` at it, then
+Two kinds share one vocabulary. A `TargetController` receives a sequence of targets: `aim` at one, then
 `update` with every reading until the `Command` says done, and further while it holds. A `Follower` is called at
 a fixed rate with a reference that moves.
 
@@ -8,8 +8,8 @@ Rules for all of them:
 
 * Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
 * The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point.
-* A reading that is missing (nan or infinite) moves nothing: the set-point is held, the script waits for the
-  next complete reading, estimators take no value in. A missing output does not keep the memory from following
+* A missing reading (nan or infinite) moves nothing: the set-point is held, the script waits for the next
+  complete reading, estimators are not updated. A missing output does not keep the memory from following
   the measured input. Controllers with a hysteresis model also take for missing what is further outside the
   model's range than that is wide. The caller decides how long missing readings are tolerated.
 * A target that cannot be met is replaced by the closest output, and `reach` says so.
@@ -230,17 +230,10 @@ class ControllerBase:
     @property
     def trace(self) -> Trace:
         """Internal values at present."""
-        if self._model is None:
-            return Trace(reference=self._reference)
-        if self._estimator is None:
-            return Trace(reference=self._reference, predicted=self._modelled())
-        disturbance = self._estimator.value
-        return Trace(
-            reference=self._reference,
-            predicted=self._modelled() + disturbance,
-            disturbance=disturbance,
-            uncertainty=self._estimator.uncertainty,
-        )
+        modelled, estimator = self._modelled(), self._estimator
+        if estimator is None:
+            return Trace(self._reference, modelled)
+        return Trace(self._reference, modelled + estimator.value, estimator.value, estimator.uncertainty)
 
     @property
     def state(self) -> Any:  # noqa: ANN401
@@ -278,9 +271,8 @@ class ControllerBase:
         return math.isfinite(output) and low <= output <= high
 
     def _modelled(self) -> float:
-        """Return the model's output after what the actuator did."""
-        assert self._model is not None
-        return self._model.value(self._state)
+        """Return the model's output after what the actuator did; nan without a model."""
+        return math.nan if self._model is None else self._model.value(self._state)
 
     def _answer(self, found: Inversion[Any], target: float) -> tuple[float, ...]:
         """Return the set-points of an inversion within the limits, and note whether they meet the target."""
@@ -304,16 +296,8 @@ class Scripted(ControllerBase, ABC):
     _poll = 0.1
     _needs_output = True
 
-    def __init__(
-        self,
-        input_range: tuple[float, float],
-        limits: tuple[float, float] | None = None,
-        model: Operator[Any] | None = None,
-        state: Any = None,  # noqa: ANN401 - each operator has its own
-    ) -> None:
-        super().__init__(input_range, limits, model, state)
-        self._script: Script | None = None
-        self._done = False
+    _script: Script | None = None
+    _done = False
 
     def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
         """Start towards a new target and return the first command.
@@ -341,10 +325,7 @@ class Scripted(ControllerBase, ABC):
     def update(self, t: float, measured_input: float, output: float) -> Command:
         """Take in a reading and return the next command.
 
-        Raises
-        ------
-        RuntimeError
-            If there is no target yet.
+        Raises RuntimeError if there is no target yet.
         """
         if math.isnan(self._reference):
             raise RuntimeError("update: expected a target first, by aim")
@@ -473,13 +454,13 @@ class Correcting(Scripted):
     def __init__(
         self,
         inverse: Inverse[Any],
-        state: Any,  # noqa: ANN401
-        limits: tuple[float, float] | None,
-        parameters: CorrectionParameters,
+        state: Any = None,  # noqa: ANN401
+        limits: tuple[float, float] | None = None,
+        parameters: CorrectionParameters | None = None,
     ) -> None:
         super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
-        self._correction = parameters
+        self._correction = parameters = parameters or CorrectionParameters()
         self._poll = parameters.arrival.poll
         self._estimator: DisturbanceEstimator = DisturbanceEstimator(
             walk_variance=parameters.walk_variance, reading_variance=parameters.reading_variance
@@ -523,15 +504,6 @@ class ClosedLoopInverse(Correcting):
     parameters : CorrectionParameters
         Numbers of the loop.
     """
-
-    def __init__(
-        self,
-        inverse: Inverse[Any],
-        state: Any = None,  # noqa: ANN401
-        limits: tuple[float, float] | None = None,
-        parameters: CorrectionParameters | None = None,
-    ) -> None:
-        super().__init__(inverse, state, limits, parameters or CorrectionParameters())
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
         yield from self._correct(target)

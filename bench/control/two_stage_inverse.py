@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from bench.hysteresis import Inverse, Reach, _checks
-from bench.hysteresis.inverse import around, first_where
 from bench.hysteresis.two_stage import Stage, TwoStage, TwoStageState
 
 # Part of an output range within which a target counts as met.
@@ -154,110 +152,6 @@ class TwoStageInverse:
             imposed = self._length_flag(reached, length)
         return self._result(after, _flag(after.force, target, self._tolerances[0]), imposed)
 
-    def voltage_for_load(
-        self, state: TwoStageState, length: float, load: Callable[[float], float]
-    ) -> TwoStageInversion:
-        """Return the voltage that brings the length to a target against an elastic load.
-
-        Force and length change along the load's line, so that the argument u goes straight to its new value
-        (`together` in `TwoStage.step`). If the voltage does not suffice, force and length are those
-        where model and load meet at the end of the range.
-
-        Parameters
-        ----------
-        state : TwoStageState
-            Present state.
-        length : float
-            Target, length units.
-        load : callable
-            Force of the load at a length of the wire, constant or falling (a spring pulls more at a contracted
-            wire).
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
-        target = _checks.number("length", length)
-        argument = self._second.nearest_input(state.second, state.argument, target)
-        _, reached = self.model.second.step(state.second, argument)
-        if self._length_flag(reached, target) is not Reach.MET:
-            # The voltage may take u further than the operating range of the second stage.
-            high, low = (self._equilibrium(state, self._blocked(state, v), load) for v in self._voltages(state))
-            argument = self._second.nearest_input(state.second, state.argument, target, (low, high))
-            _, reached = self.model.second.step(state.second, argument)
-        wanted = _checks.number("load", load(reached)) - argument
-        voltage = self._first.nearest_input(state.first, state.voltage, wanted)
-        blocked = self._blocked(state, voltage)
-        if abs(blocked - wanted) > self._tolerances[0]:
-            argument = self._equilibrium(state, blocked, load)
-        after, reached = self.model.move(state, voltage, argument)
-        return self._result(after, self._length_flag(reached, target))
-
-    def force_for_length(
-        self, state: TwoStageState, length: float, voltage: float | None = None
-    ) -> TwoStageInversion:
-        """Return the force at an imposed length and voltage: H1[voltage] + H2⁻¹[length].
-
-        The argument u goes straight to that of the length. A negative force means that a wire would be slack.
-
-        Parameters
-        ----------
-        state : TwoStageState
-            Present state.
-        length : float
-            Imposed length, length units.
-        voltage : float or None
-            Imposed voltage; default the present one. It is not clamped.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
-        target = _checks.number("length", length)
-        argument = self._second.nearest_input(state.second, state.argument, target)
-        after, reached = self.model.move(state, state.voltage if voltage is None else voltage, argument)
-        return self._result(after, self._length_flag(reached, target))
-
-    def reachable_lengths(self, state: TwoStageState, force: float | None = None) -> tuple[float, float]:
-        """Return the least and greatest length that one move of the voltage reaches under a force.
-
-        Raises
-        ------
-        ValueError
-            If the force is not finite.
-        """
-        tension = state.force if force is None else _checks.number("force", force)
-        low, high = self._voltages(state)
-        return self.model.step(state, high, tension)[1], self.model.step(state, low, tension)[1]
-
-    def reachable_forces(self, state: TwoStageState, length: float | None = None) -> tuple[float, float]:
-        """Return the least and greatest force that one move of the voltage reaches at a fixed length.
-
-        Raises
-        ------
-        ValueError
-            If the length is not finite.
-        """
-        argument = state.argument
-        if length is not None:
-            argument = self._second.nearest_input(state.second, argument, _checks.number("length", length))
-        low, high = self._voltages(state)
-        return self._blocked(state, low) + argument, self._blocked(state, high) + argument
-
-    def reachable_lengths_on(self, state: TwoStageState, load: Callable[[float], float]) -> tuple[float, float]:
-        """Return the least and greatest length that one move of the voltage reaches against an elastic load.
-
-        Raises
-        ------
-        ValueError
-            If the load is not finite.
-        """
-        ends = [self._equilibrium(state, self._blocked(state, v), load) for v in self._voltages(state)]
-        lengths = [self.model.second.step(state.second, u)[1] for u in ends]
-        return lengths[1], lengths[0]
-
     def _voltages(self, state: TwoStageState) -> tuple[float, float]:
         low, high = self.model.first.input_range
         return min(low, state.voltage), max(high, state.voltage)
@@ -270,21 +164,6 @@ class TwoStageInverse:
         if argument == state.argument:
             return state.voltage
         return self._first.nearest_input(state.first, state.voltage, force - argument)
-
-    def _equilibrium(self, state: TwoStageState, blocked: float, load: Callable[[float], float]) -> float:
-        """Return u where blocked + u is the load's force at the length H2[u]."""
-
-        def excess(u: float) -> float:
-            force = _checks.number("load", load(self.model.second.step(state.second, u)[1]))
-            return blocked + u - force
-
-        low, high = around(state.argument, self.model.second.input_range)
-        # A load that is constant or falling is met somewhere, be it where the second stage is saturated.
-        while excess(low) > 0.0:
-            low -= high - low
-        while excess(high) < 0.0:
-            high += high - low
-        return first_where(lambda u: excess(u) >= 0.0, low, high)
 
     def _length_flag(self, reached: float, target: float) -> Reach:
         return _flag(reached, target, self._tolerances[1])

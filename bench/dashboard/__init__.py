@@ -1,4 +1,4 @@
-"""The live view of a run and its .rrd file, both by Rerun, both derived from what the journal holds.
+"""The live view of a run and its .rrd file, both by Rerun, both derived from the content of the journal.
 
 The control thread only puts what happened into a queue. One thread takes it out about once a second and hands it to
 Rerun in columns, which costs a twentieth of logging row by row; the same code rebuilds an .rrd from a journal. A

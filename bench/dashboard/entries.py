@@ -1,4 +1,4 @@
-"""What the dashboard is given: ticks, steps, events, densities and the end of a run, in their order."""
+"""Entries of the dashboard: ticks, steps, events, densities and the end of a run, in their order."""
 
 from __future__ import annotations
 

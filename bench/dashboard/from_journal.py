@@ -12,7 +12,7 @@ from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
 from bench.journal import Record
-from bench.results.model_file import is_model, parse_model
+from bench.model_file import is_model, parse_model
 
 
 def rebuild(record: Record, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The live view of a run: takes what happens from the control thread and hands it to Rerun in a thread of its own."""
+"""The live view of a run: takes entries from the control thread and passes them to Rerun in a thread of its own."""
 
 from __future__ import annotations
 
@@ -149,6 +149,6 @@ class Dashboard:
                 if (missing := self.dropped - self._reported) > 0:
                     self._writer.warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
                     self._reported += missing
-            # Whatever fails in the view, the run goes on, and so does the rest of the view.
+            # After any failure in the view, the run goes on, and so does the rest of the view.
             except Exception:
                 self._not_written += len(entries)

@@ -1,4 +1,4 @@
-"""A picture of what a viewer shows of a recording, without a screen."""
+"""A picture of a recording as a viewer shows it, without a screen."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SETTLE_SECONDS = 6.0
 
 
 def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, int] = (1600, 1000)) -> list[str]:
-    """Draw what a viewer shows of an .rrd file, without a screen.
+    """Draw what a viewer shows of an .rrd file, without a screen; return the errors that the views report.
 
     Parameters
     ----------
@@ -30,11 +30,6 @@ def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, i
         Laboratory time in s to put the cursor at; None for the end.
     size : tuple of int
         Width and height, pixels.
-
-    Returns
-    -------
-    list of str
-        Errors that the views report; empty if all is well.
 
     Raises
     ------

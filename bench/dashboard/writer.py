@@ -1,4 +1,4 @@
-"""Turns what happened into the columns of a recording, and arranges its views."""
+"""Turns entries into the columns of a recording, and arranges its views."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from pydantic import ValidationError
 
+from bench.configuration_errors import problems
 from bench.dashboard.control import TRACE_NAMES, ControlPlots
 from bench.dashboard.drawing import whole_run
 from bench.dashboard.entries import End, Entry, ModelDensity, Tick
@@ -24,7 +25,6 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError
 from bench.journal import StepRecord, run_card
 from bench.layout import DashboardLayout
-from bench.validation import problems
 
 _PLOTS_IN_A_ROW = 3
 

@@ -43,8 +43,8 @@ def increasing(name: str, values: ArrayLike, least: int = 2) -> Floats:
     return array
 
 
-def number(name: str, value: Any) -> float:  # noqa: ANN401 - whatever somebody gave
-    """Return `value` as a finite float; a text is none, whatever it says."""
+def number(name: str, value: Any) -> float:  # noqa: ANN401 - an unchecked argument
+    """Return `value` as a finite float; a text is refused, even if it spells a number."""
     try:
         if isinstance(value, str):
             raise TypeError

@@ -10,15 +10,10 @@ from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
 
-_segment_up = memory.segment_up
-_segment_down = memory.segment_down
-_rising_piece = memory.rising_piece
-_move = memory.move
-_output_at = memory.output_at
-_load = memory.load
-_evaluate = memory.evaluate
-_borrowed = memory.borrowed
-_reversible_value = memory.reversible_value
+Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, and how many count
+# Ends of the operating range, outputs at negative and positive saturation (at the ends of the plane), tolerance,
+# whether the nearest answer is wanted, whether the operator is monotone.
+Ends = tuple[float, float, float, float, float, bool, bool]
 
 
 @njit(cache=True, forceinline=True)
@@ -50,15 +45,10 @@ def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -
 
 @njit(cache=True, forceinline=True)
 def walk(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    breaks: Floats,
-    quadratics: Floats,
+    plane: memory.Plane,
+    terms: memory.Terms,
     end: float,
-    left: Floats,
-    height: Floats,
-    n: int,
+    corners: Corners,
     u: float,
     value: float,
     target: float,
@@ -72,21 +62,22 @@ def walk(
     output met the target, or else came closest to it, the error there (output - target), and the number
     of segments. Gives up beyond the distance `reach`.
     """
+    left, height, n = corners
     start = u
     best, error = u, value - target
     edge, border = u, 0.0
     if direction > 0:
-        n, edge, border = _rising_piece(levels, left, height, n, u)
+        n, edge, border = memory.rising_piece(plane[0], left, height, n, u)
     steps = 0
     while abs(error) > tolerance and (u - start) * direction <= reach:
         if direction > 0:
-            stop, a, b = _segment_up(levels, inverse_step, table, breaks, quadratics, end, edge, border, u)
+            stop, a, b = memory.segment_up(plane, terms, end, edge, border, u)
             length = stop - u
         else:
             while n > 0 and left[n - 1] >= u:
                 n -= 1
             edge, border = (left[n - 1], height[n - 1]) if n > 0 else (u, u)
-            stop, a, b = _segment_down(levels, inverse_step, table, breaks, quadratics, end, edge, border, u)
+            stop, a, b = memory.segment_down(plane, terms, end, edge, border, u)
             length = u - stop
         if length <= 0.0:
             break
@@ -113,109 +104,41 @@ def walk(
 
 @njit(cache=True, forceinline=True)
 def invert(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    breaks: Floats,
-    quadratics: Floats,
-    low: float,
-    high: float,
-    minus: float,
-    plus: float,
-    left: Floats,
-    height: Floats,
-    n: int,
-    u: float,
-    value: float,
-    target: float,
-    tolerance: float,
-    nearest: bool,
-    monotone: bool,
+    plane: memory.Plane, terms: memory.Terms, ends: Ends, corners: Corners, u: float, value: float, target: float
 ) -> tuple[int, float, float, float, int]:
     """Return number of set-points, the first, the last, the error at the last, and the segments walked.
 
-    `minus` and `plus` are the outputs at negative and positive saturation, at the ends of the plane. Of a
-    `monotone` operator the output rises with the input, whatever its memory: one walk tells all.
+    Of a `monotone` operator the output rises with the input for every memory: one walk finds all solutions.
     """
+    low, high, minus, plus, tolerance, nearest, monotone = ends
     # A monotone operator finds the target this way; the other way then is walked no further than that.
     first = 1 if target > value else -1
-    x1, e1, k1 = walk(
-        levels,
-        inverse_step,
-        table,
-        breaks,
-        quadratics,
-        high if first > 0 else low,
-        left,
-        height,
-        n,
-        u,
-        value,
-        target,
-        tolerance,
-        first,
-        np.inf,
-    )
-    steps = k1
+    ahead, behind = (high, low) if first > 0 else (low, high)
+    x1, e1, steps = walk(plane, terms, ahead, corners, u, value, target, tolerance, first, np.inf)
     met = abs(e1) <= tolerance
     preferred = not nearest and ((first > 0 and target <= plus) or (first < 0 and target >= minus))
     if monotone or (met and (x1 == u or preferred)):
         return 1, x1, x1, e1, steps
-    x2, e2, k2 = walk(
-        levels,
-        inverse_step,
-        table,
-        breaks,
-        quadratics,
-        low if first > 0 else high,
-        left,
-        height,
-        n,
-        u,
-        value,
-        target,
-        tolerance,
-        -first,
-        abs(x1 - u) if met else np.inf,
-    )
+    reach = abs(x1 - u) if met else np.inf
+    x2, e2, k2 = walk(plane, terms, behind, corners, u, value, target, tolerance, -first, reach)
     steps += k2
     met2 = abs(e2) <= tolerance
-    if met and met2:
-        if abs(x2 - u) < abs(x1 - u):
-            return 1, x2, x2, e2, steps
-        return 1, x1, x1, e1, steps
+    if met2 and not (met and abs(x2 - u) >= abs(x1 - u)):
+        return 1, x2, x2, e2, steps
     if met:
         return 1, x1, x1, e1, steps
-    if met2:
-        return 1, x2, x2, e2, steps
     count, s1, s2, error = 1, x1, x1, e1
     if abs(e2) < abs(e1):
         s1, s2, error = x2, x2, e2
     # The two major branches, through saturation.
     travel = np.inf
-    full = np.empty(1)
-    full[0] = levels[0]
-    crest = np.empty(1)
-    crest[0] = levels[-1]
+    levels = plane[0]
+    full = levels[:1].copy()
+    crest = levels[-1:].copy()
     for direction in (-1, 1):
-        turn = levels[-1] if direction < 0 else levels[0]
-        x, e, k = walk(
-            levels,
-            inverse_step,
-            table,
-            breaks,
-            quadratics,
-            low if direction < 0 else high,
-            full,
-            crest,
-            1 if direction < 0 else 0,
-            turn,
-            plus if direction < 0 else minus,
-            target,
-            tolerance,
-            direction,
-            np.inf,
-        )
+        turn, end, output = (levels[-1], low, plus) if direction < 0 else (levels[0], high, minus)
+        branch = full, crest, (1 if direction < 0 else 0)
+        x, e, k = walk(plane, terms, end, branch, turn, output, target, tolerance, direction, np.inf)
         steps += k
         distance = abs(turn - u) + abs(x - turn)
         better = abs(e) < abs(error) - tolerance
@@ -227,124 +150,57 @@ def invert(
 
 @njit(cache=True)
 def invert_state(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
+    plane: memory.Plane,
     below: Floats,
     offset: float,
-    breaks: Floats,
-    quadratics: Floats,
-    low: float,
-    high: float,
-    minus: float,
-    plus: float,
-    left: Floats,
-    height: Floats,
-    inside: float,
+    terms: memory.Terms,
+    ends: Ends,
+    start: memory.Start,
     u: float,
     target: float,
-    tolerance: float,
-    nearest: bool,
-    monotone: bool,
 ) -> tuple[int, float, float, float, int]:
     """Return what `invert` does, from a state whose output is not known yet."""
     here = np.empty(1)
     here[0] = u
-    value = _evaluate(here, levels, inverse_step, table, below, offset, breaks, quadratics, left, height, inside)[0]
-    return invert(
-        levels,
-        inverse_step,
-        table,
-        breaks,
-        quadratics,
-        low,
-        high,
-        minus,
-        plus,
-        left,
-        height,
-        left.size,
-        u,
-        value,
-        target,
-        tolerance,
-        nearest,
-        monotone,
-    )
+    value = memory.evaluate(here, plane, below, offset, terms, start)[0]
+    return invert(plane, terms, ends, (start[0], start[1], start[0].size), u, value, target)
 
 
 @njit(cache=True)
 def follow(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
+    plane: memory.Plane,
     below: Floats,
     offset: float,
-    breaks: Floats,
-    quadratics: Floats,
-    low: float,
-    high: float,
-    minus: float,
-    plus: float,
-    left0: Floats,
-    height0: Floats,
-    inside: float,
+    terms: memory.Terms,
+    ends: Ends,
+    start: memory.Start,
     raw: float,
     targets: Floats,
-    tolerance: float,
-    nearest: bool,
-    monotone: bool,
     stack: Floats,
-    indices: NDArray[np.int64],
-    first: Floats,
-    last: Floats,
-    errors: Floats,
-    steps: NDArray[np.int64],
+    indices: memory.Integers,
+    found: Floats,
+    steps: memory.Integers,
 ) -> None:
-    """Invert target after target, moving the memory along; `first` is NaN where one set-point is enough.
+    """Invert target after target, moving the memory along.
 
+    `found`, shape (3, N), is given the first set-points (NaN where one is enough), the last ones and the errors;
     `stack` and `indices` are room for the pieces, shapes (3, size) and (2, size).
     """
-    levels, table, below = _borrowed(levels), _borrowed(table), _borrowed(below)
-    breaks, quadratics = _borrowed(breaks), _borrowed(quadratics)
-    left, height, mass_left = _borrowed(stack[0]), _borrowed(stack[1]), _borrowed(stack[2])
-    column, row = _borrowed(indices[0]), _borrowed(indices[1])
+    plane, terms, pieces = memory.borrow(plane, terms, stack, indices)
+    below = memory.borrowed(below)
+    left0, height0, present = start
     n = left0.size
-    for p in range(n):
-        left[p] = left0[p]
-        height[p] = height0[p]
-    k, mass = _load(levels, inverse_step, table, left, height, column, row, mass_left, n, inside)
-    present = inside
+    pieces[0][:n] = left0
+    pieces[1][:n] = height0
+    k, mass = memory.load(plane, pieces, n, present)
     for t in range(targets.size):
-        value = _output_at(levels, table, below, offset, breaks, quadratics, raw, present, k, mass)
-        count, s1, s2, error, walked = invert(
-            levels,
-            inverse_step,
-            table,
-            breaks,
-            quadratics,
-            low,
-            high,
-            minus,
-            plus,
-            left,
-            height,
-            n,
-            raw,
-            value,
-            targets[t],
-            tolerance,
-            nearest,
-            monotone,
-        )
-        first[t] = s1 if count == 2 else np.nan
-        last[t] = s2
-        errors[t] = error
-        steps[t] = walked
+        value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)
+        count, s1, s2, error, steps[t] = invert(plane, terms, ends, (pieces[0], pieces[1], n), raw, value, targets[t])
+        found[0, t] = s1 if count == 2 else np.nan
+        found[1, t] = s2
+        found[2, t] = error
         for stage in range(2 - count, 2):
             raw = s1 if stage == 0 else s2
-            u = min(max(raw, levels[0]), levels[-1])
-            n, k, mass = _move(
-                levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u
-            )
+            u = min(max(raw, plane[0][0]), plane[0][-1])
+            n, k, mass = memory.move(plane, pieces, n, present, k, mass, u)
             present = u

@@ -1,4 +1,4 @@
-"""Compiled loops over the memory curve. Imported on first use only: numba takes its time to load.
+"""Compiled loops over the memory curve. Imported on first use only, because numba is slow to load.
 
 The on-region of the plane is a staircase of pieces (left edge, height); see `MemoryCurve.staircase`.
 With each diagonal cell completed to a square, the integral of the density over {β < b, α < a} is bilinear
@@ -18,6 +18,14 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+# What the loops share, as plain tuples: numba passes them at the cost of their members.
+Axis = tuple[Floats, float]  # levels and inverse step of a lattice
+Plane = tuple[Floats, float, Floats]  # levels, inverse step, table
+Terms = tuple[Floats, Floats]  # breaks and quadratics of the reversible part
+Start = tuple[Floats, Floats, float]  # left edges and heights of the pieces, and the input within the plane
+Pieces = tuple[Floats, Floats, Floats, Integers, Integers]  # left, height, mass_left, column, row
+Entries = tuple[NDArray[np.int32], Floats]  # cells and changes
 
 
 def _unowned(typing_context: Any, array: Any) -> Any:  # noqa: ANN401, ARG001
@@ -71,8 +79,9 @@ def bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) 
 
 
 @njit(cache=True, forceinline=True)
-def reversible_value(breaks: Floats, quadratics: Floats, u: float) -> float:
+def reversible_value(terms: Terms, u: float) -> float:
     """Return the single-valued part at u."""
+    breaks, quadratics = terms
     r = 0
     while r < breaks.size and u > breaks[r]:
         r += 1
@@ -104,23 +113,39 @@ def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, s
     return count
 
 
-@njit(cache=True)
-def load(
+@njit(cache=True, forceinline=True)
+def borrow(plane: Plane, terms: Terms, stack: Floats, indices: Integers) -> tuple[Plane, Terms, Pieces]:
+    """Return plane, terms, and the rows of `stack` and `indices` as pieces, all without ownership."""
+    pieces = borrowed(stack[0]), borrowed(stack[1]), borrowed(stack[2]), borrowed(indices[0]), borrowed(indices[1])
+    return (borrowed(plane[0]), plane[1], borrowed(plane[2])), (borrowed(terms[0]), borrowed(terms[1])), pieces
+
+
+@njit(cache=True, forceinline=True)
+def _row_mass(
     levels: Floats,
-    inverse_step: float,
     table: Floats,
-    left: Floats,
-    height: Floats,
-    column: Integers,
-    row: Integers,
-    mass_left: Floats,
-    n: int,
-    u: float,
-) -> tuple[int, float]:
+    left: float,
+    column: int,
+    right: float,
+    k: int,
+    height: float,
+    row: int,
+    mass: float,
+) -> float:
+    """Return a mass plus that of the piece from `left` to `right` below its height; by cells k, column, row."""
+    mass += bilinear(table, levels, right, k, height, row)
+    mass -= bilinear(table, levels, left, column, height, row)
+    return mass
+
+
+@njit(cache=True)
+def load(plane: Plane, pieces: Pieces, n: int, u: float) -> tuple[int, float]:
     """Fill in what belongs to n given pieces; return the input's cell and the mass up to the input.
 
     mass_left[p] is the integral of the completed density over the pieces to the left of piece p.
     """
+    levels, inverse_step, table = plane
+    left, height, mass_left, column, row = pieces
     mass = 0.0
     for p in range(n):
         column[p] = locate(levels, inverse_step, left[p])
@@ -128,28 +153,17 @@ def load(
         mass_left[p] = mass
         right = left[p + 1] if p + 1 < n else u
         k = locate(levels, inverse_step, right)
-        mass += bilinear(table, levels, right, k, height[p], row[p])
-        mass -= bilinear(table, levels, left[p], column[p], height[p], row[p])
+        mass = _row_mass(levels, table, left[p], column[p], right, k, height[p], row[p], mass)
     return locate(levels, inverse_step, u), mass
 
 
 @njit(cache=True, forceinline=True)
 def move(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    left: Floats,
-    height: Floats,
-    column: Integers,
-    row: Integers,
-    mass_left: Floats,
-    n: int,
-    present: float,
-    k: int,
-    mass: float,
-    u: float,
+    plane: Plane, pieces: Pieces, n: int, present: float, k: int, mass: float, u: float
 ) -> tuple[int, int, float]:
     """Move the staircase from input `present` to u; return number of pieces, the input's cell, the mass."""
+    levels, inverse_step, table = plane
+    left, height, mass_left, column, row = pieces
     if u == present:
         return n, k, mass
     if u > present:
@@ -171,120 +185,69 @@ def move(
     mass = 0.0
     if n > 0:
         p = n - 1
-        mass = mass_left[p]
-        mass += bilinear(table, levels, u, k, height[p], row[p])
-        mass -= bilinear(table, levels, left[p], column[p], height[p], row[p])
+        mass = _row_mass(levels, table, left[p], column[p], u, k, height[p], row[p], mass_left[p])
     return n, k, mass
 
 
 @njit(cache=True, forceinline=True)
 def output_at(
-    levels: Floats,
-    table: Floats,
-    below: Floats,
-    offset: float,
-    breaks: Floats,
-    quadratics: Floats,
-    raw: float,
-    u: float,
-    k: int,
-    mass: float,
+    plane: Plane, below: Floats, offset: float, terms: Terms, raw: float, u: float, k: int, mass: float
 ) -> float:
     """Return the output at input `raw`, which is u within the plane, given the mass up to u."""
+    levels, _, table = plane
     x = u - levels[k]
     mass -= below[k] + 0.5 * table[k, k, 3] * x * x
-    return offset + 2.0 * mass + reversible_value(breaks, quadratics, raw)
+    return offset + 2.0 * mass + reversible_value(terms, raw)
 
 
 @njit(cache=True)
 def _run(
     inputs: Floats,
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
+    plane: Plane,
     below: Floats,
     offset: float,
-    breaks: Floats,
-    quadratics: Floats,
-    left0: Floats,
-    height0: Floats,
-    u0: float,
+    terms: Terms,
+    start: Start,
     stack: Floats,
     indices: Integers,
     outputs: Floats,
 ) -> None:
-    levels, table, below = borrowed(levels), borrowed(table), borrowed(below)
-    breaks, quadratics = borrowed(breaks), borrowed(quadratics)
-    left, height, mass_left = borrowed(stack[0]), borrowed(stack[1]), borrowed(stack[2])
-    column, row = borrowed(indices[0]), borrowed(indices[1])
-    low, high = levels[0], levels[-1]
+    plane, terms, pieces = borrow(plane, terms, stack, indices)
+    below = borrowed(below)
+    low, high = plane[0][0], plane[0][-1]
+    left0, height0, present = start
     n = left0.size
-    left[:n] = left0
-    height[:n] = height0
-    k, mass = load(levels, inverse_step, table, left, height, column, row, mass_left, n, u0)
-    present = u0
+    pieces[0][:n] = left0
+    pieces[1][:n] = height0
+    k, mass = load(plane, pieces, n, present)
     for t in range(inputs.size):
         raw = inputs[t]
         u = min(max(raw, low), high)
-        n, k, mass = move(levels, inverse_step, table, left, height, column, row, mass_left, n, present, k, mass, u)
+        n, k, mass = move(plane, pieces, n, present, k, mass, u)
         present = u
-        outputs[t] = output_at(levels, table, below, offset, breaks, quadratics, raw, u, k, mass)
+        outputs[t] = output_at(plane, below, offset, terms, raw, u, k, mass)
 
 
 @njit(cache=True)
-def evaluate(
-    inputs: Floats,
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    below: Floats,
-    offset: float,
-    breaks: Floats,
-    quadratics: Floats,
-    left0: Floats,
-    height0: Floats,
-    u0: float,
-) -> Floats:
+def evaluate(inputs: Floats, plane: Plane, below: Floats, offset: float, terms: Terms, start: Start) -> Floats:
     """Return the outputs of a sequence: a running sum on the staircase, O(1) amortised a sample."""
-    room = inputs.size + left0.size + 1
-    stack = np.empty((3, room))
-    indices = np.empty((2, room), np.int64)
+    room = inputs.size + start[0].size + 1
     outputs = np.empty(inputs.size)
-    _run(
-        inputs,
-        levels,
-        inverse_step,
-        table,
-        below,
-        offset,
-        breaks,
-        quadratics,
-        left0,
-        height0,
-        u0,
-        stack,
-        indices,
-        outputs,
-    )
+    # In a call of its own: what it borrows must be held here.
+    _run(inputs, plane, below, offset, terms, start, np.empty((3, room)), np.empty((2, room), np.int64), outputs)
     return outputs
 
 
 @njit(cache=True, forceinline=True)
 def segment_up(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    breaks: Floats,
-    quadratics: Floats,
-    high: float,
-    edge: float,
-    above: float,
-    u: float,
+    plane: Plane, terms: Terms, high: float, edge: float, above: float, u: float
 ) -> tuple[float, float, float]:
     """Return (stop, A, B): output(u + d) - output(u) = A d² + B d up to input `stop`.
 
     `edge` is the left edge of the piece that rises with u, `above` the height of the piece before it.
     """
+    levels, inverse_step, table = plane
+    breaks, quadratics = terms
     stop = high
     a, b = 0.0, 0.0
     if u < levels[0]:
@@ -310,20 +273,14 @@ def segment_up(
 
 @njit(cache=True, forceinline=True)
 def segment_down(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    breaks: Floats,
-    quadratics: Floats,
-    low: float,
-    edge: float,
-    top: float,
-    u: float,
+    plane: Plane, terms: Terms, low: float, edge: float, top: float, u: float
 ) -> tuple[float, float, float]:
     """Return (stop, A, B): output(u - d) - output(u) = A d² + B d down to input `stop`.
 
     `edge` and `top` are left edge and height of the piece immediately left of u.
     """
+    levels, inverse_step, table = plane
+    breaks, quadratics = terms
     stop = low
     a, b = 0.0, 0.0
     if u > levels[-1]:
@@ -362,32 +319,23 @@ def rising_piece(levels: Floats, left: Floats, height: Floats, n: int, u: float)
 
 @njit(cache=True)
 def segment(
-    levels: Floats,
-    inverse_step: float,
-    table: Floats,
-    breaks: Floats,
-    quadratics: Floats,
-    low: float,
-    high: float,
-    left: Floats,
-    height: Floats,
-    u: float,
-    direction: int,
+    plane: Plane, terms: Terms, low: float, high: float, left: Floats, height: Floats, u: float, direction: int
 ) -> tuple[float, float, float]:
     """Return (length, A, B) of the segment from the state (pieces, raw input u)."""
     n = left.size
     if direction > 0:
-        _, edge, above = rising_piece(levels, left, height, n, u)
-        stop, a, b = segment_up(levels, inverse_step, table, breaks, quadratics, high, edge, above, u)
+        _, edge, above = rising_piece(plane[0], left, height, n, u)
+        stop, a, b = segment_up(plane, terms, high, edge, above, u)
         return max(stop - u, 0.0), a, b
     edge, top = (left[n - 1], height[n - 1]) if n > 0 else (u, u)
-    stop, a, b = segment_down(levels, inverse_step, table, breaks, quadratics, low, edge, top, u)
+    stop, a, b = segment_down(plane, terms, low, edge, top, u)
     return max(u - stop, 0.0), a, b
 
 
 @njit(cache=True)
-def _span(levels: Floats, inverse_step: float, low: float, high: float) -> tuple[int, int]:
+def _span(axis: Axis, low: float, high: float) -> tuple[int, int]:
     """Return the first and last cell that [low, high] overlaps by more than a point."""
+    levels, inverse_step = axis
     first = locate(levels, inverse_step, low)
     last = locate(levels, inverse_step, high)
     if last > first and high == levels[last]:
@@ -397,23 +345,15 @@ def _span(levels: Floats, inverse_step: float, low: float, high: float) -> tuple
 
 @njit(cache=True)
 def _rectangle(
-    levels: Floats,
-    inverse_step: float,
-    b0: float,
-    b1: float,
-    a0: float,
-    a1: float,
-    factor: float,
-    cells: NDArray[np.int32],
-    changes: Floats,
-    end: int,
-    write: bool,
+    axis: Axis, b0: float, b1: float, a0: float, a1: float, factor: float, entries: Entries, end: int, write: bool
 ) -> int:
     """Append factor * overlap with [b0, b1] x [a0, a1] (above the diagonal) for each cell touched."""
+    levels, _ = axis
+    cells, changes = entries
     if b1 <= b0 or a1 <= a0:
         return end
-    j0, j1 = _span(levels, inverse_step, b0, b1)
-    i0, i1 = _span(levels, inverse_step, a0, a1)
+    j0, j1 = _span(axis, b0, b1)
+    i0, i1 = _span(axis, a0, a1)
     if not write:
         return end + (i1 - i0 + 1) * (j1 - j0 + 1)
     for i in range(i0, i1 + 1):
@@ -427,21 +367,13 @@ def _rectangle(
 
 
 @njit(cache=True)
-def _triangle(
-    levels: Floats,
-    inverse_step: float,
-    low: float,
-    high: float,
-    factor: float,
-    cells: NDArray[np.int32],
-    changes: Floats,
-    end: int,
-    write: bool,
-) -> int:
+def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entries, end: int, write: bool) -> int:
     """Append factor * overlap with {low <= β <= α <= high} for each cell touched."""
+    levels, _ = axis
+    cells, changes = entries
     if high <= low:
         return end
-    i0, i1 = _span(levels, inverse_step, low, high)
+    i0, i1 = _span(axis, low, high)
     if not write:
         count = i1 - i0 + 1
         return end + count * (count + 1) // 2
@@ -459,45 +391,28 @@ def _triangle(
 
 
 @njit(cache=True)
-def swept_areas(
-    levels: Floats,
-    inverse_step: float,
-    left: Floats,
-    height: Floats,
-    u: float,
-    cells: NDArray[np.int32],
-    changes: Floats,
-    write: bool,
-) -> int:
+def swept_areas(axis: Axis, start: Start, entries: Entries, write: bool) -> int:
     """List twice the on-area of each cell that the staircase touches; return the number of entries."""
-    end = _triangle(levels, inverse_step, levels[0], u, 2.0, cells, changes, 0, write)
+    left, height, u = start
+    end = _triangle(axis, axis[0][0], u, 2.0, entries, 0, write)
     for p in range(left.size):
         right = left[p + 1] if p + 1 < left.size else u
-        end = _rectangle(levels, inverse_step, left[p], right, u, height[p], 2.0, cells, changes, end, write)
+        end = _rectangle(axis, left[p], right, u, height[p], 2.0, entries, end, write)
     return end
 
 
 @njit(cache=True)
 def swept_differences(
-    inputs: Floats,
-    levels: Floats,
-    inverse_step: float,
-    left0: Floats,
-    height0: Floats,
-    u0: float,
-    starts: Integers,
-    cells: NDArray[np.int32],
-    changes: Floats,
-    write: bool,
+    inputs: Floats, axis: Axis, start: Start, starts: Integers, entries: Entries, write: bool
 ) -> int:
     """List, sample by sample, the change of 2 * on-area of the cells that the input swept."""
+    left0, height0, present = start
     left = np.empty(inputs.size + left0.size + 1)
     height = np.empty(inputs.size + left0.size + 1)
     left[: left0.size] = left0
     height[: left0.size] = height0
     n = left0.size
-    low, high = levels[0], levels[-1]
-    present = u0
+    low, high = axis[0][0], axis[0][-1]
     end = 0
     for t in range(inputs.size):
         starts[t] = end
@@ -508,9 +423,9 @@ def swept_differences(
             while n > 0 and height[n - 1] <= u:
                 n -= 1
                 edge = left[n]
-                end = _rectangle(levels, inverse_step, edge, right, height[n], u, 2.0, cells, changes, end, write)
+                end = _rectangle(axis, edge, right, height[n], u, 2.0, entries, end, write)
                 right = edge
-            end = _triangle(levels, inverse_step, present, u, 2.0, cells, changes, end, write)
+            end = _triangle(axis, present, u, 2.0, entries, end, write)
             left[n] = edge
             height[n] = u
             n += 1
@@ -519,12 +434,10 @@ def swept_differences(
             p = n - 1
             while p >= 0 and right > u:
                 edge = max(left[p], u)
-                end = _rectangle(
-                    levels, inverse_step, edge, right, present, height[p], -2.0, cells, changes, end, write
-                )
+                end = _rectangle(axis, edge, right, present, height[p], -2.0, entries, end, write)
                 right = edge
                 p -= 1
-            end = _triangle(levels, inverse_step, u, present, -2.0, cells, changes, end, write)
+            end = _triangle(axis, u, present, -2.0, entries, end, write)
             while n > 0 and left[n - 1] >= u:
                 n -= 1
         present = u
@@ -544,19 +457,6 @@ def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floa
         total += step
         result[t] = total
     return result
-
-
-@njit(cache=True)
-def difference_transpose_product(
-    starts: Integers, cells: NDArray[np.int32], changes: Floats, residuals: Floats, result: Floats
-) -> None:
-    """Add (row differences).T @ (reverse running sum of residuals) to result."""
-    total = 0.0
-    for t in range(residuals.size - 1, -1, -1):
-        total += residuals[t]
-        if total != 0.0:
-            for e in range(starts[t], starts[t + 1]):
-                result[cells[e]] += changes[e] * total
 
 
 @njit(cache=True)

@@ -38,10 +38,7 @@ class Document:
     def from_json(cls, document: Mapping[str, Any]) -> Self:
         """Return the model that `to_json` wrote; a field may be missing if its default is None or an empty text.
 
-        Raises
-        ------
-        ValueError
-            If a key is missing or a value is wrong.
+        Raises ValueError if a key is missing or a value is wrong.
         """
         values: dict[str, Any] = {}
         for field in fields(cls):  # type: ignore[arg-type]

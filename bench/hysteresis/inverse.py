@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 Policy: TypeAlias = Literal["nearest", "paper"]
+
+# As the compiled walks take them, see `_inverse_kernels.Ends`.
+_Plane: TypeAlias = tuple[Floats, float, Floats]
+_Terms: TypeAlias = tuple[Floats, Floats]
+_Ends: TypeAlias = tuple[float, float, float, float, float, bool, bool]
 
 # Part of the output scale within which a target counts as met.
 _TOLERANCE = 2e-13
@@ -129,10 +134,7 @@ class Inverse(ABC, Generic[S]):
     def invert(self, state: S, target: float) -> Inversion[S]:
         """Return the set-points that bring the output from `state` to `target`, output units.
 
-        Raises
-        ------
-        ValueError
-            If the target is not finite.
+        Raises ValueError if the target is not finite.
         """
 
     @abstractmethod
@@ -388,21 +390,11 @@ class PreisachInverse(Inverse[MemoryCurve]):
         return self.operator.rises()
 
     @cached_property
-    def _constants(self) -> tuple[Any, ...]:
-        t = self.operator.lattice
-        minus, plus, _ = self._ends
-        return (
-            t.levels,
-            t.inverse_step,
-            t.table,
-            t.below,
-            t.offset,
-            t.breaks,
-            t.quadratics,
-            *self.operator.input_range,
-            minus,
-            plus,
-        )
+    def _constants(self) -> tuple[_Plane, Floats, float, _Terms, _Ends]:
+        t, (minus, plus, tolerance) = self.operator.lattice, self._ends
+        low, high = self.operator.input_range
+        ends = (low, high, minus, plus, tolerance, self.policy == "nearest", self._monotone)
+        return t.plane, t.below, t.offset, t.terms, ends
 
     def invert(self, state: MemoryCurve, target: float) -> Inversion[MemoryCurve]:
         """Return the set-points that bring the output from `state` to `target`; see `Inverse.invert`."""
@@ -410,21 +402,11 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
         if not math.isfinite(target):
             raise ValueError(f"target: expected a finite number, got {target}")
-        levels = self.operator.levels
-        left, height, inside = state.staircase(levels.item(0), levels.item(-1))
         minus, plus, tolerance = self._ends
-        arguments = (
-            *self._constants,
-            np.array(left, dtype=np.float64),
-            np.array(height, dtype=np.float64),
-            inside,
-            state.input,
-            float(target),
-            tolerance,
-            self.policy == "nearest",
-            self._monotone,
+        start = self.operator._pieces(state)
+        count, first, last, error, iterations = _kernels.invert_state(
+            *self._constants, start, state.input, float(target)
         )
-        count, first, last, error, iterations = _kernels.invert_state(*arguments)
         reach = Reach.MET
         if abs(error) > 2.0 * tolerance:
             reach = Reach.TOO_HIGH if error < 0.0 else Reach.TOO_LOW
@@ -440,36 +422,18 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
         wanted = _checks.samples("targets", targets)
         before = self.operator.initial_state() if state is None else state
-        levels = self.operator.levels
-        left, height, inside = before.staircase(levels.item(0), levels.item(-1))
-        tolerance = self._ends[2]
-        first, last, errors = (np.empty(wanted.size) for _ in range(3))
-        room = 2 * wanted.size + len(left) + 2
-        iterations = np.empty(wanted.size, dtype=np.int64)
-        arguments = (
-            *self._constants,
-            np.array(left, dtype=np.float64),
-            np.array(height, dtype=np.float64),
-            inside,
-            before.input,
-            wanted,
-            tolerance,
-            self.policy == "nearest",
-            self._monotone,
-            np.empty((3, room)),
-            np.empty((2, room), dtype=np.int64),
-            first,
-            last,
-            errors,
-            iterations,
-        )
-        _kernels.follow(*arguments)
+        start = self.operator._pieces(before)
+        room = 2 * wanted.size + start[0].size + 2
+        stack, indices = np.empty((3, room)), np.empty((2, room), dtype=np.int64)
+        found, iterations = np.empty((3, wanted.size)), np.empty(wanted.size, dtype=np.int64)
+        _kernels.follow(*self._constants, start, before.input, wanted, stack, indices, found, iterations)
+        first, last, errors = found
         path = np.column_stack([first, last]).ravel()
         return Following(
             setpoints=last,
             saturating=first,
             outputs=wanted + errors,
-            met=np.abs(errors) <= 2.0 * tolerance,
+            met=np.abs(errors) <= 2.0 * self._ends[2],
             iterations=iterations,
             state=before.advance(path[~np.isnan(path)]),
         )

@@ -83,13 +83,8 @@ class MemoryCurve:
     def step(self, value: float) -> MemoryCurve:
         """Return the memory after the input moved monotonically to `value`.
 
-        The number of comparisons is O(1) amortised over a sequence: each extremum is added once and wiped
-        out at most once.
-
-        Raises
-        ------
-        ValueError
-            If `value` is not finite.
+        The number of comparisons is O(1) amortised over a sequence: each extremum is added once and wiped out at most
+        once. Raises ValueError if `value` is not finite.
         """
         present = self.input
         if value == present:
@@ -111,10 +106,7 @@ class MemoryCurve:
     def advance(self, inputs: ArrayLike) -> MemoryCurve:
         """Return the memory after a whole sequence of inputs, shape (N,).
 
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite.
+        Raises ValueError if `inputs` is empty, not one-dimensional or not finite.
         """
         from bench.hysteresis import _kernels
 
@@ -161,17 +153,14 @@ class MemoryCurve:
         return lefts, heights, clipped
 
     def corners(self, low: float, high: float) -> Floats:
-        """Return the staircase as a polyline for drawing.
+        """Return the staircase as a polyline for drawing, shape (n, 2).
+
+        Vertices (β, α) lead from the left border (β = low) to the diagonal (β = α = input).
 
         Parameters
         ----------
         low, high : float
             The plane's range, input units, low < high.
-
-        Returns
-        -------
-        ndarray, shape (n, 2)
-            Vertices (β, α) from the left border (β = low) to the diagonal (β = α = input).
         """
         lefts, heights, present = self.staircase(low, high)
         vertices: list[tuple[float, float]] = []
@@ -182,58 +171,6 @@ class MemoryCurve:
         # A rising branch ends on the diagonal anyway.
         distinct = [vertex for n, vertex in enumerate(vertices) if n == 0 or vertex != vertices[n - 1]]
         return np.array(distinct, dtype=np.float64)
-
-    def _turns(self, low: float, high: float) -> list[float]:
-        """Return the shortest set-points that make this curve, clipped to [low, high], from negative saturation."""
-        lefts, heights, present = self.staircase(low, high)
-        if not heights:
-            return []
-        turns = [heights[0]]
-        for left, height in zip(lefts[1:], heights[1:], strict=True):
-            turns += [left, height]
-        return turns if present == heights[-1] else [*turns, present]
-
-    def priming(self, low: float, high: float, present: MemoryCurve | None = None) -> tuple[float, ...]:
-        """Return the fewest set-points within [low, high] that bring a specimen to this memory.
-
-        An extremum that is not wanted is wiped out only by going back to the extremum before it, or beyond, and
-        each wanted extremum that is missing must be visited. So the longest outer part that the present memory
-        shares is kept; the sequence begins at the first difference, one extremum earlier if the present one there
-        is the more extreme.
-
-        Parameters
-        ----------
-        low, high : float
-            Range of the set-points, input units, low < high; outside of it every hysteron is saturated. Both
-            memories count only as far as they lie in the plane of this range.
-        present : MemoryCurve or None
-            The memory of the specimen now; None if it is unknown.
-
-        Returns
-        -------
-        tuple of float
-            Set-points, each reached monotonically from the one before; empty if nothing is to be done.
-
-        Raises
-        ------
-        ValueError
-            If low >= high or a bound is not finite.
-        """
-        low, high = _checks.increasing("low, high", [low, high]).tolist()
-        wanted = self._turns(low, high)
-        if present is None:
-            # Both ends wipe everything out.
-            return tuple(wanted) if wanted and wanted[0] == high else (low, *wanted)
-        here = present._turns(low, high)
-        shared = 0
-        while shared < min(len(wanted), len(here)) and wanted[shared] == here[shared]:
-            shared += 1
-        if shared < len(here):
-            # Even places are maxima, odd ones minima.
-            beyond = shared < len(wanted) and (wanted[shared] > here[shared]) == (shared % 2 == 0)
-            if not beyond:
-                return (wanted[shared - 1] if shared else low, *wanted[shared:])
-        return tuple(wanted[shared:])
 
     def describe(self, unit: str = "") -> str:
         """Return the memory in words, for people: present branch, input, and the reversals it remembers."""
@@ -263,10 +200,7 @@ class MemoryCurve:
     def from_json(cls, document: Mapping[str, Any]) -> MemoryCurve:
         """Return the memory that `to_json` wrote.
 
-        Raises
-        ------
-        ValueError
-            If a key is missing or the extrema are not nested.
+        Raises ValueError if a key is missing or the extrema are not nested.
         """
         return cls(
             tuple(_checks.json_field(document, "extrema", "memory curve")),

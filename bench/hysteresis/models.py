@@ -1,4 +1,4 @@
-"""Registered models: what an entry of the group `bench.models` says, and the classes that model files name."""
+"""Registered models: the entries of the group `bench.models`, and the classes that model files name."""
 
 from __future__ import annotations
 
@@ -77,10 +77,7 @@ def _specs() -> dict[str, ModelSpec]:
 def model_class(kind: object) -> type[Any]:
     """Return the registered class of a kind.
 
-    Raises
-    ------
-    ValueError
-        If no entry of `bench.models` has it.
+    Raises ValueError if no entry of `bench.models` has it.
     """
     # Most kinds are also names: nothing else then need be imported.
     if isinstance(kind, str) and kind in registry.entries("models"):
@@ -99,9 +96,6 @@ def model_class(kind: object) -> type[Any]:
 def model_from_json(document: Mapping[str, Any]) -> Any:  # noqa: ANN401 - each kind has its class
     """Return the model that the `to_json` of a registered class wrote.
 
-    Raises
-    ------
-    ValueError
-        If the type is unknown or the object is not what that type expects.
+    Raises ValueError if the type is unknown or the object is not what that type expects.
     """
     return model_class(_checks.json_field(document, "type", "model")).from_json(document)

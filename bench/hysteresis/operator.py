@@ -69,10 +69,7 @@ class Operator(Model, ABC, Generic[S]):
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Self:
         """Return the same operator with other coefficients, shape (K,), and bias.
 
-        Raises
-        ------
-        ValueError
-            If their number is wrong or one is not finite or not possible.
+        Raises ValueError if their number is wrong or one is not finite or not possible.
         """
 
     @abstractmethod
@@ -83,19 +80,13 @@ class Operator(Model, ABC, Generic[S]):
     def step(self, state: S, value: float) -> tuple[S, float]:
         """Return state and output after the input moved monotonically to `value`.
 
-        Raises
-        ------
-        ValueError
-            If `value` is not finite.
+        Raises ValueError if `value` is not finite.
         """
 
     def evaluate(self, inputs: ArrayLike, state: S | None = None) -> Floats:
         """Return the outputs of a sequence, shape (N,), from `state` (default: the initial state).
 
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite.
+        Raises ValueError if `inputs` is empty, not one-dimensional or not finite.
         """
         outputs = []
         memory = self.initial_state() if state is None else state
@@ -213,17 +204,14 @@ class Operator(Model, ABC, Generic[S]):
         """Return which cells of the plane a sequence sweeps; None for an operator without a plane."""
         return None
 
-    def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - whatever JSON the operator chooses
+    def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - any JSON that the operator chooses
         """Return a state as JSON: by default a list of its numbers, or null."""
         return None if state is None else list(state)  # type: ignore[call-overload]
 
     def state_from_json(self, document: Any) -> S:  # noqa: ANN401
         """Return the state that `state_to_json` wrote.
 
-        Raises
-        ------
-        ValueError
-            If it is no state of this operator.
+        Raises ValueError if it is no state of this operator.
         """
         state: Any = self.initial_state()
         if state is None:
@@ -243,10 +231,7 @@ class Operator(Model, ABC, Generic[S]):
 def operator_from_json(document: Mapping[str, Any]) -> Operator[Any]:
     """Return the operator that the `to_json` of a registered class wrote.
 
-    Raises
-    ------
-    ValueError
-        If the type is unknown, no operator, or the object is not what that type expects.
+    Raises ValueError if the type is unknown, no operator, or the object is not what that type expects.
     """
     from bench.hysteresis.models import model_from_json
 

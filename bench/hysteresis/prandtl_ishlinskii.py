@@ -95,10 +95,7 @@ class DeadZones:
     def inverse(self) -> DeadZones:
         """Return the inverse map.
 
-        Raises
-        ------
-        ValueError
-            If a slope is zero.
+        Raises ValueError if a slope is zero.
         """
         if (self.slopes <= 0.0).any():
             raise ValueError(f"slopes: expected values > 0 for an inverse, got {self.slopes.min()}")
@@ -112,10 +109,7 @@ class DeadZones:
     def from_json(cls, document: Mapping[str, Any]) -> DeadZones:
         """Return the map that `to_json` wrote.
 
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
+        Raises ValueError if a key is missing or wrong.
         """
         return cls(
             _checks.json_field(document, "thresholds", "dead zones"),
@@ -199,10 +193,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PrandtlIshlinskii:
         """Return the same operator with other coefficients and bias.
 
-        Raises
-        ------
-        ValueError
-            If their number is wrong, one is not finite, or the output would fall with a rising input.
+        Raises ValueError if their number is wrong, one is not finite, or the output would fall with a rising input.
         """
         values = _checks.samples("coefficients", coefficients)
         if values.size != self.coefficients.size:
@@ -218,12 +209,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def saturated_state(self, direction: int, value: float | None = None) -> PlayState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
 
-        Every play then is dragged: at the low end z = x + r, at the high end z = x - r.
-
-        Raises
-        ------
-        ValueError
-            If `direction` is neither -1 nor 1.
+        Every play then is dragged: at the low end z = x + r, at the high end z = x - r. Raises ValueError if
+        `direction` is neither -1 nor 1.
         """
         _, end = self._ends(direction)
         x = self._inner(end if value is None else value)
@@ -257,10 +244,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def evaluate(self, inputs: ArrayLike, state: PlayState | None = None) -> Floats:
         """Return the outputs of a sequence, shape (N,), from `state` (default: relaxed).
 
-        Raises
-        ------
-        ValueError
-            If `inputs` is empty, not one-dimensional or not finite, or `state` has the wrong length.
+        Raises ValueError if `inputs` is empty, not one-dimensional or not finite, or `state` has the wrong length.
         """
         from bench.hysteresis import _kernels
 
@@ -272,10 +256,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def advance(self, state: PlayState, inputs: ArrayLike) -> PlayState:
         """Return the state after a sequence of inputs, shape (N,).
 
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
+        Raises ValueError as `evaluate`.
         """
         from bench.hysteresis import _kernels
 
@@ -290,10 +271,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def step(self, state: PlayState, value: float) -> tuple[PlayState, float]:
         """Return state and output after the input moved monotonically to `value`.
 
-        Raises
-        ------
-        ValueError
-            If `value` is not finite or the state has the wrong length.
+        Raises ValueError if `value` is not finite or the state has the wrong length.
         """
         if not math.isfinite(value):
             raise ValueError(f"value: expected a finite number, got {value}")
@@ -307,10 +285,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def value(self, state: PlayState) -> float:
         """Return the output of a state.
 
-        Raises
-        ------
-        ValueError
-            If the state has the wrong length or is not finite.
+        Raises ValueError if the state has the wrong length or is not finite.
         """
         return self._output(tuple(self._checked(state).tolist()))
 
@@ -323,13 +298,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def regressor(self, inputs: ArrayLike, state: PlayState | None = None) -> Regressor:
         """Return the dense columns that the coefficients multiply.
 
-        evaluate(inputs) = bias + regressor @ coefficients: the play states, or, with dead zones after the
-        plays, what `DeadZones.columns` makes of the weighted sum.
-
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
+        evaluate(inputs) = bias + regressor @ coefficients: the play states, or, with dead zones after the plays, what
+        `DeadZones.columns` makes of the weighted sum. Raises ValueError as `evaluate`.
         """
         columns = self._plays(inputs, state)
         if self.after is not None:
@@ -363,14 +333,10 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def inverse_operator(self) -> PrandtlIshlinskii:
         """Return the operator that gives the input back: itself a Prandtl-Ishlinskii operator.
 
-        Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the
-        running sums W (Kuhnen 2003). Its states come from `inverse_state`; its operating range is
-        this operator's `output_range`.
-
-        Raises
-        ------
-        ValueError
-            If a running sum of the weights or a slope of the dead zones is zero: a plateau has no inverse.
+        Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the running
+        sums W (Kuhnen 2003). Its states come from `inverse_state`; its operating range is this operator's
+        `output_range`. Raises ValueError if a running sum of the weights or a slope of the dead zones is zero: a
+        plateau has no inverse.
         """
         w, r, sums = self.weights, self.thresholds, self._sums
         if not (sums > 0.0).all():
@@ -393,12 +359,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def inverse_state(self, state: PlayState) -> PlayState:
         """Return the state of `inverse_operator()` that belongs to a state of this operator.
 
-        z'_i = W_i z_i + sum over j > i of w_j z_j.
-
-        Raises
-        ------
-        ValueError
-            If the state has the wrong length or is not finite.
+        z'_i = W_i z_i + sum over j > i of w_j z_j. Raises ValueError if the state has the wrong length or is not
+        finite.
         """
         z = self._checked(state)
         weighted = self.weights * z

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -53,6 +54,16 @@ class Lattice:
     breaks: Floats
     quadratics: Floats
 
+    @property
+    def plane(self) -> tuple[Floats, float, Floats]:
+        """Levels, inverse step and table."""
+        return self.levels, self.inverse_step, self.table
+
+    @property
+    def terms(self) -> tuple[Floats, Floats]:
+        """Breaks and quadratics of the reversible part."""
+        return self.breaks, self.quadratics
+
 
 @dataclass(frozen=True, eq=False)
 class Preisach(Operator[MemoryCurve]):
@@ -61,8 +72,8 @@ class Preisach(Operator[MemoryCurve]):
     output = bias + sum over cells of density * (2 on-area - area) + reversible(input): Zhang et al. 2013,
     eqs. 2, 10 and 12. The levels l_0 < ... < l_M divide the plane {l_0 <= β <= α <= l_M} into K = M(M+1)/2
     cells of constant density; diagonal cells are triangles. Beyond the plane every hysteron is saturated and
-    the reversible part goes on. The non-monotonic model of VO2 films is the case
-    `reversible=ThermalExpansion(...)`.
+    the reversible part goes on. The non-monotonic model of Zhang et al. 2013 is the
+    case `reversible=ThermalExpansion(...)`.
 
     Parameters
     ----------
@@ -131,10 +142,7 @@ class Preisach(Operator[MemoryCurve]):
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Preisach:
         """Return the same operator with other coefficients, shape (K + q,), and bias.
 
-        Raises
-        ------
-        ValueError
-            If there are not K + q coefficients or one is not finite.
+        Raises ValueError if there are not K + q coefficients or one is not finite.
         """
         values = _checks.samples("coefficients", coefficients)
         cells = self.density.size
@@ -220,7 +228,7 @@ class Preisach(Operator[MemoryCurve]):
         return np.array(left, dtype=np.float64), np.array(height, dtype=np.float64), present
 
     def evaluate(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Floats:
-        """Return the outputs of a sequence of inputs.
+        """Return the outputs of a sequence of inputs, shape (N,), output units.
 
         Parameters
         ----------
@@ -229,11 +237,6 @@ class Preisach(Operator[MemoryCurve]):
         state : MemoryCurve or None
             Memory before the first sample; default negative saturation. `state.advance(inputs)` is the
             memory after the last.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Outputs, output units.
 
         Raises
         ------
@@ -250,16 +253,12 @@ class Preisach(Operator[MemoryCurve]):
         from bench.hysteresis import _kernels
 
         t = self.lattice
-        tables = t.levels, t.inverse_step, t.table, t.below, t.offset, t.breaks, t.quadratics
-        return np.asarray(_kernels.evaluate(inputs, *tables, *self._pieces(state)))
+        return np.asarray(_kernels.evaluate(inputs, t.plane, t.below, t.offset, t.terms, self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
         """Return memory and output after the input moved monotonically to `value`.
 
-        Raises
-        ------
-        ValueError
-            If `value` is not finite.
+        Raises ValueError if `value` is not finite.
         """
         after = state.step(value)
         return after, self.value(after)
@@ -267,12 +266,8 @@ class Preisach(Operator[MemoryCurve]):
     def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
         """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).
 
-        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17.
-
-        Raises
-        ------
-        ValueError
-            If `direction` is neither -1 nor 1.
+        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17. Raises ValueError if
+        `direction` is neither -1 nor 1.
         """
         from bench.hysteresis import _kernels
 
@@ -280,20 +275,8 @@ class Preisach(Operator[MemoryCurve]):
             raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
         t = self.lattice
         left, height, _ = self._pieces(state)
-        found = Segment(
-            *_kernels.segment(
-                t.levels,
-                t.inverse_step,
-                t.table,
-                t.breaks,
-                t.quadratics,
-                *self.input_range,
-                left,
-                height,
-                state.input,
-                direction,
-            )
-        )
+        ends = self.input_range
+        found = Segment(*_kernels.segment(t.plane, t.terms, *ends, left, height, state.input, direction))
         return found if found.length > 0.0 else None
 
     def regressor(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Regressor:
@@ -317,24 +300,22 @@ class Preisach(Operator[MemoryCurve]):
 
         sequence = _checks.samples("inputs", inputs)
         t = self.lattice
-        left, height, present = self._pieces(state)
-        no_cells, no_changes = np.empty(0, dtype=np.int32), np.empty(0)
+        axis, start = (t.levels, t.inverse_step), self._pieces(state)
 
-        count = _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, no_cells, no_changes, False)
-        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
-        _kernels.swept_areas(t.levels, t.inverse_step, left, height, present, cells, changes, True)
-        base = np.bincount(cells, changes, minlength=self.density.size) - self.cell_areas()
+        def listed(sweep: Callable[..., int], *arguments: object) -> tuple[NDArray[np.int32], Floats]:
+            count = sweep(*arguments, (np.empty(0, dtype=np.int32), np.empty(0)), False)
+            entries = np.empty(count, dtype=np.int32), np.empty(count)
+            sweep(*arguments, entries, True)
+            return entries
 
+        base = np.bincount(*listed(_kernels.swept_areas, axis, start), minlength=self.density.size)
         starts = np.empty(sequence.size + 1, dtype=np.int64)
-        arguments = (sequence, t.levels, t.inverse_step, left, height, present, starts)
-        count = _kernels.swept_differences(*arguments, no_cells, no_changes, False)
-        cells, changes = np.empty(count, dtype=np.int32), np.empty(count)
-        _kernels.swept_differences(*arguments, cells, changes, True)
+        cells, changes = listed(_kernels.swept_differences, sequence, axis, start, starts)
         if self.reversible is None:
             extra = np.empty((sequence.size, 0))
         else:
             extra = np.ascontiguousarray(self.reversible.columns(sequence))
-        return Regressor(base=base, starts=starts, cells=cells, changes=changes, extra=extra)
+        return Regressor(base=base - self.cell_areas(), starts=starts, cells=cells, changes=changes, extra=extra)
 
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest output over every memory the operating range can produce.
@@ -459,10 +440,7 @@ class Preisach(Operator[MemoryCurve]):
 def uniform_levels(low: float, high: float, intervals: int) -> Floats:
     """Return `intervals` + 1 equally spaced discretization levels from low to high.
 
-    Raises
-    ------
-    ValueError
-        If low >= high or there is no interval.
+    Raises ValueError if low >= high or there is no interval.
     """
     first, last = _checks.increasing("low, high", [low, high]).tolist()
     if intervals < 1:

@@ -62,10 +62,7 @@ class Regressor:
     def product(self, coefficients: ArrayLike) -> Floats:
         """Return R @ coefficients, shape (N,).
 
-        Raises
-        ------
-        ValueError
-            If `coefficients` has not the shape (K + q,) or is not finite.
+        Raises ValueError if `coefficients` has not the shape (K + q,) or is not finite.
         """
         from bench.hysteresis import _kernels
 
@@ -75,25 +72,6 @@ class Regressor:
         if count:
             result += self.base @ weights[:count]
             result += _kernels.difference_product(self.starts, self.cells, self.changes, weights[:count])
-        return result
-
-    def transpose_product(self, residuals: ArrayLike) -> Floats:
-        """Return R.T @ residuals, shape (K + q,).
-
-        Raises
-        ------
-        ValueError
-            If `residuals` has not the shape (N,) or is not finite.
-        """
-        from bench.hysteresis import _kernels
-
-        values = self._vector("residuals", residuals, self.shape[0])
-        count = self.base.size
-        result = np.empty(self.shape[1])
-        result[count:] = self.extra.T @ values
-        if count:
-            result[:count] = self.base * values.sum()
-            _kernels.difference_transpose_product(self.starts, self.cells, self.changes, values, result[:count])
         return result
 
     def dense(self) -> Floats:

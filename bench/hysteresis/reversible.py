@@ -193,16 +193,16 @@ class PolynomialTerm(Document):
 class ThermalExpansion(Document):
     """The thermal term of a film whose phase fraction θ is a ramp: -[k0 (1 - θ) + k1 θ] (T - reference).
 
-    θ = clip((T - low) / (high - low), 0, 1): Zhang et al. 2013, eqs. 6, 7 and 11.
+    θ = clip((T - low) / (high - low), 0, 1): Zhang et al. 2013, eqs. 6, 7 and 11. The input T is a temperature.
 
     Parameters
     ----------
     k0, k1 : float
-        Expansion coefficients of the low- and high-temperature phase, output units per kelvin, >= 0.
+        Expansion coefficients of the low- and high-temperature phase, output units per input unit, >= 0.
     low, high : float
-        Phase-transition range, °C, low < high.
+        Phase-transition range, input units, low < high.
     reference : float
-        Temperature of zero expansion T0, °C.
+        Temperature of zero expansion T0, input units.
 
     Raises
     ------
@@ -211,11 +211,11 @@ class ThermalExpansion(Document):
     """
 
     kind: ClassVar[str] = "thermal-expansion"
-    k0: float = 0.0
-    k1: float = 0.0
-    low: float = 30.0
-    high: float = 70.0
-    reference: float = 20.0
+    k0: float
+    k1: float
+    low: float
+    high: float
+    reference: float
 
     def __post_init__(self) -> None:
         for name in ("k0", "k1", "low", "high", "reference"):
@@ -258,10 +258,7 @@ class ThermalExpansion(Document):
 def reversible_from_json(document: Mapping[str, Any]) -> Reversible:
     """Return the term that `to_json` wrote.
 
-    Raises
-    ------
-    ValueError
-        If the type is unknown or a key is missing or wrong.
+    Raises ValueError if the type is unknown or a key is missing or wrong.
     """
     kind = _checks.json_field(document, "type", "reversible")
     fields = {key: value for key, value in document.items() if key != "type"}

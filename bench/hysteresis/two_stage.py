@@ -47,18 +47,23 @@ class Coupled(Model, ABC, Generic[S]):
 
     @property
     @abstractmethod
+    def units(self) -> tuple[str, str, str]:
+        """Units of voltage, force and length."""
+
+    @property
     def voltage_unit(self) -> str:
         """Unit of the voltage."""
+        return self.units[0]
 
     @property
-    @abstractmethod
     def force_unit(self) -> str:
         """Unit of the force."""
+        return self.units[1]
 
     @property
-    @abstractmethod
     def length_unit(self) -> str:
         """Unit of the length."""
+        return self.units[2]
 
     @abstractmethod
     def initial_state(self) -> S:
@@ -68,20 +73,14 @@ class Coupled(Model, ABC, Generic[S]):
     def step(self, state: S, voltage: float, force: float) -> tuple[S, float]:
         """Return state and length after both inputs moved monotonically to new values, force first.
 
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        Raises ValueError if a number is not finite.
         """
 
     @abstractmethod
     def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> Floats:
         """Return the lengths of a sequence, shape (N,), from `state` (default: that after a reset).
 
-        Raises
-        ------
-        ValueError
-            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
+        Raises ValueError if a sequence is empty, not one-dimensional or not finite, or the lengths differ.
         """
 
     @abstractmethod
@@ -172,19 +171,9 @@ class TwoStage(Coupled[TwoStageState]):
         return {"H1": self.first, "H2": self.second}
 
     @property
-    def voltage_unit(self) -> str:
-        """Unit of the voltage."""
-        return self.first.input_unit
-
-    @property
-    def force_unit(self) -> str:
-        """Unit of the force."""
-        return self.first.output_unit or self.second.input_unit
-
-    @property
-    def length_unit(self) -> str:
-        """Unit of the length."""
-        return self.second.output_unit
+    def units(self) -> tuple[str, str, str]:
+        """Units of voltage, force and length."""
+        return self.first.input_unit, self.first.output_unit or self.second.input_unit, self.second.output_unit
 
     def initial_state(self) -> TwoStageState:
         """Return the state after a reset under the pretension: heated to the high end of the voltage, then cooled.
@@ -203,21 +192,9 @@ class TwoStage(Coupled[TwoStageState]):
     def step(
         self, state: TwoStageState, voltage: float, force: float, *, together: bool = False
     ) -> tuple[TwoStageState, float]:
-        """Return state and length after both inputs moved monotonically to new values.
+        """Return state and length after both inputs moved monotonically to new values; see `Coupled.step`.
 
-        Parameters
-        ----------
-        state : TwoStageState
-            State before.
-        voltage, force : float
-            New inputs.
-        together : bool
-            Whether u moves straight to its new value; otherwise with the force first.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        With `together` u moves straight to its new value, otherwise with the force first.
         """
         tension = _checks.number("force", force)
         second = state.second
@@ -229,12 +206,8 @@ class TwoStage(Coupled[TwoStageState]):
     def move(self, state: TwoStageState, voltage: float, argument: float) -> tuple[TwoStageState, float]:
         """Return state and length after the voltage and the argument u moved to new values; the force follows.
 
-        With `argument` = `state.argument` the length is held and the force is H1[voltage] + u.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        With `argument` = `state.argument` the length is held and the force is H1[voltage] + u. Raises ValueError if a
+        number is not finite.
         """
         u = _checks.number("argument", argument)
         first, blocked = self._driven(state, voltage)
@@ -258,21 +231,11 @@ class TwoStage(Coupled[TwoStageState]):
         return TwoStageState(float(voltage), force, first, after, blocked, argument, length), length
 
     def arguments(
-        self,
-        voltages: ArrayLike,
-        forces: ArrayLike,
-        state: TwoStageState | None = None,
-        *,
-        together: bool = False,
+        self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None, *, together: bool = False
     ) -> Floats:
         """Return the inputs of H2, shape (2 N,): for each sample after the move of the force and of the voltage.
 
-        With `together` the two are the same.
-
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
+        With `together` the two are the same. Arguments and errors as `evaluate`.
         """
         before = self.initial_state() if state is None else state
         v, f = _pair(voltages, forces)
@@ -280,53 +243,17 @@ class TwoStage(Coupled[TwoStageState]):
         return _interleaved(blocked, f, together)
 
     def evaluate(
-        self,
-        voltages: ArrayLike,
-        forces: ArrayLike,
-        state: TwoStageState | None = None,
-        *,
-        together: bool = False,
+        self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None, *, together: bool = False
     ) -> Floats:
-        """Return the lengths of a sequence.
-
-        Parameters
-        ----------
-        voltages, forces : array_like, shape (N,)
-            Inputs, between which each moves monotonically.
-        state : TwoStageState or None
-            State before the first sample; default that after a reset.
-        together : bool
-            As in `step`.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Lengths.
-
-        Raises
-        ------
-        ValueError
-            If a sequence is empty, not one-dimensional or not finite, or the lengths differ.
-        """
+        """Return the lengths of a sequence; `together` as in `step`, otherwise see `Coupled.evaluate`."""
         before = self.initial_state() if state is None else state
         path = self.arguments(voltages, forces, before, together=together)
         return self.second.evaluate(path, before.second)[1::2]
 
     def advance(
-        self,
-        voltages: ArrayLike,
-        forces: ArrayLike,
-        state: TwoStageState | None = None,
-        *,
-        together: bool = False,
+        self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None, *, together: bool = False
     ) -> TwoStageState:
-        """Return the state after a sequence; arguments as in `evaluate`.
-
-        Raises
-        ------
-        ValueError
-            As `evaluate`.
-        """
+        """Return the state after a sequence; arguments and errors as `evaluate`."""
         before = self.initial_state() if state is None else state
         v, f = _pair(voltages, forces)
         blocked = np.append(before.blocked, self.first.evaluate(v, before.first))
@@ -369,10 +296,7 @@ class Summed(Coupled[SummedState]):
     """
 
     kind: ClassVar[str] = "summed"
-    parts: ClassVar[Parts] = {
-        "by_force": operator_from_json,
-        "by_voltage": operator_from_json,
-    }
+    parts: ClassVar[Parts] = {"by_force": operator_from_json, "by_voltage": operator_from_json}
     by_force: Stage
     by_voltage: Stage
     pretension: float = 0.0
@@ -387,19 +311,10 @@ class Summed(Coupled[SummedState]):
         return {"H3": self.by_force, "H4": self.by_voltage}
 
     @property
-    def voltage_unit(self) -> str:
-        """Unit of the voltage."""
-        return self.by_voltage.input_unit
-
-    @property
-    def force_unit(self) -> str:
-        """Unit of the force."""
-        return self.by_force.input_unit
-
-    @property
-    def length_unit(self) -> str:
-        """Unit of the length."""
-        return self.by_force.output_unit or self.by_voltage.output_unit
+    def units(self) -> tuple[str, str, str]:
+        """Units of voltage, force and length."""
+        length = self.by_force.output_unit or self.by_voltage.output_unit
+        return self.by_voltage.input_unit, self.by_force.input_unit, length
 
     def initial_state(self) -> SummedState:
         """Return the state after a reset under the pretension: heated to the high end of the voltage, then cooled."""
@@ -497,14 +412,9 @@ class Linear(Coupled[TwoStageState]):
         return {"H5": self.operator}
 
     @property
-    def force_unit(self) -> str:
-        """Unit of the force."""
-        return self.operator.input_unit
-
-    @property
-    def length_unit(self) -> str:
-        """Unit of the length."""
-        return self.operator.output_unit
+    def units(self) -> tuple[str, str, str]:
+        """Units of voltage, force and length."""
+        return self.voltage_unit, self.operator.input_unit, self.operator.output_unit
 
     def initial_state(self) -> TwoStageState:
         """Return the state after a reset under the pretension."""

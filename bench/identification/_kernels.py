@@ -1,8 +1,8 @@
-"""Compiled loops of the constrained fit. Imported on first use only: numba takes its time to load.
+"""Compiled loops of the constrained fit. Imported on first use only, because numba is slow to load.
 
-Columns are held as differences: `values[e]` is the change of a column at sample `rows[e]`, for e from
-`starts[c]` to `starts[c + 1]`. `remaining[n]` is the weight of samples n and later, so that sums over samples
-become sums over changes.
+Columns are held as differences (`Columns`: starts, rows, values): `values[e]` is the change of a column at sample
+`rows[e]`, for e from `starts[c]` to `starts[c + 1]`. `remaining[n]` is the weight of samples n and later, so that
+sums over samples become sums over changes.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Rows = NDArray[np.int32]
+Columns = tuple[Integers, Rows, Floats]
 
 # Columns that `gram_rows` forms at a time.
 _BLOCK = 8
 
 
 @njit(cache=True)
-def moments(starts: Integers, rows: Rows, values: Floats, base: Floats, remaining: Floats) -> tuple[Floats, Floats]:
+def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, Floats]:
     """Return weighted mean and norm about the mean of each column."""
+    starts, rows, values = sparse
     columns = base.size
     means = np.empty(columns)
     norms = np.empty(columns)
@@ -45,11 +47,12 @@ def moments(starts: Integers, rows: Rows, values: Floats, base: Floats, remainin
 
 
 @njit(cache=True)
-def gradient(starts: Integers, rows: Rows, values: Floats, tail: Floats) -> Floats:
+def gradient(sparse: Columns, tail: Floats) -> Floats:
     """Return the product of each column with the vector whose reverse running sum is `tail`.
 
     That vector must add up to zero: the columns' starting values then drop out.
     """
+    starts, rows, values = sparse
     result = np.empty(starts.size - 1)
     for c in range(result.size):
         total = 0.0
@@ -61,16 +64,10 @@ def gradient(starts: Integers, rows: Rows, values: Floats, tail: Floats) -> Floa
 
 @njit(cache=True)
 def combination(
-    starts: Integers,
-    rows: Rows,
-    values: Floats,
-    base: Floats,
-    means: Floats,
-    chosen: Integers,
-    factors: Floats,
-    samples: int,
+    sparse: Columns, base: Floats, means: Floats, chosen: Integers, factors: Floats, samples: int
 ) -> Floats:
     """Return the sum of factor * (column - mean) over the chosen columns, shape (samples,)."""
+    starts, rows, values = sparse
     result = np.zeros(samples)
     start = 0.0
     for k in range(chosen.size):
@@ -87,9 +84,7 @@ def combination(
 
 @njit(cache=True)
 def gram_rows(
-    starts: Integers,
-    rows: Rows,
-    values: Floats,
+    columns: Columns,
     base: Floats,
     means: Floats,
     norms: Floats,
@@ -103,6 +98,7 @@ def gram_rows(
 
     Columns from base.size on are those of `extra`, already centred and scaled.
     """
+    starts, rows, values = columns
     sparse = base.size
     samples = weights.size
     # Several new columns at a time: one look-up of a row then serves them all.

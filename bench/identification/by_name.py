@@ -113,11 +113,6 @@ def identify(
     **options
         As listed above; `levels` is the number of intervals or the increasing levels themselves.
 
-    Returns
-    -------
-    Identification
-        Model, residuals, errors, certificate and warnings.
-
     Raises
     ------
     ValueError

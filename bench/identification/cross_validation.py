@@ -98,11 +98,6 @@ def cross_validate(
     blocks : int
         Number of blocks, >= folds.
 
-    Returns
-    -------
-    CrossValidation
-        One trial for each pair of levels and smoothing.
-
     Raises
     ------
     ValueError

@@ -64,12 +64,8 @@ def covering_sequence(
 
     Parameters
     ----------
-    levels : array_like, shape (M + 1,)
-        Increasing levels, input units: those of the model, or finer.
-    input_range : tuple of float or None
-        Operating range whose ends are visited once too, for a reversible part; default none.
-    per_cell : int
-        Set-points on the way from one level to the next, >= 1: more of them average noise.
+    levels, input_range, per_cell
+        As in `first_order_reversals`; more set-points in a cell average noise.
 
     Returns
     -------

@@ -199,17 +199,14 @@ class ThirdOrder:
     def simulate(self, inputs: ArrayLike, dt: float) -> Floats:
         """Return the outputs to inputs that are held for dt each, from rest, exactly.
 
+        Output k, of N, is at time k dt, before input k has acted.
+
         Parameters
         ----------
         inputs : array_like, shape (N,)
             Number k is held from k dt to (k + 1) dt.
         dt : float
             Time step, s, > 0.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Output k is at time k dt, before input k has acted.
 
         Raises
         ------
@@ -234,10 +231,7 @@ class ThirdOrder:
     def from_json(cls, document: Mapping[str, Any]) -> ThirdOrder:
         """Return the model that `to_json` wrote.
 
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
+        Raises ValueError if a key is missing or wrong.
         """
         return cls(*[_checks.json_field(document, each.name, "third-order dynamics") for each in fields(cls)])
 

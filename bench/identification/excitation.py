@@ -11,18 +11,12 @@ from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 
 
-def damped_oscillation(
-    low: float = 21.0,
-    high: float = 84.0,
-    center: float = 54.0,
-    half_cycles: int = 36,
-    step: float = 0.35,
-) -> Floats:
+def damped_oscillation(low: float, high: float, center: float, half_cycles: int, step: float) -> Floats:
     """Return set-points of one full sweep from low to high, then a decaying oscillation about `center`.
 
     Extremum n of the oscillation lies at center ± reach (1 - n / half_cycles), where reach is the distance
     from the center to `high` or `low`: nested minor loops down to the center itself, the pattern of Zhang
-    et al. 2013, section II-B. The defaults give 3439 set-points.
+    et al. 2013, section II-B.
 
     Parameters
     ----------
@@ -34,11 +28,6 @@ def damped_oscillation(
         Number of half-cycles after the first sweep, >= 1.
     step : float
         Greatest distance between set-points, > 0; each ramp is divided evenly.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Set-points from `low` on, every extremum included once.
 
     Raises
     ------
@@ -57,12 +46,12 @@ def damped_oscillation(
 
 def random_validation(
     rng: np.random.Generator,
-    count: int = 600,
+    count: int,
     *,
-    operating: tuple[float, float] = (21.0, 84.0),
-    transition: tuple[float, float] = (40.0, 72.0),
+    operating: tuple[float, float],
+    transition: tuple[float, float],
+    step: float,
     inside: float = 0.8,
-    step: float = 1.2,
 ) -> Floats:
     """Return `count` set-points on ramps between random targets.
 
@@ -78,11 +67,6 @@ def random_validation(
         Probability of a target in the transition range, 0 to 1.
     step : float
         Greatest distance between set-points, > 0.
-
-    Returns
-    -------
-    ndarray, shape (count,)
-        Set-points.
 
     Raises
     ------
@@ -107,10 +91,7 @@ def random_validation(
 def ramps(extrema: list[float], step: float) -> Floats:
     """Return set-points on straight ramps through `extrema`, no further apart than `step`.
 
-    Raises
-    ------
-    ValueError
-        If there are no extrema, a number is not finite, or the step is not positive.
+    Raises ValueError if there are no extrema, a number is not finite, or the step is not positive.
     """
     points = _checks.samples("extrema", extrema)
     if not _checks.number("step", step) > 0.0:

@@ -126,11 +126,6 @@ def fit(
         the density on the plane|². Cells never swept then follow their neighbours. The fit starts from that on
         a plane of half the order. See `cross_validate` for a choice of the weight.
 
-    Returns
-    -------
-    Fit
-        Solution with certificate.
-
     Raises
     ------
     ValueError
@@ -166,19 +161,8 @@ def fit_minimum_norm(
 
     Parameters
     ----------
-    regressor : Regressor
-        R, shape (N, K + q).
-    outputs : array_like, shape (N,)
-        Measured outputs.
-    weights : array_like, shape (N,), or None
-        Weight per sample, >= 0; default 1.
-    skip : int
-        Number of first samples left out of the cost; they still drive the memory.
-
-    Returns
-    -------
-    Fit
-        Solution with certificate.
+    regressor, outputs, weights, skip
+        As in `fit`.
 
     Raises
     ------
@@ -372,7 +356,7 @@ class _ActiveSet:
         self.columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
         remaining = w[::-1].cumsum()[::-1].copy()
         self.total = float(remaining[0])
-        self.cell_means, cell_norms = _kernels.moments(*self.columns, regressor.base, remaining)
+        self.cell_means, cell_norms = _kernels.moments(self.columns, regressor.base, remaining)
         extra = regressor.extra
         self.means = np.concatenate([self.cell_means, w @ extra / self.total])
         centred = extra - self.means[self.cells :]
@@ -413,7 +397,7 @@ class _ActiveSet:
         v = self.w * residual
         v -= self.w * (v.sum() / self.total)
         result = np.empty(self.regressor.shape[1])
-        result[: self.cells] = _kernels.gradient(*self.columns, v[::-1].cumsum()[::-1].copy())
+        result[: self.cells] = _kernels.gradient(self.columns, v[::-1].cumsum()[::-1].copy())
         result[: self.cells] /= self.norms[: self.cells]
         result[self.cells :] = self.extra.T @ v
         result[~self.usable] = 0.0
@@ -424,9 +408,7 @@ class _ActiveSet:
 
         chosen = np.flatnonzero(self.x[: self.cells])
         factors = self.x[chosen] / self.norms[chosen]
-        model = _kernels.combination(
-            *self.columns, self.regressor.base, self.cell_means, chosen, factors, self.y.size
-        )
+        model = _kernels.combination(self.columns, self.regressor.base, self.cell_means, chosen, factors, self.y.size)
         return np.asarray(self.centred - model - self.extra @ self.x[self.cells :])
 
     def slope(self) -> Floats:
@@ -453,7 +435,7 @@ class _ActiveSet:
             self.gram = grown
         rows = np.empty((new.size, size))
         _kernels.gram_rows(
-            *self.columns,
+            self.columns,
             self.regressor.base,
             self.cell_means,
             self.norms[: self.cells],

@@ -56,10 +56,7 @@ class Errors:
 def measure_errors(measured: ArrayLike, predicted: ArrayLike) -> Errors:
     """Return the error measures of `predicted` against `measured`, both of shape (N,).
 
-    Raises
-    ------
-    ValueError
-        If the lengths differ, or a sequence is empty or not finite.
+    Raises ValueError if the lengths differ, or a sequence is empty or not finite.
     """
     truth = _checks.samples("measured", measured)
     model = _checks.samples("predicted", predicted)

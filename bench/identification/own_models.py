@@ -104,15 +104,10 @@ def _nonmonotonic(
     output_unit: str = "",
 ) -> Preisach:
     plain = _preisach(
-        inputs,
-        levels=levels,
-        plane=plane,
-        input_range=input_range,
-        input_unit=input_unit,
-        output_unit=output_unit,
+        inputs, levels=levels, plane=plane, input_range=input_range, input_unit=input_unit, output_unit=output_unit
     )
     zero = plain.input_range[0] if reference is None else reference
-    return replace(plain, reversible=ThermalExpansion(low=plain.plane[0], high=plain.plane[1], reference=zero))
+    return replace(plain, reversible=ThermalExpansion(0.0, 0.0, *plain.plane, zero))
 
 
 def _polynomial(
@@ -160,12 +155,7 @@ def _prandtl_ishlinskii(
 
 
 def _fit_dead_zones(
-    template: PrandtlIshlinskii,
-    inputs: Floats,
-    outputs: Floats,
-    weights: Floats,
-    skip: int,
-    state: PlayState,
+    template: PrandtlIshlinskii, inputs: Floats, outputs: Floats, weights: Floats, skip: int, state: PlayState
 ) -> PrandtlIshlinskii:
     """Return the operator with play weights, and dead zones whose slopes are still to be fitted, if it has any.
 

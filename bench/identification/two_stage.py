@@ -183,11 +183,6 @@ def identify_two_stage(
     units : tuple of str
         Units of voltage, force and length of the default stages, for labels.
 
-    Returns
-    -------
-    CoupledIdentification
-        Model, errors, certificates.
-
     Raises
     ------
     ValueError
@@ -321,10 +316,7 @@ def predict_series(model: Coupled[Any], series: Series) -> Floats:
 def measure_series(model: Coupled[Any], series: Iterable[Series]) -> Errors:
     """Return the errors of a model over several series; percentages refer to the range over all of them.
 
-    Raises
-    ------
-    ValueError
-        If there is no series.
+    Raises ValueError if there is no series.
     """
     measured = _all(series)
     return measure_errors(
@@ -343,11 +335,6 @@ def voltage_steps(
         Turning points, each of which is a sample; two at least, no two in a row equal.
     count : int
         Number of samples, at least that of the extrema.
-
-    Returns
-    -------
-    ndarray, shape (count,)
-        Set-points.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Protocols: the vocabulary of operator scripts, their parameters, their dry run, and where they come from."""
+"""Protocols: the vocabulary of operator scripts, their parameters, their dry run, and their discovery."""
 
 from bench.binding import Slot, Slots
 from bench.protocol.discovery import Packaged, find_protocol, packaged_protocols

@@ -1,4 +1,4 @@
-"""Where protocols come from: installed packages, by name, and files of one's own."""
+"""Discovery of protocols: by name in installed packages, and in files of one's own."""
 
 from __future__ import annotations
 
@@ -38,12 +38,8 @@ class Packaged:
 def packaged_protocols() -> Packaged:
     """Return the protocols of all installed packages.
 
-    An entry of the group `bench.protocols` is a module, or a package whose modules are searched.
-
-    Raises
-    ------
-    ConfigurationError
-        If two protocols share a name.
+    An entry of the group `bench.protocols` is a module, or a package whose modules are searched. Raises
+    ConfigurationError if two protocols share a name.
     """
     found: dict[str, ProtocolDefinition] = {}
     packages: dict[str, str] = {}
@@ -82,10 +78,7 @@ def _modules(module: ModuleType, problems: list[str]) -> Iterator[ModuleType]:
 def find_protocol(name: str) -> ProtocolDefinition:
     """Return a protocol by its name, or from a file as `path/to/file.py` or `path/to/file.py:NAME`.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none, or the file cannot be loaded or holds several.
+    Raises ConfigurationError if there is none, or the file cannot be loaded or holds several.
     """
     path, _, wanted = (name, "", "") if name.endswith(".py") else name.rpartition(":")
     if path.endswith(".py"):

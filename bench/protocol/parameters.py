@@ -66,7 +66,7 @@ class ProtocolParameters(BaseModel):
 
 
 def parameter(
-    default: Any,  # noqa: ANN401 - whatever type the field has
+    default: Any,  # noqa: ANN401 - of the type of the field
     *,
     unit: str,
     help: str,  # noqa: A002 - the word that the user sees

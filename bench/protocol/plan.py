@@ -48,12 +48,8 @@ class Plan:
 def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: Slots | None = None) -> Plan:
     """Run a protocol dry, echoing each set-point as `NAME_setpoint` and `NAME_temperature` and the like.
 
-    Any other signal reads as 0.
-
-    Raises
-    ------
-    ConfigurationError
-        If the protocol does not end within a million messages, its parameters do not fit together, or it fails.
+    Any other signal reads as 0. Raises ConfigurationError if the protocol does not end within a million messages, its
+    parameters do not fit together, or it fails.
     """
     steps, others, prompts, seconds, at_most = 0, 0, 0, 0.0, 0.0
     watched: set[str] = set()

@@ -1,4 +1,4 @@
-"""The vocabulary of protocols: what an operator's script says, and what it gets back.
+"""The vocabulary of protocols: the messages that they yield, and the readings that they receive.
 
 A protocol is a generator. It yields messages, and for each `Step` it is sent the `Reading` that was taken
 once the step had settled::
@@ -12,8 +12,8 @@ once the step had settled::
         reading = yield Step({"plate": parameters.target}, Dwell(30.0))
         yield Note(f"arrived at {reading['plate_temperature']:.2f} °C")
 
-Messages name devices and signals of a rig. A protocol that shall run on any rig asks for slots instead, and takes
-the names from what the rig file binds to them; see `bench.binding`.
+Messages name devices and signals of a rig. A protocol for any rig asks for slots instead, and takes the names from
+their binding in the rig file; see `bench.binding`.
 
 A protocol touches no device and no clock, and is deterministic given its parameters and its readings. So
 it can be run dry to learn its length and the extremes of its set-points before anything moves.
@@ -223,7 +223,7 @@ class FixedRate(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Prompt(Message):
-    """Ask the operator to do something by hand, let the rig settle, and see by a reading that it was done.
+    """Prompt for a manual action, wait until the rig has settled, and verify the action with a reading.
 
     An emulated laboratory does it by itself, from `task` and `value`.
 

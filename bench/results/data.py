@@ -67,12 +67,7 @@ def read_columns(path: Path, names: Sequence[str], *, at_least: int = 1) -> Colu
 
 
 def check_excitation(columns: Columns, name: str) -> list[str]:
-    """Check that a column can serve as the input of an identification.
-
-    Returns
-    -------
-    list of str
-        What is odd about it, though usable.
+    """Check that a column can serve as the input of an identification; return what is odd about it, though usable.
 
     Raises
     ------
@@ -97,10 +92,7 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
 def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequence[object]]) -> None:
     """Write columns of equal length as CSV, numbers with all their digits.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    Raises DataError if the file cannot be written.
     """
     plain = [column.tolist() if isinstance(column, np.ndarray) else column for column in columns]
     try:
@@ -177,7 +169,7 @@ def _place(path: Path, header: Sequence[str], name: str) -> int:
         known = ", ".join(cell.strip() for cell in header)
         raise DataError(f"{path}: has no column {name!r}; it has: {known}")
     if len(places) > 1:
-        raise DataError(f"{path}: has {len(places)} columns {name!r}; name one with its unit, as the header has it")
+        raise DataError(f"{path}: has {len(places)} columns {name!r}; name one with its unit, as in the header")
     return places[0]
 
 

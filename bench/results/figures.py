@@ -63,15 +63,7 @@ class Curve(NamedTuple):
 def plot_loops(
     path: Path, inputs: Floats, measured: Floats, modelled: Floats | None, *, input_label: str, output_label: str
 ) -> None:
-    """Draw measured loops, and those of a model beside them.
-
-    Parameters
-    ----------
-    inputs, measured : ndarray, shape (N,)
-        Input and output, one sample a step.
-    modelled : ndarray or None, shape (N,)
-        Output of the model.
-    """
+    """Draw measured loops, one sample a step, and those of a model beside them; arrays of shape (N,)."""
     with _figure(path, (6.0, 4.2)) as figure:
         axes = figure.subplots()
         axes.plot(inputs, measured, "-", color=_COLORS[0], linewidth=0.8, label="measured")
@@ -82,13 +74,7 @@ def plot_loops(
 
 
 def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str) -> None:
-    """Draw the error of each model against the sample index, one panel a model.
-
-    Parameters
-    ----------
-    errors : mapping of str to ndarray
-        Measured minus modelled by the model's title, each of shape (N,).
-    """
+    """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, by its title."""
     with _figure(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
         for i, (title, error) in enumerate(errors.items()):
@@ -102,15 +88,7 @@ def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str) -
 def plot_sequence_and_errors(
     path: Path, inputs: Floats, errors: Mapping[str, Floats], *, input_label: str, error_label: str
 ) -> None:
-    """Draw an input sequence, and below it the errors of several models.
-
-    Parameters
-    ----------
-    inputs : ndarray, shape (N,)
-        Input, one sample a step.
-    errors : mapping of str to ndarray
-        Measured minus modelled by the model's title, each of shape (N,).
-    """
+    """Draw an input sequence, one sample a step, and below it the errors of several models; as in `plot_errors`."""
     with _figure(path, (6.0, 5.5)) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True)
         top.plot(inputs, color=_COLORS[0], linewidth=0.8)
@@ -133,14 +111,8 @@ def plot_tracking(
 ) -> None:
     """Draw a reference and the outputs under several controllers, and below it their errors.
 
-    Parameters
-    ----------
-    reference : ndarray, shape (N,)
-        The reference.
-    outputs : mapping of str to ndarray
-        Measured outputs by the controller's title, each of shape (N,).
-    horizontal : ndarray or None, shape (N,)
-        Horizontal positions, such as times; the index if None.
+    Outputs are given by the controller's title; all arrays have the shape (N,). Horizontal positions, such as times,
+    default to the index.
     """
     places = np.arange(reference.size, dtype=np.float64) if horizontal is None else horizontal
     marker = "." if horizontal is None else ""
@@ -164,15 +136,7 @@ def plot_panels(
     vertical_label: str,
     columns: int = 2,
 ) -> None:
-    """Draw several sets of curves on the same axes, one panel a set.
-
-    Parameters
-    ----------
-    panels : mapping of str to sequence of Curve
-        Curves by the panel's title.
-    columns : int
-        Panels beside each other.
-    """
+    """Draw several sets of curves on the same axes, one panel a set, by their titles; `columns` beside each other."""
     rows = -(-len(panels) // columns)
     with _figure(path, (3.3 * columns, 0.4 + 2.6 * rows)) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -200,13 +164,7 @@ def plot_panels(
 
 
 def plot_densities(path: Path, densities: Sequence[Density]) -> None:
-    """Draw Preisach densities on their planes, side by side; cells without density are white.
-
-    Parameters
-    ----------
-    densities : sequence of Density
-        Their titles are those of the panels.
-    """
+    """Draw Preisach densities on their planes, side by side, under their titles; cells without density are white."""
     with _figure(path, (5.2 * len(densities), 4.2), grid=False) as figure:
         panels = figure.subplots(1, len(densities), squeeze=False)[0]
         for axes, density in zip(panels, densities, strict=True):
@@ -226,16 +184,9 @@ def plot_densities(path: Path, densities: Sequence[Density]) -> None:
 
 
 def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
-    """Draw which cells of a plane were swept, and the memory curve at the end.
+    """Draw which cells of a plane were swept, shape (K,) as in `Preisach`, and the memory curve at the end over them.
 
-    Parameters
-    ----------
-    density : Density
-        The operator's density, for its levels.
-    swept : ndarray of bool, shape (K,)
-        By cell, as in `Preisach`.
-    memory : MemoryCurve
-        The staircase that is drawn over the cells.
+    Of the density only the levels and units count.
     """
     cells = np.full(density.values.shape, np.nan)
     cells[np.tril_indices(len(cells))] = swept
@@ -251,17 +202,7 @@ def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], me
 
 
 def plot_signals(path: Path, hours: Floats, signals: Mapping[str, Floats], labels: Sequence[str]) -> None:
-    """Draw signals over laboratory time, one panel each.
-
-    Parameters
-    ----------
-    hours : ndarray, shape (N,)
-        Laboratory time in h.
-    signals : mapping of str to ndarray
-        By name, each of shape (N,).
-    labels : sequence of str
-        Axis label of each, with unit.
-    """
+    """Draw signals, each of shape (N,), over laboratory time in h, one panel each; labels include units."""
     with _figure(path, (7.0, 0.8 + 1.2 * len(signals))) as figure:
         panels = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
         for i, values in enumerate(signals.values()):

@@ -1,4 +1,4 @@
-"""From a file of measurements to a model file, and back: what `bench identify` and `bench predict` do."""
+"""From measurements to a model file, and back: the work of `bench identify`, `bench predict` and their like."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from bench.identification import (
     first_order_reversals,
     identify,
 )
+from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
-from bench.results.model_file import ModelFile, load_model
 
 Floats = npt.NDArray[np.float64]
 
@@ -207,7 +207,7 @@ def _largest(uncertainties: Floats) -> float | None:
 
 
 def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) -> Floats:
-    """Apply a model to a sequence of inputs.
+    """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
     Parameters
     ----------
@@ -218,11 +218,6 @@ def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) 
     continue_memory : bool
         Start from the memory that the model file keeps, the end of its identification data, rather than from
         the state from which identification started.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Predicted outputs, in the unit of the model.
     """
     return np.asarray(model.operator.evaluate(inputs, model.memory if continue_memory else None))
 
@@ -285,10 +280,7 @@ def invert_targets(
 def check_unit(expected: str, unit: str, column: str) -> None:
     """Check that a column's unit is that of the model; an unknown unit passes.
 
-    Raises
-    ------
-    DataError
-        If both are known and differ.
+    Raises DataError if both are known and differ.
     """
     if unit and expected and unit != expected:
         raise DataError(f"column {column} is in {unit}; the model has it in {expected}")
@@ -415,7 +407,7 @@ def assess_designs(
         operator = Preisach(
             grid,
             np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(low=plane[0], high=plane[1]),
+            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
             input_range=operating,
         )
         span = high - low

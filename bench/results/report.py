@@ -17,9 +17,9 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table, run_card
+from bench.model_file import ModelFile, parse_model
 from bench.results.data import header_with_unit, write_csv
 from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
-from bench.results.model_file import ModelFile, parse_model
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
@@ -27,7 +27,7 @@ from bench.units import format_numbers, with_unit
 
 
 def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console: Console) -> dict[str, Any]:
-    """Print a run's tables, draw its figures, and compare models on it.
+    """Print a run's tables, draw its figures, and compare models on it; return the same for programs.
 
     Parameters
     ----------
@@ -39,11 +39,6 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         Folder of the figures; `report` beside the journal if None.
     console : Console
         Console to print on.
-
-    Returns
-    -------
-    dict
-        The report for programs.
 
     Raises
     ------
@@ -82,12 +77,7 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
 
 
 def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
-    """Write a run's readings and telemetry as `csv` or `parquet`, rebuild its `rrd`, or picture it as `png`.
-
-    Returns
-    -------
-    list of Path
-        The files that were written.
+    """Write a run's readings and telemetry as `csv` or `parquet`, its `rrd` or a `png`; return the files.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The folder of a run, for programs and notebooks: what was measured as tables, and what happened."""
+"""The folder of a run, for programs and notebooks: measurements as tables, events, and outcome."""
 
 from __future__ import annotations
 
@@ -67,10 +67,7 @@ class RunFolder:
     def signal_of(self, slot: str) -> str:
         """Return the signal to which the protocol's slot was bound.
 
-        Raises
-        ------
-        DataError
-            If the protocol had no such slot.
+        Raises DataError if the protocol had no such slot.
         """
         slots = self.meta.get("slots", {})
         if slot not in slots:

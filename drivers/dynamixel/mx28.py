@@ -1,4 +1,4 @@
-"""The Dynamixel MX-28 with Protocol 2.0 firmware (39 and newer): what its uses as a servo and with a drum share.
+"""The Dynamixel MX-28 with Protocol 2.0 firmware (39 and newer): the common base of servo and drum.
 
 Source: ROBOTIS e-Manual, MX-28(2.0) (control table, units, hardware errors, bus watchdog).
 
@@ -287,10 +287,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         The torque is off then and the number of turns is lost: the angle is that within one turn, and a drum is off
         by whole circumferences.
 
-        Raises
-        ------
-        DeviceError
-            If the servo does not come back within 5 s, or comes back with an error.
+        Raises `DeviceError` if the servo does not come back within 5 s, or comes back with an error.
         """
         self._reboot(_START_TIMEOUT)
         self._start()

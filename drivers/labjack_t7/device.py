@@ -1,4 +1,4 @@
-"""What every device on a LabJack T7 has: where the instrument is, and a connection of its own."""
+"""The base of all devices on a LabJack T7: the address of the instrument, and a connection of their own."""
 
 from __future__ import annotations
 

@@ -83,8 +83,6 @@ class DigitalOutput:
 
     Parameters
     ----------
-    name : str
-        Name of the device, for messages.
     instrument : LabJackT7
         The connection.
     line : int
@@ -112,10 +110,7 @@ class DigitalOutput:
     def switch(self, on: bool) -> None:
         """Make the line an output with the level for on or off.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument refuses, or if the line does not read back so.
+        Raises `DeviceError` if the instrument refuses, or if the line does not read back so.
         """
         self._instrument.write(DIO.of(self._line), int(on == self._active_high))
         self.check_output()
@@ -146,10 +141,8 @@ class DigitalOutput:
         Other outputs under the watchdog stay so, and then the shorter of its present time and `seconds` holds. The
         outputs of a watchdog that is switched off are not taken over.
 
-        Raises
-        ------
-        DeviceError
-            If the watchdog is in strict mode, which another program feeds, or if the instrument refuses.
+        Raises `DeviceError` if the watchdog is in strict mode, which another program feeds, or if the instrument
+        refuses.
         """
         present = self._watchdog()
         if present.enabled and present.strict:
@@ -175,10 +168,7 @@ class DigitalOutput:
     def unguard(self) -> None:
         """Take the line from the watchdog, and switch the watchdog off if nothing else is under it.
 
-        Raises
-        ------
-        DeviceError
-            If the instrument refuses.
+        Raises `DeviceError` if the instrument refuses.
         """
         present = self._watchdog()
         if not present.lines & self._bit:

@@ -24,21 +24,14 @@ from drivers.modbus import exception_text, pack, swapped, unpack
 
 
 class Register(NamedTuple):
-    """A register, or the first of several alike.
-
-    Attributes
-    ----------
-    name : str
-        Name in the map, with # for the number of a channel.
-    address : int
-        Modbus address.
-    form : str
-        Type of its value by its letter in `struct`: f FLOAT32, I UINT32, H UINT16.
-    """
+    """A register, or the first of several alike."""
 
     name: str
+    """Name in the map, with # for the number of a channel."""
     address: int
+    """Modbus address."""
     form: str
+    """Type of its value by its letter in `struct`: f FLOAT32, I UINT32, H UINT16."""
 
     def of(self, channel: int) -> Register:
         """Return the register of a channel."""
@@ -105,8 +98,6 @@ class LabJackT7:
 
     Parameters
     ----------
-    name : str
-        Name of the device, for messages.
     port : str
         Address as `tcp://HOST:PORT`.
     timeout : float
@@ -167,10 +158,7 @@ class LabJackT7:
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type in one request, and read them back.
 
-        Raises
-        ------
-        DeviceError
-            If a register reads back another value.
+        Raises `DeviceError` if a register reads back another value.
         """
         first = next(iter(values))
         self.write(first, *values.values())
@@ -186,10 +174,8 @@ class LabJackT7:
     def identify(self) -> Identity:
         """Check the byte order and the product, and get the identity.
 
-        Raises
-        ------
-        DeviceConnectionError
-            If another device answers, or words or bytes arrive in another order than LabJack's.
+        Raises `DeviceConnectionError` if another device answers, or words or bytes arrive in another order than
+        LabJack's.
         """
         try:
             words = self.read_words(TEST.address, 2)
@@ -197,11 +183,11 @@ class LabJackT7:
             raise
         except DeviceError as error:
             reason = str(error).removeprefix(f"{self._name}: ")
-            raise self._wrong(f"is no LabJack T-series: register TEST gave {reason}") from error
+            raise self._wrong(f"is not a LabJack T-series: register TEST gave {reason}") from error
         if words != _TEST_WORDS:
             raise self._wrong(
                 swapped(words, lambda order: list(order) == _TEST_WORDS)
-                or f"is no LabJack T-series: register TEST is 0x{words[0]:04X}{words[1]:04X}, not 0x00112233"
+                or f"is not a LabJack T-series: register TEST is 0x{words[0]:04X}{words[1]:04X}, not 0x00112233"
             )
         (value,) = self.read(TEST_FLOAT32)
         if value != _TEST_FLOAT:

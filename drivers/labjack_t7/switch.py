@@ -67,10 +67,7 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
     def safe(self) -> None:
         """Switch off and see that the line is off.
 
-        Raises
-        ------
-        DeviceError
-            If that could not be confirmed; a line that cannot be reached is left to the watchdog.
+        Raises `DeviceError` if that could not be confirmed; a line that cannot be reached is left to the watchdog.
         """
         self._setpoint = 0.0
         self._output.switch(False)

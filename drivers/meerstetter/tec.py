@@ -156,10 +156,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def select_mode(self, mode: TECMode) -> None:
         """Choose what is held constant; a change switches the output off first.
 
-        Raises
-        ------
-        DeviceError
-            If the output does not go off, or the device refuses.
+        Raises `DeviceError` if the output does not go off, or the device refuses.
         """
         if mode is self._mode:
             return
@@ -244,10 +241,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def reset(self) -> None:
         """Restart the device and configure it again: clears an error whose cause is gone. The output is off.
 
-        Raises
-        ------
-        DeviceError
-            If the device does not come back within 5 s, or comes back with an error.
+        Raises `DeviceError` if the device does not come back within 5 s, or comes back with an error.
         """
         # The acknowledge may be lost in the restart; whether the device comes back is what counts.
         with suppress(DeviceConnectionError, RefusedError):

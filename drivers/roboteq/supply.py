@@ -219,10 +219,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def emergency_stop(self) -> None:
         """Switch the power stage off until `release`, or until the device is switched off and on.
 
-        Raises
-        ------
-        DeviceError
-            If the device does not acknowledge.
+        Raises `DeviceError` if the device does not acknowledge.
         """
         with self._lock:
             self._order += 1
@@ -232,10 +229,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def release(self) -> None:
         """End an emergency stop; the output stays at 0 V, as 0 is commanded before and after.
 
-        Raises
-        ------
-        DeviceError
-            If the device refuses, or reports a fault still.
+        Raises `DeviceError` if the device refuses, or reports a fault still.
         """
         with self._lock:
             self._order += 1

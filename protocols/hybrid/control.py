@@ -8,9 +8,9 @@ from typing import Literal
 
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
 from bench.controllers import ControllerSetup, make_controller
+from bench.model_file import load_model
 from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
 from bench.protocol.number_list import NumberList
-from bench.results.model_file import load_model
 from protocols.hybrid import FINE, SENSORS, THERMAL, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]

@@ -1,4 +1,4 @@
-"""Control of a muscle: its length under a weight, or its force between fixed ends, to one target after another."""
+"""Control of a muscle: its length under a weight, or its force between fixed ends, follows a sequence of targets."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from bench.control.loops import Reaching, ReachTarget
 from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
+from bench.model_file import ModelFile, load_model
 from bench.protocol import (
     Control,
     Dwell,
@@ -23,7 +24,6 @@ from bench.protocol import (
     parameter,
     protocol,
 )
-from bench.results.model_file import ModelFile, load_model
 from bench.results.tracking import REACH, READING
 from protocols.muscles.parts import (
     ON_STAGE,

@@ -26,7 +26,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
-from protocols.preparation import DRIVE_AND_RESPONSE, Part
+from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for_load
 
 SAMPLE = "sample"
 """Label of the readings that count."""
@@ -39,7 +39,6 @@ LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 """Dead loads, N (Zhang and Yip 2017, section II-A)."""
 
 _COOL_SECONDS = 20.0
-_SETTLE_LOAD = Dwell(5.0)
 _STIFFNESSES = (0.8e3, 12e3)
 """Least and greatest stiffness of muscle and frame together that are believed, N/m."""
 _LARGEST_STEP = 0.2e-3
@@ -74,18 +73,7 @@ def drive_to(slots: Slots, value: float, seconds: float, label: str) -> Step:
 
 def hang(slots: Slots, load: float) -> Part[Reading]:
     """Prompt for a load (N) on the muscle, and verify it with the load cell."""
-    slot = slots["load"]
-    tolerance = 0.15 + 0.02 * load
-    reading = yield Prompt(
-        text=slot.table.prompt.format(value=load, unit=slot.unit),
-        task=slot.table.task or slot.name,
-        value=load,
-        settle=_SETTLE_LOAD,
-        signal=slot.signal,
-        low=load - tolerance,
-        high=load + tolerance,
-    )
-    return reading
+    return (yield from prompt_for_load(slots["load"], load, 0.15 + 0.02 * load))
 
 
 def reset_under_weights(parameters: ResetParameters, slots: Slots) -> Part[Reading]:
@@ -115,7 +103,7 @@ def fasten(slots: Slots) -> Part[Reading]:
         text="Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
         task="stage",
         value=0.0,
-        settle=_SETTLE_LOAD,
+        settle=SETTLE_LOAD,
         signal=slots["force"].signal,
         low=-0.3,
         high=1.0,

@@ -24,7 +24,7 @@ def identify(
     Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
     voltage, third-order dynamics from the fast step.
     """
-    from bench.results.model_file import ModelFile
+    from bench.model_file import ModelFile
     from rigs.hybrid.identification import identify_hybrid
 
     found = identify_hybrid(steps, static, loops, step, plays=plays)

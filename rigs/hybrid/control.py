@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from functools import partial
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -165,10 +166,7 @@ class _MidRanging:
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
         """Take deflection (m) and temperatures of base and tip (°C) at a time (s); return current and voltage.
 
-        Raises
-        ------
-        ValueError
-            If there are not three readings.
+        Raises ValueError if there are not three readings.
         """
         if len(measured) != 3:
             raise ValueError(f"measured: expected deflection and two temperatures, got {len(measured)} readings")
@@ -309,24 +307,20 @@ def _spec(summary: str, make: Callable[[HybridModel, Reference, float], SampledC
     return ControllerSpec(summary, lambda s: make(s.model.model, s.options["reference"], s.options["rate"]))
 
 
-HYBRID = _spec(
-    "mid-ranging of thermal and piezo part, with a Kalman filter",
-    lambda model, reference, rate: HybridController(model, reference, MidRangingParameters.at_rate(rate)),
+def _mid_ranging(summary: str, controller: Callable[..., _MidRanging], **settings: Any) -> ControllerSpec:  # noqa: ANN401 - as each field
+    """Return a controller of the class for the registry, with the settings that differ from those of the rate."""
+    return _spec(
+        summary,
+        lambda model, reference, rate: controller(
+            model, reference, replace(MidRangingParameters.at_rate(rate), **settings)
+        ),
+    )
+
+
+HYBRID = _mid_ranging("mid-ranging of thermal and piezo part, with a Kalman filter", HybridController)
+HYBRID_LOW_PASS = _mid_ranging(
+    "mid-ranging of thermal and piezo part, with a low-pass", partial(HybridController, estimator="low-pass")
 )
-HYBRID_LOW_PASS = _spec(
-    "mid-ranging of thermal and piezo part, with a low-pass",
-    lambda model, reference, rate: HybridController(
-        model, reference, MidRangingParameters.at_rate(rate), estimator="low-pass"
-    ),
-)
-OPEN_LOOP = _spec(
-    "the inverse of the model, without the deflection sensor",
-    lambda model, reference, rate: OpenLoopHybrid(model, reference, MidRangingParameters.at_rate(rate)),
-)
-THERMAL_FEEDBACK = _spec(
-    "feedback to the thermal part alone",
-    lambda model, reference, rate: ThermalFeedback(
-        model, reference, replace(MidRangingParameters.at_rate(rate), gain=_THERMAL_GAIN)
-    ),
-)
+OPEN_LOOP = _mid_ranging("the inverse of the model, without the deflection sensor", OpenLoopHybrid)
+THERMAL_FEEDBACK = _mid_ranging("feedback to the thermal part alone", ThermalFeedback, gain=_THERMAL_GAIN)
 NOTCH = _spec("the piezo part alone, with a notch at its resonance", make_fine)

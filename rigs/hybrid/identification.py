@@ -113,10 +113,7 @@ def signal_names(record: Record) -> dict[str, str]:
 def read_loops(run: Path) -> dict[str, Samples]:
     """Return the samples of each fast loop of a run by its label.
 
-    Raises
-    ------
-    DataError
-        If the run was not completed, has no fast loop or two of one label, or left samples out.
+    Raises DataError if the run was not completed, has no fast loop or two of one label, or left samples out.
     """
     with Record(run) as record:
         if record.status != "completed":
@@ -163,10 +160,7 @@ def sine_at(samples: Samples, signal: str, frequency: float) -> complex:
 def bandwidth_of(frequencies: Floats, gains: Floats) -> float:
     """Return the frequency (Hz) at which a gain has fallen by 3 dB from the one at the lowest, between two of them.
 
-    Raises
-    ------
-    DataError
-        If it has not fallen so far at the highest.
+    Raises DataError if it has not fallen so far at the highest.
     """
     wanted = gains[0] / np.sqrt(2.0)
     below = np.flatnonzero(gains <= wanted)
@@ -243,10 +237,7 @@ def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:
 def read_loop(run: Path) -> Samples:
     """Return the samples of the one fast loop of a run.
 
-    Raises
-    ------
-    DataError
-        As `read_loops`, or if there are several.
+    Raises DataError as `read_loops`, or if there are several.
     """
     loops = read_loops(run)
     if len(loops) != 1:

@@ -224,10 +224,7 @@ class Direct(Device):
     def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> Self:  # noqa: ARG003
         """Return the instrument of the laboratory that is open.
 
-        Raises
-        ------
-        DeviceConnectionError
-            If the laboratory has no such instrument, or one of another name.
+        Raises DeviceConnectionError if the laboratory has no such instrument, or one of another name.
         """
         device = _direct.get(settings.port)
         if not isinstance(device, cls):

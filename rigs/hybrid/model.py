@@ -111,23 +111,16 @@ class HybridModel(Model):
     ) -> HybridResponse:
         """Return the response to currents and voltages that are held for dt each, exactly.
 
+        Row k is at time k dt, before current and voltage k have acted.
+
         At the start every temperature is that of the air, and the piezo layer is relaxed.
 
         Parameters
         ----------
-        currents : array_like, shape (N,)
-            A, positive heats; number k is held from k dt to (k + 1) dt.
+        currents, dt, ambient
+            As in `ThermalNetwork.simulate`.
         voltages : array_like, shape (N,)
             V, held likewise.
-        dt : float
-            Time step, s, > 0.
-        ambient : array_like, scalar or shape (N,)
-            Temperature of the air, °C, held likewise.
-
-        Returns
-        -------
-        HybridResponse
-            Row k is at time k dt, before current and voltage k have acted.
 
         Raises
         ------

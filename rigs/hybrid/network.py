@@ -195,12 +195,8 @@ class ThermalNetwork:
     def steady_rises(self, current: float, ambient: float = 22.0) -> Floats:
         """Return the steady rise of each node above the air under a constant current, K, shape (4,).
 
-        One linear solve: no iteration, and exactly 0 without current.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite or the current heats without end.
+        One linear solve: no iteration, and exactly 0 without current. Raises ValueError if a number is not finite or
+        the current heats without end.
         """
         matrix, forcing = self._system(_checks.number("current", current), _air(ambient))
         if np.linalg.eigvals(matrix).real.max() >= 0.0:
@@ -227,12 +223,7 @@ class ThermalNetwork:
     def linearise(self, current: float = 0.0, ambient: float = 22.0) -> tuple[Floats, Floats]:
         """Return A (shape (4, 4), 1/s) and B (shape (4,), K/(A s)) of small changes about a steady state.
 
-        Changes of the temperatures follow A @ temperatures + B * current.
-
-        Raises
-        ------
-        ValueError
-            As `steady_rises`.
+        Changes of the temperatures follow A @ temperatures + B * current. Raises ValueError as `steady_rises`.
         """
         temperatures = self.steady_state(current, ambient)
         back = self._back_face(temperatures, current)
@@ -286,6 +277,8 @@ class ThermalNetwork:
     ) -> Floats:
         """Return the temperatures under currents that are held for dt each, exactly.
 
+        Shape (N, 4), °C; row k is at time k dt, before current k has acted.
+
         Parameters
         ----------
         currents : array_like, shape (N,)
@@ -296,11 +289,6 @@ class ThermalNetwork:
             Temperature of the air, °C, held likewise.
         start : array_like, shape (4,), or None
             Temperatures at time 0; default the ambient.
-
-        Returns
-        -------
-        ndarray, shape (N, 4)
-            °C; row k is at time k dt, before current k has acted.
 
         Raises
         ------
@@ -329,10 +317,7 @@ class ThermalNetwork:
     def from_json(cls, document: Mapping[str, Any]) -> ThermalNetwork:
         """Return the network that `to_json` wrote.
 
-        Raises
-        ------
-        ValueError
-            If a key is missing or wrong.
+        Raises ValueError if a key is missing or wrong.
         """
         return cls(**{each.name: _checks.json_field(document, each.name, "thermal network") for each in fields(cls)})
 

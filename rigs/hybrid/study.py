@@ -17,8 +17,8 @@ import numpy.typing as npt
 from bench.campaign import Campaign, ResultTable, Study, StudyResult
 from bench.identification import measure_errors
 from bench.journal import Record
+from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
-from bench.results.model_file import ModelFile
 from bench.runs import RunResult
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (

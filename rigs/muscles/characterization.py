@@ -17,8 +17,8 @@ import numpy.typing as npt
 from bench.campaign import Campaign, ResultTable
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
+from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
-from bench.results.model_file import ModelFile
 from rigs.muscles.identification import (
     MODELS,
     ModelName,

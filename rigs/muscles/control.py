@@ -27,7 +27,7 @@ from typing import ClassVar
 from bench.control.baselines import saturation
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.loops import SHORTEST_WAIT
-from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
+from bench.control.tracking import Command, ControllerBase, check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
 from bench.controllers import ControllerSetup, ControllerSpec
 from bench.errors import DataError
@@ -72,10 +72,7 @@ class ThermalLag:
     def advance(self, duration: float, voltage: float) -> ThermalLag:
         """Return the lag after a time (s, at least 0) at a constant voltage, exactly.
 
-        Raises
-        ------
-        ValueError
-            If the duration is negative or a number is not finite.
+        Raises ValueError if the duration is negative or a number is not finite.
         """
         if not 0.0 <= duration < math.inf:
             raise ValueError(f"duration: expected a finite number of s, at least 0, got {duration}")
@@ -182,12 +179,7 @@ class LengthTask(Task):
     def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
         """Return the model's state after force and voltage have come to new values, the force first.
 
-        A missing force is replaced by the last one.
-
-        Raises
-        ------
-        ValueError
-            If there is not one further signal.
+        A missing force is replaced by the last one. Raises ValueError if there is not one further signal.
         """
         if len(others) != 1:
             raise ValueError(f"length task: expected the force as one further signal, got {len(others)}")
@@ -220,10 +212,7 @@ class ForceTask(Task):
     def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
         """Return the model's state after the voltage has come to a new value; the argument of H2 stays.
 
-        Raises
-        ------
-        ValueError
-            If there are further signals.
+        Raises ValueError if there are further signals.
         """
         if others:
             raise ValueError(f"force task: expected no further signals, got {len(others)}")
@@ -269,35 +258,20 @@ class InverseControlParameters:
         check_positive(self)
 
 
-class MuscleController(ABC):
+class MuscleController(ControllerBase, ABC):
     """Base of the controllers: limits, the last set-point, a fixed period and a fixed time at each target."""
 
-    def __init__(self, limits: tuple[float, float], period: float, duration: float) -> None:
-        self._low, self._high = limits
+    def __init__(
+        self, input_range: tuple[float, float], limits: tuple[float, float] | None, period: float, duration: float
+    ) -> None:
+        super().__init__(input_range, limits)
         if self._low < 0.0:
-            raise ValueError(f"limits: expected voltages of at least 0, got {limits}")
+            raise ValueError(f"limits: expected voltages of at least 0, got {self.limits}")
         self._period = period
         self._samples = max(1, round(duration / period))
         self._sample = 0
         self._start = 0.0
-        self._target = math.nan
         self._setpoint = self._low
-        self._reach = Reach.MET
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Least and greatest voltage, V."""
-        return self._low, self._high
-
-    @property
-    def reach(self) -> Reach:
-        """Whether the present target can be met."""
-        return self._reach
-
-    @property
-    @abstractmethod
-    def trace(self) -> Trace:
-        """The present estimates of the controller."""
 
     def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Start towards a new target and return the first command.
@@ -320,7 +294,7 @@ class MuscleController(ABC):
         ValueError
             If the target is not finite, the time goes back or the number of further signals is wrong.
         """
-        self._target = _checks.number("target", target)
+        self._reference = _checks.number("target", target)
         self._start, self._sample, self._reach = t, 0, Reach.MET
         return self.update(t, measured_input, output, *others)
 
@@ -334,21 +308,18 @@ class MuscleController(ABC):
         ValueError
             As `aim`.
         """
-        if math.isnan(self._target):
+        if math.isnan(self._reference):
             raise RuntimeError("update: expected a target first, by aim")
-        self._observe(t, measured_input, output, others)
+        self._take_in(t, measured_input, output, others)
         if self._sample == self._samples:
             return Command(self._setpoint, self._period, done=True)
         self._setpoint = self._clip(self._decide(output, first=self._sample == 0))
         self._sample += 1
-        # Counted from the beginning, so that what is late once is not late ever after.
+        # Counted from the beginning, so that one delay does not shift all later samples.
         return Command(self._setpoint, max(SHORTEST_WAIT, self._start + self._sample * self._period - t))
 
-    def _clip(self, voltage: float) -> float:
-        return min(max(voltage, self._low), self._high)
-
     @abstractmethod
-    def _observe(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
+    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
         """Take in a reading."""
 
     @abstractmethod
@@ -368,7 +339,7 @@ class _Modelled(MuscleController):
     ) -> None:
         self._parameters = p = parameters or InverseControlParameters()
         model = task.inverse.model
-        super().__init__(ControllerBase(model.first.input_range, limits).limits, p.period, p.duration)
+        super().__init__(model.first.input_range, limits, p.period, p.duration)
         self._task = task
         self._state = model.initial_state() if state is None else state
         self._lag = ThermalLag(p.time_constant, self._state.voltage**2)
@@ -380,9 +351,10 @@ class _Modelled(MuscleController):
     @property
     def state(self) -> TwoStageState:
         """Memory of the wire as the controller knows it; its voltage is the one that would hold the temperature."""
-        return self._state
+        state: TwoStageState = self._state
+        return state
 
-    def _observe(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
+    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
         low, high = self._plausible_input
         applied = measured_input if low <= measured_input <= high else self._setpoint
         if self._time is not None:
@@ -390,7 +362,10 @@ class _Modelled(MuscleController):
         self._time = t
         self._state = self._task.advance(self._state, self._lag.voltage, others)
 
-    def _answer(self, target: float) -> float:
+    def _modelled(self) -> float:
+        return self._task.output(self._state)
+
+    def _steady(self, target: float) -> float:
         """Return the steady voltage for a target of the model within the limits; note whether it meets the target."""
         found = self._task.invert(self._state, target)
         voltage = self._clip(found.voltage)
@@ -424,13 +399,8 @@ class MuscleOpenLoop(_Modelled):
         If the limits do not increase, are negative or have nothing in common with the model's range.
     """
 
-    @property
-    def trace(self) -> Trace:
-        """The present estimates of the controller."""
-        return Trace(reference=self._target, predicted=self._task.output(self._state))
-
     def _decide(self, output: float, *, first: bool) -> float:  # noqa: ARG002
-        return self._answer(self._target) if first else self._setpoint
+        return self._steady(self._reference) if first else self._setpoint
 
 
 class MuscleClosedLoop(_Modelled):
@@ -461,33 +431,22 @@ class MuscleClosedLoop(_Modelled):
         parameters: InverseControlParameters | None = None,
     ) -> None:
         super().__init__(task, state, limits, parameters)
-        self._estimator = DisturbanceEstimator(
+        self._estimator: DisturbanceEstimator = DisturbanceEstimator(
             walk_variance=task.walk_variance, reading_variance=task.reading_variance
         )
 
-    @property
-    def trace(self) -> Trace:
-        """The present estimates of the controller."""
-        disturbance = self._estimator.value
-        return Trace(
-            reference=self._target,
-            predicted=self._task.output(self._state) + disturbance,
-            disturbance=disturbance,
-            uncertainty=self._estimator.uncertainty,
-        )
-
-    def _observe(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
-        super()._observe(t, measured_input, output, others)
+    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
+        super()._take_in(t, measured_input, output, others)
         low, high = self._plausible_output
         if low <= output <= high:
-            self._estimator.update(output - self._task.output(self._state))
+            self._estimator.update(output - self._modelled())
 
     def _decide(self, output: float, *, first: bool) -> float:  # noqa: ARG002
-        wanted = self._target - self._estimator.value
+        wanted = self._reference - self._estimator.value
         present = self._lag.voltage
-        error = wanted - self._task.output(self._state)
+        error = wanted - self._modelled()
         least, greatest = sorted(error / slope for slope in self._task.slopes)
-        move = min(max(self._answer(wanted) - present, least), greatest)
+        move = min(max(self._steady(wanted) - present, least), greatest)
         return self._lag.lead(self._clip(present + move), self._parameters.horizon, self.limits)[0]
 
 
@@ -539,17 +498,12 @@ class MuscleProportionalIntegral(MuscleController):
     """
 
     def __init__(self, limits: tuple[float, float], parameters: ProportionalIntegralParameters) -> None:
-        super().__init__(ControllerBase(limits).limits, parameters.period, parameters.duration)
+        super().__init__(limits, None, parameters.period, parameters.duration)
         self._parameters = parameters
         self._error: float | None = None
         self._started = False
 
-    @property
-    def trace(self) -> Trace:
-        """The present estimates of the controller."""
-        return Trace(reference=self._target)
-
-    def _observe(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
+    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
         if not self._started and math.isfinite(measured_input):
             # The first reading says where the actuator is.
             self._setpoint, self._started = self._clip(measured_input), True
@@ -558,7 +512,7 @@ class MuscleProportionalIntegral(MuscleController):
         if not math.isfinite(output):
             return self._setpoint
         p = self._parameters
-        error = self._target - output
+        error = self._reference - output
         change = 0.0 if self._error is None else error - self._error
         self._error = error
         square = self._setpoint**2 + p.gain * (change + error * p.period / p.integral_time)

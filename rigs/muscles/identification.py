@@ -26,7 +26,7 @@ from bench.identification.two_stage import (
     identify_two_stage,
 )
 from bench.journal import Record
-from bench.results.model_file import ModelFile
+from bench.model_file import ModelFile
 from protocols.muscles.parts import SAMPLE
 
 Floats = npt.NDArray[np.float64]
@@ -61,10 +61,7 @@ class Resting(NamedTuple):
 def read_resting(run: Path) -> Resting:
     """Return what a run of `force-voltage` measured.
 
-    Raises
-    ------
-    DataError
-        If it is no such run, or was not completed.
+    Raises DataError if it is no such run, or was not completed.
     """
     voltages, forces, _ = np.concatenate(_samples(run, RESTING_PROTOCOLS)).T
     with Record(run) as record:
@@ -74,13 +71,8 @@ def read_resting(run: Path) -> Resting:
 def read_series(run: Path) -> list[Series]:
     """Return what a run of `length-voltage`, `length-force` or `length-verification` measured.
 
-    A series at one voltage is one over the force, any other is one under a load, which is the mean of the forces
-    that were measured.
-
-    Raises
-    ------
-    DataError
-        If it is no such run, or was not completed.
+    A series at one voltage is one over the force, any other is one under a load, which is the mean of the forces that
+    were measured. Raises DataError if it is no such run, or was not completed.
     """
     series = []
     for group in _samples(run, LENGTH_PROTOCOLS):

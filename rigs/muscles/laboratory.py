@@ -102,10 +102,10 @@ class MuscleLaboratorySettings(LaboratorySettings, ABC):
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
     fault: FaultName = Field(
         default="none",
-        description="what goes wrong at `fault_time`; forgotten-load (the operator hangs nothing) and heavy-load "
+        description="fault at `fault_time`; forgotten-load (the operator hangs nothing) and heavy-load "
         "(twice the weight) from then on",
     )
-    fault_time: float = Field(default=0.0, ge=0, description="when it goes wrong, s of laboratory time")
+    fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
     @abstractmethod
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
@@ -215,10 +215,7 @@ class MuscleLaboratory(EmulatedLaboratory):
     def operate(self, task: str, value: float) -> None:
         """Hang a load of `value` N on the muscle, or fasten its end to the stage.
 
-        Raises
-        ------
-        ConfigurationError
-            If it is another task, or the muscle does not bear the load.
+        Raises ConfigurationError if it is another task, or the muscle does not bear the load.
         """
         if task not in (LOAD, STAGE):
             raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
@@ -261,7 +258,7 @@ class _ThermalSettings(MuscleLaboratorySettings):
 class SMALaboratorySettings(_ThermalSettings):
     """Keys of the laboratory with the SMA wire."""
 
-    specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="which specimen it is")
+    specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="seed of the specimen")
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the wire."""

@@ -26,12 +26,8 @@ TABLES = tuple(
 def carry_out(campaign: Campaign) -> StudyResult:
     """Characterize both muscles and identify the models.
 
-    The values are errors in percent of the range by muscle, and `fv`, `lv`, `lf` and `verification`.
-
-    Raises
-    ------
-    BenchError
-        If a run did not complete; its record is kept.
+    The values are errors in percent of the range by muscle, and `fv`, `lv`, `lf` and `verification`. Raises
+    BenchError if a run did not complete; its record is kept.
     """
     values, figures = {}, []
     for key, (_, rig) in MUSCLES.items():

@@ -92,12 +92,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
     """Run the paper's experiments and the control beyond it, and identify the models.
 
     The values are errors in percent of the range by `fv`, `lv`, `lf` and `verification`, and those of `control` in
-    `units`.
-
-    Raises
-    ------
-    BenchError
-        If a run did not complete; its record is kept.
+    `units`. Raises BenchError if a run did not complete; its record is kept.
     """
     measured = characterize(campaign)
     common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}

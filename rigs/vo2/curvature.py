@@ -22,7 +22,7 @@ _LARGEST_RATIO = (1.0 - np.cos(_LARGEST_ANGLE)) / _LARGEST_ANGLE
 
 
 def curvature_to_deflection(curvature: npt.ArrayLike, length: float, residual_curvature: float = 0.0) -> Floats:
-    """Return how far the tip of a bent cantilever moves when its curvature changes.
+    """Return how far the tip of a bent cantilever moves, m, when its curvature changes; of the shape of `curvature`.
 
     Parameters
     ----------
@@ -32,11 +32,6 @@ def curvature_to_deflection(curvature: npt.ArrayLike, length: float, residual_cu
         Length of the beam along its arc, m.
     residual_curvature : float
         Curvature of the beam at rest, 1/m, from which deflection and curvature are counted.
-
-    Returns
-    -------
-    ndarray
-        Deflection in m, of the shape of `curvature`.
 
     Notes
     -----
@@ -56,10 +51,8 @@ def deflection_to_curvature(deflection: npt.ArrayLike, length: float, residual_c
     ----------
     deflection : array_like
         Movement of the tip from its place at rest, m, any shape.
-    length : float
-        Length of the beam along its arc, m.
-    residual_curvature : float
-        Curvature of the beam at rest, 1/m.
+    length, residual_curvature
+        As in `curvature_to_deflection`.
 
     Returns
     -------

@@ -22,7 +22,7 @@ from sim_devices.world import World
 class VO2LaboratorySettings(LaboratorySettings):
     """Keys of the table `[emulation]`."""
 
-    specimen_seed: int = Field(default=VO2Parameters.specimen_seed, ge=0, description="which specimen it is")
+    specimen_seed: int = Field(default=VO2Parameters.specimen_seed, ge=0, description="seed of the specimen")
     session_offset: float = Field(
         default=0.0, ge=-5, le=5, description="temperature of the film above the plate's, constant in a session, K"
     )

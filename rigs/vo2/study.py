@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion
+from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
 from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
@@ -146,10 +146,7 @@ TABLES = (
 def carry_out(campaign: Campaign) -> StudyResult:
     """Run the paper's experiments, identify its models, and track with every controller.
 
-    Raises
-    ------
-    BenchError
-        If a run did not complete; its record is kept.
+    Raises BenchError if a run did not complete; its record is kept.
     """
     folder = campaign.folder
     sign = 1.0 if campaign.seed % 2 == 0 else -1.0
@@ -246,9 +243,7 @@ def _followed(run: RunResult) -> FollowingResult:
     return result
 
 
-def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - checked here
-    if not (isinstance(operator, Preisach) and isinstance(operator.reversible, ThermalExpansion)):
-        raise TypeError("expected the non-monotonic model")
+def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - the non-monotonic model
     low, high = float(operator.levels[0]), float(operator.levels[-1])
     values = (
         operator.bias,

@@ -1,1 +1,1 @@
-"""Emulated instruments: range, resolution, noise, protection, watchdogs, and what firmware does."""
+"""Emulated instruments: range, resolution, noise, protection, watchdogs, and firmware behaviour."""

@@ -103,16 +103,10 @@ class EmulatedMX28(EmulatedInstrument, Servo):
 
     Parameters
     ----------
-    name, world
-        See `EmulatedDevice`.
     load : ShaftLoad, optional
         The load on the shaft; without it the shaft is free.
     bus_id : int
         Id on the bus, 0 to 252.
-    firmware : int
-        Firmware version that the servo reports.
-    model_number : int
-        Model number that the servo reports.
     position : float
         Angle of the shaft at the beginning, rad.
     supply_voltage : float
@@ -237,10 +231,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     def read_bytes(self, address: int, length: int) -> bytes:
         """Return bytes of the control table.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there are none to return, or one of the addresses is not defined.
+        Raises `RequestRefusedError` if there are none to return, or one of the addresses is not defined.
         """
         with self._world.lock:
             self.attend()
@@ -257,11 +248,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     def write_bytes(self, address: int, data: bytes) -> None:
         """Write whole items of the control table.
 
-        Raises
-        ------
-        RequestRefusedError
-            If an item is not defined, incomplete, read-only or locked, or a value is out of its range; nothing
-            is written then.
+        Raises `RequestRefusedError` if an item is not defined, incomplete, read-only or locked, or a value is out of
+        its range; nothing is written then.
         """
         with self._world.lock:
             self.attend()
@@ -288,10 +276,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     def action(self) -> None:
         """Carry out what `register_write` kept.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is nothing, or the reasons of `write_bytes`.
+        Raises `RequestRefusedError` if there is nothing, or the reasons of `write_bytes`.
         """
         with self._world.lock:
             if self._registered is None:
@@ -309,10 +294,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     def clear(self, parameters: bytes) -> None:
         """Forget the number of turns (firmware 42 and newer).
 
-        Raises
-        ------
-        RequestRefusedError
-            If the firmware is older, the parameters are not 01 44 58 4C 22, or the shaft moves.
+        Raises `RequestRefusedError` if the firmware is older, the parameters are not 01 44 58 4C 22, or the shaft
+        moves.
         """
         with self._world.lock:
             self.attend()

@@ -34,22 +34,15 @@ class ShaftLoad(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motion from one angle to another, piecewise of constant acceleration.
-
-    Attributes
-    ----------
-    start : float
-        When it begins, s.
-    origin, target : float
-        Where it begins and where it ends, rad.
-    pieces : tuple of (float, float, float)
-        Duration (s), velocity at its beginning (rad/s) and acceleration (rad/s²) of each piece.
-    """
+    """A motion from one angle to another, piecewise of constant acceleration."""
 
     start: float
+    """When it begins, s."""
     origin: float
     target: float
+    """Where it begins and where it ends, rad."""
     pieces: tuple[tuple[float, float, float], ...] = ()
+    """Duration (s), velocity at its beginning (rad/s) and acceleration (rad/s²) of each piece."""
 
     @property
     def end(self) -> float:
@@ -132,8 +125,6 @@ def balance(load: ShaftLoad, near: float, reach: float, drive: Callable[[float],
 
     Parameters
     ----------
-    load : ShaftLoad
-        The load.
     near : float
         Angle where the shaft is, rad.
     reach : float

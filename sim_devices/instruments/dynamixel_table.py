@@ -72,31 +72,21 @@ class ErrorNumber(IntEnum):
 
 @dataclass(frozen=True)
 class Item:
-    """One item of the control table.
-
-    Attributes
-    ----------
-    address : int
-        Address of its first byte; below 64 it lies in the EEPROM.
-    size : int
-        Bytes, 1, 2 or 4, the lowest first.
-    default : int
-        Value as delivered.
-    low, high : int
-        Range of the values that a host may write.
-    writable : bool
-        Whether a host may write it.
-    signed : bool
-        Whether it is in two's complement.
-    """
+    """One item of the control table."""
 
     address: int
+    """Address of its first byte; below 64 it lies in the EEPROM."""
     size: int
+    """Bytes, 1, 2 or 4, the lowest first."""
     default: int = 0
+    """Value as delivered."""
     low: int = 0
     high: int = 0
+    """Range of the values that a host may write."""
     writable: bool = True
+    """Whether a host may write it."""
     signed: bool = False
+    """Whether it is in two's complement."""
 
     @property
     def in_eeprom(self) -> bool:

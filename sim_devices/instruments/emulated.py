@@ -33,10 +33,6 @@ class EmulatedDevice(Device):
 
     Parameters
     ----------
-    name : str
-        Name in the rig.
-    world : World
-        The emulated laboratory.
     rng : numpy.random.Generator, optional
         Noise of the readings; without it they are free of noise.
     """

@@ -11,7 +11,7 @@ Assumptions, where these say nothing:
   times that the manual gives for each setting. Setting 0, the anti-aliasing filter of 17 Hz alone, is emulated
   in the same way, although it falls by 60 dB a decade. Filter mode 1 (FIR) is stored and changes nothing.
 - The noise of amplifier and cell is white before the filter.
-- Conversions come when somebody asks, not 600 times a second; between two of them the force ran straight.
+- Conversions are made on request, not 600 times a second; between two of them the force is interpolated linearly.
 - Integer weights are the displayed digits without the decimal point. The ADC value is the filtered signal with
   24 bits.
 - The range bits say that the gross weight is beyond the largest or the smallest value to be displayed; the
@@ -102,12 +102,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     Parameters
     ----------
-    name, world
-        See `EmulatedDevice`.
     force : callable
         The force on the cell in N, positive in tension, from the plant.
-    rng : numpy.random.Generator
-        Source of the noise.
     newtons_per_unit : float
         How the instrument was calibrated: N for each unit that it displays, not 0; 9.80665 for kg.
     zero_newtons : float
@@ -123,8 +119,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         the cut-off at other settings: 0.49 times at setting 3.
     samples : int
         Readings that `measure` averages, 1 or more.
-    serial_number : int
-        Serial number that the instrument reports.
     firmware : tuple of int
         Major and minor version that the instrument reports.
 
@@ -427,10 +421,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
     def tare(self) -> None:
         """Set the tare, as soon as the signal is still; waits 10 s for it at most.
 
-        Raises
-        ------
-        DeviceError
-            If the signal does not become still.
+        Raises `DeviceError` if the signal does not become still.
         """
         clock = self.world.clock
         end = clock.now() + _STILL_TIMEOUT

@@ -147,16 +147,8 @@ class EmulatedT7(RegisterInstrument):
 
     Parameters
     ----------
-    world : World
-        The laboratory that the instrument stands in.
     inputs : mapping of int to callable
         Voltage in V at an analog input by its number, 0 to 13; an input that is not named is grounded.
-    rng : numpy.random.Generator
-        Source of the input noise.
-    serial_number : int
-        Serial number that the instrument reports.
-    firmware : float
-        Firmware version that the instrument reports.
 
     Raises
     ------
@@ -316,10 +308,7 @@ class EmulatedT7(RegisterInstrument):
     ) -> None:
         """Set single-ended inputs up for `convert` and `burst`, as requests of a host would.
 
-        Raises
-        ------
-        RegisterError
-            If a setting is refused.
+        Raises `RegisterError` if a setting is refused.
         """
         self.write_value("STREAM_RESOLUTION_INDEX", resolution_index)
         for channel in channels:
@@ -340,10 +329,7 @@ class EmulatedT7(RegisterInstrument):
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
 
-        Raises
-        ------
-        RegisterError
-            If the input is not set up for it, or the burst would take longer than 0.18 s.
+        Raises `RegisterError` if the input is not set up for it, or the burst would take longer than 0.18 s.
         """
         with self._request():
             settings = self._inputs[channel]

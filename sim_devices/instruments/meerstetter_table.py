@@ -48,31 +48,21 @@ class ServerError(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One row of the parameter table.
-
-    Attributes
-    ----------
-    number : int
-        Number of the parameter.
-    kind : {"INT32", "FLOAT32"}
-        How the value is coded on the wire.
-    low, high : float
-        Range of the values.
-    default : float
-        Value as delivered.
-    writable : bool
-        Whether the host may write it.
-    volatile : bool
-        Whether it lives in RAM only and starts from its default after each reset.
-    """
+    """One row of the parameter table."""
 
     number: int
+    """Number of the parameter."""
     kind: Literal["INT32", "FLOAT32"]
+    """How the value is coded on the wire."""
     low: float
     high: float
+    """Range of the values."""
     default: float
+    """Value as delivered."""
     writable: bool = True
+    """Whether the host may write it."""
     volatile: bool = False
+    """Whether it lives in RAM only and starts from its default after each reset."""
 
 
 def _integer(number: int, high: float, default: float = 0, *, low: float = 0) -> Parameter:

@@ -98,12 +98,6 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     Parameters
     ----------
-    name, world
-        See `EmulatedDevice`.
-    load : PeltierLoad
-        The plant's Peltier element.
-    serial_number : int
-        Serial number that the device reports.
     firmware : int
         Firmware version times 100 that the device reports.
     rng : numpy.random.Generator, optional
@@ -188,10 +182,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     def parameter(self, number: int, instance: int = 1) -> Parameter:
         """Return the row of the parameter table.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such parameter or no such instance of it; this device has one channel.
+        Raises `RequestRefusedError` if there is no such parameter or no such instance of it; this device has one
+        channel.
         """
         row = PARAMETERS.get(number)
         if row is None:
@@ -203,10 +195,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     def read_parameter(self, number: int, instance: int = 1) -> float:
         """Return the value of a parameter, in the unit of the table.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such parameter or instance.
+        Raises `RequestRefusedError` if there is no such parameter or instance.
         """
         with self._world.lock:
             self.parameter(number, instance)
@@ -216,10 +205,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     def write_parameter(self, number: int, value: float, instance: int = 1) -> None:
         """Set a parameter; it goes to the flash as well unless saving is off (parameter 108).
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such parameter or instance, it is read-only, or the value is out of its range.
+        Raises `RequestRefusedError` if there is no such parameter or instance, it is read-only, or the value is out
+        of its range.
         """
         with self._world.lock:
             row = self.parameter(number, instance)

@@ -20,30 +20,20 @@ _FORMATS = {"F32": ">f", "I32": ">i", "U32": ">I", "U16": ">H"}
 
 @dataclass(frozen=True)
 class Register:
-    """One row of a register map, or several numbered registers of one meaning.
-
-    Attributes
-    ----------
-    name : str
-        Name in the manual; a `#` stands for the number, as in `AIN#_RANGE`.
-    address : int
-        Address of the first 16-bit word, 0 to 65535; the highest word comes first.
-    kind : {"F32", "I32", "U32", "U16"}
-        Type of the value.
-    read : callable, optional
-        Returns the value; without it the register can only be written. Takes the number if there are several.
-    write : callable, optional
-        Takes the value, after the number if there are several; without it the register can only be read.
-    count : int
-        How many registers there are, one behind the other.
-    """
+    """One row of a register map, or several numbered registers of one meaning."""
 
     name: str
+    """Name in the manual; a `#` stands for the number, as in `AIN#_RANGE`."""
     address: int
+    """Address of the first 16-bit word, 0 to 65535; the highest word comes first."""
     kind: Kind
+    """Type of the value."""
     read: Callable[..., float] | None = None
+    """Returns the value; without it the register can only be written. Takes the number if there are several."""
     write: Callable[..., None] | None = None
+    """Takes the value, after the number if there are several; without it the register can only be read."""
     count: int = 1
+    """How many registers there are, one behind the other."""
 
     @property
     def words(self) -> int:
@@ -91,10 +81,7 @@ class RegisterInstrument(ABC):
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return `count` registers from `address` on, of one instant; reading half a value is allowed.
 
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be read.
+        Raises `RegisterError` if one of them does not exist or cannot be read.
         """
         with self._request():
             values: dict[int, tuple[int, ...]] = {}
@@ -111,11 +98,8 @@ class RegisterInstrument(ABC):
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values.
 
-        Raises
-        ------
-        RegisterError
-            If one of them does not exist or cannot be written, or if a value is not allowed; the values
-            before it have been written then.
+        Raises `RegisterError` if one of them does not exist or cannot be written, or if a value is not allowed; the
+        values before it have been written then.
         """
         with self._request():
             position = 0

@@ -13,14 +13,14 @@ Assumptions, where the manuals are silent or were not at hand:
 
 - Only runtime commands (objects 0x2000 to 0x20FF) feed the watchdog: the user manual says so of the serial
   commands with `!`, of which these objects are the CANopen form. Queries do not.
-- After the watchdog has expired, the first command of the channel that is not 0 resumes the power of before,
+- After the watchdog has expired, the first command of the channel that is not 0 resumes the previous power,
   and its own value counts only when it is sent again. This is the worst reading of "motor operation will
   resume at whichever speed motors were running prior"; a command of 0 resumes nothing.
 - The power follows the command at once (a real device has a ramp), and is 0 as long as a fault stands.
 - The amps limit acts when the power is applied, by scaling it down, and holds until it is applied anew.
 - A command beyond ±1000 ‰ is refused rather than clipped.
 - The device starts its node by itself (autostart); a reset by NMT clears command and emergency stop.
-- Flags have 16 bits (0x2111, 0x2112, as the manual has it; the data sheet says 8) and 32 bits (0x2122).
+- Flags have 16 bits (0x2111, 0x2112, according to the manual; the data sheet says 8) and 32 bits (0x2122).
 - The wording of device name, hardware and software version.
 
 Kept in the dictionary without effect: the consumer heartbeat times (0x1016).
@@ -120,19 +120,13 @@ Kind = Literal["S8", "U8", "S16", "U16", "S32", "U32", "text"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of the object dictionary.
-
-    Attributes
-    ----------
-    kind : {"S8", "U8", "S16", "U16", "S32", "U32", "text"}
-        Type of the value.
-    readable, writable : bool
-        Which ways it can be transferred.
-    """
+    """One row of the object dictionary."""
 
     kind: Kind
+    """Type of the value."""
     readable: bool = True
     writable: bool = False
+    """Which ways it can be transferred."""
 
 
 def _dictionary() -> dict[tuple[int, int], Entry]:
@@ -182,10 +176,6 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
 
     Parameters
     ----------
-    name, world
-        See `EmulatedDevice`.
-    load : HeatingLoad
-        The heated load.
     output : {"average", "rms"}
         Whether an LC filter is between output and load, so that it sees the average, or none.
     voltage_limits : tuple of float
@@ -293,10 +283,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def entry(self, index: int, sub: int) -> Entry:
         """Get a row of the object dictionary.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object or no such subindex of it.
+        Raises `RequestRefusedError` if there is no such object or no such subindex of it.
         """
         row = DICTIONARY.get((index, sub))
         if row is None:
@@ -306,10 +293,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def read_object(self, index: int, sub: int = 0) -> int | str:
         """Return the value of an object, in the unit of the manual.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object, or it can only be written.
+        Raises `RequestRefusedError` if there is no such object, or it can only be written.
         """
         with self._world.lock:
             row = self.entry(index, sub)
@@ -321,10 +305,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def write_object(self, index: int, value: int, sub: int = 0) -> None:
         """Set an object.
 
-        Raises
-        ------
-        RequestRefusedError
-            If there is no such object, it can only be read, or the value is out of its range.
+        Raises `RequestRefusedError` if there is no such object, it can only be read, or the value is out of its
+        range.
         """
         with self._world.lock:
             row = self.entry(index, sub)

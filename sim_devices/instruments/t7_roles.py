@@ -52,13 +52,6 @@ _KELVIN = 273.15
 class _T7Device(EmulatedDevice):
     """A device on an emulated T7.
 
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    instrument : EmulatedT7
-        The instrument.
-
     Raises
     ------
     RegisterError
@@ -80,8 +73,6 @@ class _T7Reader(_T7Device):
 
     Parameters
     ----------
-    name, instrument
-        See `_T7Device`.
     channels : sequence of int
         Inputs, 0 to 13.
     """
@@ -117,8 +108,6 @@ class EmulatedPositionSensor(_T7Reader, PositionSensor):
 
     Parameters
     ----------
-    name, instrument
-        See `_T7Reader`.
     readout : {"voltage", "currents", "ratiometric"}
         One normalised voltage, two amplified photocurrents, or an output that is a share of its supply.
     channels : sequence of int
@@ -191,8 +180,6 @@ class EmulatedTemperatureSensor(_T7Reader, TemperatureSensor):
 
     Parameters
     ----------
-    name, instrument
-        See `_T7Reader`.
     channels : tuple of int
         Inputs of a thermistor's divider and of its excitation, 0 to 13.
     """

@@ -11,12 +11,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from sim_devices.plants import cooler
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
+from sim_devices.plants.grid import Floats, Record
 
 # Nodes of the thermal chain, each joined to the next: insulated end and front of the block, back and
 # actuator face of the TEC, then the elements of the beam from its base to its tip.
@@ -43,25 +42,6 @@ STATE_SIZE = 5
 ROOM_STEP = cooler.COMMAND_SIZE
 COMMAND_SIZE = ROOM_STEP + 1
 
-# Coefficients, prepared once from the parameters.
-(
-    STEP,
-    KELVIN,
-    SEEBECK,
-    RESISTANCE,
-    ROOM_DECAY,
-    ROOM_KICK,
-    LOOP_PROPORTIONAL,
-    LOOP_INTEGRAL,
-    MAXIMUM_CURRENT,
-    STRAIGHT,
-    SENSITIVITY,
-    QUADRATIC,
-    CUBIC,
-    WARM_GAIN,
-) = range(14)
-COEFFICIENT_SIZE = 14
-
 # Fast state: voltage, hysteretic part (m), quasi-static piezo deflection that goes into the modes (m), then
 # each mode's distance from its steady value when the voltage last changed (m), the resonance's as cosine
 # and sine parts.
@@ -87,84 +67,48 @@ FAST_SIZE = FIRST_REAL + REAL_MODES
 FIRST_GAIN = FIRST_RATE + REAL_MODES
 FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
 
-Floats = NDArray[np.float64]
-
 
 class Thermal(NamedTuple):
-    """All numbers of the thermal part; the first three and the factors are changed in place.
-
-    Attributes
-    ----------
-    rise : ndarray
-        Node temperatures, K.
-    increment : ndarray
-        Change of them over the latest step that is known, K.
-    state, command, c, nodes, factors : ndarray
-        State, commands, coefficients, node table and factorised matrix.
-    """
+    """All numbers of the thermal part; the first three and the factors are changed in place."""
 
     rise: Floats
+    """Node temperatures, K."""
     increment: Floats
+    """Change of them over the latest step that is known, K."""
     state: Floats
     command: Floats
-    c: Floats
+    c: Record
     nodes: Floats
     factors: Floats
+    """State, commands, coefficients, node table and factorised matrix."""
 
 
 @njit(cache=True)
-def take_commands(rise: Floats, state: Floats, command: Floats, c: Floats) -> bool:
-    """Set room temperature and current for the step that begins here.
-
-    Parameters
-    ----------
-    rise : ndarray
-        Node temperatures, K.
-    state : ndarray
-        State, changed in place.
-    command : ndarray
-        Commands to amplifier and room.
-    c : ndarray
-        Coefficients.
-
-    Returns
-    -------
-    bool
-        Whether the regulator wants more than the current can do.
-    """
+def take_commands(rise: Floats, state: Floats, command: Floats, c: Record) -> bool:
+    """Set room temperature and current for the step that begins here; return whether the current is saturated."""
     state[ROOM] = state[FLUCTUATION] + command[ROOM_STEP]
     if command[CLOSED] == 0.0:
         state[CURRENT] = command[COMMAND]
         return False
-    heat = c[LOOP_PROPORTIONAL] * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
-    pumped = c[SEEBECK] * (c[KELVIN] + rise[FACE])
-    square = pumped * pumped + 2.0 * c[RESISTANCE] * heat
+    heat = c.loop_proportional * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
+    pumped = c.seebeck * (c.kelvin + rise[FACE])
+    square = pumped * pumped + 2.0 * c.resistance * heat
     # Of the two currents that give this heat the smaller; below the strongest cooling there is none.
     wanted = 2.0 * heat / (pumped + math.sqrt(max(square, 0.0)))
-    limit = min(command[LIMIT], c[MAXIMUM_CURRENT])
+    limit = min(command[LIMIT], c.maximum_current)
     state[CURRENT] = min(max(wanted, -limit), limit)
     saturated: bool = square < 0.0 or abs(wanted) > limit
     return saturated
 
 
 @njit(cache=True)
-def factorise(current: float, c: Floats, nodes: Floats, factors: Floats) -> None:
-    """Factorise the matrix of a step, which is tridiagonal and depends on the current alone.
-
-    Parameters
-    ----------
-    current : float
-        Current, A.
-    c, nodes : ndarray
-        Coefficients and node table.
-    factors : ndarray
-        `FACTOR_ROWS` rows, overwritten.
-    """
-    half = 0.5 * c[SEEBECK] * current
+def factorise(current: float, c: Record, nodes: Floats, factors: Floats) -> None:
+    """Factorise the matrix of a step, which is tridiagonal and depends on the current alone."""
+    half = 0.5 * c.seebeck * current
     before = 0.0
     for j in range(NODES):
         after = 0.5 * nodes[LINK, j]
-        diagonal = nodes[CAPACITY, j] / c[STEP] + 0.5 * nodes[AIR, j] + before + after
+        diagonal = nodes[CAPACITY, j] / c.step + 0.5 * nodes[AIR, j] + before + after
         if j == BACK:
             diagonal += half
         elif j == FACE:
@@ -185,11 +129,6 @@ def look_ahead(thermal: Thermal) -> None:
     The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
     balance to rounding. The nonlinear part of convection changes over seconds and is taken at the middle of
     the step, extrapolated from the step before.
-
-    Parameters
-    ----------
-    thermal : Thermal
-        On entry with the increment over the step before, on return with that over this one.
     """
     rise, increment, state, command, c, nodes, factors = thermal
     saturated = take_commands(rise, state, command, c)
@@ -197,7 +136,7 @@ def look_ahead(thermal: Thermal) -> None:
         error = command[TARGET] - rise[FACE]
         # A saturated loop integrates only what leads out of saturation.
         if not saturated or error * state[CURRENT] < 0.0:
-            state[INTEGRAL] += c[LOOP_INTEGRAL] * error
+            state[INTEGRAL] += c.loop_integral * error
     current = state[CURRENT]
     room = state[ROOM]
     if current != state[FACTORED]:
@@ -207,12 +146,12 @@ def look_ahead(thermal: Thermal) -> None:
     for j in range(BEAM, NODES):
         excess = rise[j] + 0.5 * increment[j] - room
         increment[j] = -nodes[EXCESS, j] * math.sqrt(math.sqrt(abs(excess))) * excess
-    joule = 0.5 * c[RESISTANCE] * current * current
-    pumped = c[SEEBECK] * current
+    joule = 0.5 * c.resistance * current * current
+    pumped = c.seebeck * current
     for j in range(BEAM):
         increment[j] = 0.0
-    increment[BACK] = joule - pumped * (c[KELVIN] + rise[BACK])
-    increment[FACE] = joule + pumped * (c[KELVIN] + rise[FACE])
+    increment[BACK] = joule - pumped * (c.kelvin + rise[BACK])
+    increment[FACE] = joule + pumped * (c.kelvin + rise[FACE])
 
     # Heat into each node, and forward elimination on the way.
     inflow = 0.0
@@ -233,17 +172,7 @@ def look_ahead(thermal: Thermal) -> None:
 
 @njit(cache=True)
 def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
-    """Complete one grid step for each of `normals`.
-
-    Parameters
-    ----------
-    normals : ndarray
-        Standard normal numbers, one a step, for the room.
-    ahead : bool
-        Whether the first step's change is already known.
-    thermal : Thermal
-        See `look_ahead`.
-    """
+    """Complete one grid step for each of `normals`; `ahead` says whether the first step's change is known."""
     rise, increment, state, command, c, _, _ = thermal
     for row in range(normals.size):
         if not ahead:
@@ -251,50 +180,29 @@ def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
         ahead = False
         for j in range(NODES):
             rise[j] += increment[j]
-        state[FLUCTUATION] = c[ROOM_DECAY] * state[FLUCTUATION] + c[ROOM_KICK] * normals[row]
+        state[FLUCTUATION] = c.room_decay * state[FLUCTUATION] + c.room_kick * normals[row]
     take_commands(rise, state, command, c)
 
 
 @njit(cache=True)
-def bending(fraction: float, rise: Floats, increment: Floats, c: Floats, nodes: Floats) -> tuple[float, float]:
-    """Add up the bending of the beam.
+def bending(fraction: float, rise: Floats, increment: Floats, c: Record, nodes: Floats) -> tuple[float, float]:
+    """Add up the bending of the beam, after a fraction of the step under way, in [0, 1].
 
-    Parameters
-    ----------
-    fraction : float
-        How much of the step under way has gone by, in [0, 1].
-    rise, increment, c, nodes : ndarray
-        See `look_ahead`.
-
-    Returns
-    -------
-    tuple of float
-        Thermal deflection of the tip, m, and the factor of the piezo deflection. Either is the local value
-        weighted by the distance to the tip.
+    Returns the thermal deflection of the tip and the factor of the piezo deflection. Either is the local value
+    weighted by the distance to the tip.
     """
     bent = 0.0
     warm = 0.0
     for j in range(BEAM, NODES):
-        d = rise[j] + fraction * increment[j] + c[STRAIGHT]
-        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c[QUADRATIC] + d * c[CUBIC]))
+        d = rise[j] + fraction * increment[j] + c.straight
+        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c.quadratic + d * c.cubic))
         warm += nodes[WEIGHT, j] * d
-    return c[SENSITIVITY] * bent, 1.0 + c[WARM_GAIN] * warm
+    return c.sensitivity * bent, 1.0 + c.warm_gain * warm
 
 
 @njit(cache=True)
 def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats, nodes: Floats) -> float:
-    """Add up the heat that all nodes give to the air.
-
-    Parameters
-    ----------
-    fraction, rise, increment, state, nodes
-        See `bending` and `look_ahead`.
-
-    Returns
-    -------
-    float
-        Heat flow, W.
-    """
+    """Add up the heat flow from all nodes to the air."""
     total = 0.0
     for j in range(NODES):
         excess = rise[j] + fraction * increment[j] - state[ROOM]
@@ -304,20 +212,7 @@ def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats,
 
 @njit(cache=True)
 def piezo_deflection(elapsed: float, fast: Floats, f: Floats) -> float:
-    """Evaluate the piezo deflection some time after the last change of the voltage.
-
-    Parameters
-    ----------
-    elapsed : float
-        Time since then, s.
-    fast, f : ndarray
-        State and constants of the fast part.
-
-    Returns
-    -------
-    float
-        Deflection of the tip at the temperature of the straight beam, m.
-    """
+    """Evaluate the piezo deflection, at the temperature of the straight beam, some time after the last voltage."""
     phase = f[FREQUENCY] * elapsed
     swing = math.exp(-f[DAMPING] * elapsed)
     total: float = f[STEADY] * fast[DRIVE]
@@ -333,20 +228,6 @@ def hysteresis(lag: float, change: float, f: Floats) -> float:
 
     Seen along the motion, ``g = sign(change) h`` obeys ``dg/dv = a - b g - c |g|``, which is linear on
     either side of zero; it crosses zero at most once, upwards.
-
-    Parameters
-    ----------
-    lag : float
-        Hysteretic part before, m.
-    change : float
-        Change of the voltage, V.
-    f : ndarray
-        Constants of the fast part.
-
-    Returns
-    -------
-    float
-        Hysteretic part afterwards, m.
     """
     sign = math.copysign(1.0, change)
     way = abs(change)
@@ -366,19 +247,7 @@ def hysteresis(lag: float, change: float, f: Floats) -> float:
 
 @njit(cache=True)
 def apply_voltage(voltage: float, elapsed: float, fast: Floats, f: Floats) -> None:
-    """Change the voltage.
-
-    Parameters
-    ----------
-    voltage : float
-        New voltage, V.
-    elapsed : float
-        Time since the last change, s.
-    fast : ndarray
-        State of the fast part, changed in place.
-    f : ndarray
-        Constants of the fast part.
-    """
+    """Change the voltage, some time after the last change."""
     lag = hysteresis(fast[LAG], voltage - fast[VOLTAGE], f)
     drive = f[GAIN] * voltage - lag + f[VOLTAGE_QUADRATIC] * voltage * voltage
     step = drive - fast[DRIVE]

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim_devices.plants.grid import Floats, Record
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 
 # Continuous state: wire temperature, ambient deviation (K), stress, position of the moving end (mm),
@@ -26,88 +27,33 @@ STATE_SIZE = 6
 AUSTENITE, WIDTH, SLOPE, DETWIN, ORIENT, RETWIN = range(6)
 GRAIN_ROWS = 6
 
-# Coefficients, prepared once from the parameters.
-(
-    AMBIENT,
-    HEATING,
-    STILL_DECAY,
-    FAN_DECAY,
-    FAN_SHARE,
-    AMBIENT_DECAY,
-    AMBIENT_KICK,
-    AMBIENT_GAIN,
-    AREA,
-    REST_LENGTH,
-    SERIES_COMPLIANCE,
-    MARTENSITE_MODULUS,
-    AUSTENITE_MODULUS,
-    EXPANSION,
-    EXPANSION_REFERENCE,
-    TRANSFORMATION_STRAIN,
-    UNORIENTED_SHARE,
-    REST_STRAIN,
-    STRESS_LIMIT,
-    TEMPERATURE_STEP,
-    STRESS_STEP,
-    LENGTH_STEP,
-) = range(22)
-COEFFICIENT_SIZE = 22
-
 # Halvings of the stress interval: 600 MPa come down to 3.5e-8 MPa, a nanonewton of force.
 HALVINGS = 34
 FIRST_HALVINGS = 5
 
-Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 class Parts(NamedTuple):
-    """All numbers of a wire, as the compiled loops take them.
-
-    Attributes
-    ----------
-    state, c : ndarray
-        State, and coefficients.
-    grains : ndarray
-        Grain table, `GRAIN_ROWS` rows.
-    martensite, oriented : ndarray
-        Committed grain states.
-    scratch : ndarray
-        Two rows of stresses, MPa.
-    """
+    """All numbers of a wire, as the compiled loops take them."""
 
     state: Floats
-    c: Floats
+    c: Record
+    """State, and coefficients."""
     grains: Floats
+    """Grain table, `GRAIN_ROWS` rows."""
     martensite: Flags
     oriented: Flags
+    """Committed grain states."""
     scratch: Floats
+    """Two rows of stresses, MPa."""
 
 
 @njit(cache=True)
 def update_grains(
     temperature: float, stress: float, unoriented_share: float, grains: Floats, martensite: Flags, oriented: Flags
 ) -> tuple[int, int]:
-    """Bring every grain to one new value of temperature and stress.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature, °C.
-    stress : float
-        Tensile stress, MPa.
-    unoriented_share : float
-        Share of the stress that stabilises an unoriented martensite grain.
-    grains : ndarray
-        Grain table, `GRAIN_ROWS` rows.
-    martensite, oriented : ndarray
-        Grain states, changed in place.
-
-    Returns
-    -------
-    tuple of int
-        Number of martensite grains and of oriented ones.
-    """
+    """Bring every grain to a temperature and a stress; return the number of martensite and of oriented grains."""
     martensites = 0
     orienteds = 0
     for g in range(martensite.size):
@@ -138,65 +84,29 @@ def update_grains(
 
 @njit(cache=True)
 def wire_length(
-    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Floats
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
 ) -> float:
-    """Elongation of the wire from its resting length, mm.
-
-    Parameters
-    ----------
-    temperature, stress : float
-        Temperature, °C, and stress, MPa.
-    martensites, orienteds : float
-        Number of martensite grains and of oriented ones.
-    count : int
-        Number of grains.
-    c : ndarray
-        Coefficients.
-
-    Returns
-    -------
-    float
-        Elongation, mm.
-    """
+    """Elongation of the wire from its resting length, mm."""
     share = martensites / count
-    strain = stress * (share / c[MARTENSITE_MODULUS] + (1.0 - share) / c[AUSTENITE_MODULUS])
-    strain += c[EXPANSION] * (temperature - c[EXPANSION_REFERENCE]) + c[TRANSFORMATION_STRAIN] * orienteds / count
-    length: float = c[REST_LENGTH] * (strain - c[REST_STRAIN])
+    strain = stress * (share / c.martensite_modulus + (1.0 - share) / c.austenite_modulus)
+    strain += c.expansion * (temperature - c.expansion_reference) + c.transformation_strain * orienteds / count
+    length: float = c.rest_length * (strain - c.rest_strain)
     return length
 
 
 @njit(cache=True)
 def end_position(
-    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Floats
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
 ) -> float:
-    """Position of the moving end of a taut wire: its elongation and that of frame and load cell, mm.
-
-    Parameters
-    ----------
-    temperature, stress, martensites, orienteds, count, c
-        See `wire_length`.
-
-    Returns
-    -------
-    float
-        Position, mm.
-    """
+    """Position of the moving end of a taut wire: its elongation and that of frame and load cell, mm."""
     length = wire_length(temperature, stress, martensites, orienteds, count, c)
-    position: float = length + stress * c[AREA] * c[SERIES_COMPLIANCE]
+    position: float = length + stress * c.area * c.series_compliance
     return position
 
 
 @njit(cache=True)
 def switching_stresses(temperature: float, parts: Parts) -> None:
-    """Find the stress above which each grain will be martensite, and oriented, in a trial from its state.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature of the trial, °C.
-    parts : Parts
-        Stresses for martensite and for orientation are written to the rows of `scratch`.
-    """
+    """Write the stresses above which each grain will be martensite, and oriented, to the rows of `scratch`."""
     _, c, grains, martensite, oriented, scratch = parts
     for g in range(martensite.size):
         cold = (temperature - grains[AUSTENITE, g] + grains[WIDTH, g]) * grains[SLOPE, g]
@@ -208,7 +118,7 @@ def switching_stresses(temperature: float, parts: Parts) -> None:
             switch = hot
             orient = grains[RETWIN, g]
         else:
-            switch = min(hot / c[UNORIENTED_SHARE], cold)
+            switch = min(hot / c.unoriented_share, cold)
             orient = grains[DETWIN, g]
         scratch[0, g] = switch
         scratch[1, g] = max(switch, orient)
@@ -218,30 +128,16 @@ def switching_stresses(temperature: float, parts: Parts) -> None:
 def solve_stress(position: float, temperature: float, committed: float, parts: Parts) -> float:
     """Find the stress at which the wire is as long as imposed, by bisection on trials from the committed state.
 
+    It is 0 if the wire is slack, and the stress limit if it cannot be stretched so far.
+
     The trial length is non-decreasing in stress with a jump where a grain switches. Of the last
     interval the end next to the committed stress is taken, so that a grain whose switch alone would
     overshoot the imposed length waits. Grains that the interval has left behind need not be looked at
     again, so the whole bisection costs little more than one trial.
-
-    Parameters
-    ----------
-    position : float
-        Imposed position of the moving end, mm.
-    temperature : float
-        Temperature, °C.
-    committed : float
-        Stress of the committed state, MPa.
-    parts : Parts
-        Only `scratch` is changed.
-
-    Returns
-    -------
-    float
-        Stress, MPa: 0 if the wire is slack, the stress limit if it cannot be stretched so far.
     """
     c, scratch = parts.c, parts.scratch
     count = parts.martensite.size
-    limit = float(c[STRESS_LIMIT])
+    limit = float(c.stress_limit)
     below = np.zeros(2, dtype=np.int64)
     inside = np.zeros(2, dtype=np.int64)
     low = 0.0
@@ -310,17 +206,9 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
 
 @njit(cache=True)
 def commit(temperature: float, stress: float, parts: Parts) -> None:
-    """Take over temperature and stress and bring the grains there.
-
-    Parameters
-    ----------
-    temperature, stress : float
-        Temperature, °C, and stress, MPa.
-    parts : Parts
-        State and grain states are changed.
-    """
+    """Take over temperature and stress and bring the grains there."""
     state, c, grains, martensite, oriented, _ = parts
-    martensites, orienteds = update_grains(temperature, stress, c[UNORIENTED_SHARE], grains, martensite, oriented)
+    martensites, orienteds = update_grains(temperature, stress, c.unoriented_share, grains, martensite, oriented)
     state[TEMPERATURE] = temperature
     state[STRESS] = stress
     state[MARTENSITE] = martensites
@@ -329,19 +217,11 @@ def commit(temperature: float, stress: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def load_to(stress: float, parts: Parts) -> None:
-    """Move the imposed stress at constant temperature, in sub-steps.
-
-    Parameters
-    ----------
-    stress : float
-        Stress to reach, MPa.
-    parts : Parts
-        See `commit`.
-    """
+    """Move the imposed stress at constant temperature, in sub-steps."""
     state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[STRESS]
-    steps = math.ceil(abs(stress - begin) / c[STRESS_STEP])
+    steps = math.ceil(abs(stress - begin) / c.stress_step)
     for k in range(1, steps + 1):
         commit(temperature, begin + (stress - begin) * k / steps, parts)
     state[STRESS] = stress
@@ -350,19 +230,11 @@ def load_to(stress: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def stretch_to(position: float, parts: Parts) -> None:
-    """Move the imposed position at constant temperature, in sub-steps.
-
-    Parameters
-    ----------
-    position : float
-        Position to reach, mm.
-    parts : Parts
-        See `commit` and `solve_stress`.
-    """
+    """Move the imposed position at constant temperature, in sub-steps."""
     state, c = parts.state, parts.c
     temperature = state[TEMPERATURE]
     begin = state[POSITION]
-    steps = math.ceil(abs(position - begin) / c[LENGTH_STEP])
+    steps = math.ceil(abs(position - begin) / c.length_step)
     for k in range(1, steps + 1):
         place = begin + (position - begin) * k / steps
         stress = solve_stress(place, temperature, state[STRESS], parts)
@@ -372,21 +244,11 @@ def stretch_to(position: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
-    """Move the temperature at constant load or at constant position, in sub-steps.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature to reach, °C.
-    clamped : bool
-        Whether the position is held; the stress is otherwise.
-    parts : Parts
-        See `commit` and `solve_stress`.
-    """
+    """Move the temperature at constant load or at constant position, in sub-steps."""
     state, c = parts.state, parts.c
     begin = state[TEMPERATURE]
     position = state[POSITION]
-    steps = math.ceil(abs(temperature - begin) / c[TEMPERATURE_STEP])
+    steps = math.ceil(abs(temperature - begin) / c.temperature_step)
     for k in range(1, steps + 1):
         warm = begin + (temperature - begin) * k / steps
         stress = state[STRESS]
@@ -406,15 +268,6 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
 
     The mechanical command is carried out first, at the temperature of the step before, and then the
     wire is heated: this order of the two moves decides the memory when both change in one step.
-
-    Parameters
-    ----------
-    normals : ndarray
-        Standard normal numbers, one a step: the ambient temperature.
-    command : ndarray
-        Command.
-    parts : Parts
-        See `commit` and `solve_stress`.
     """
     state, c = parts.state, parts.c
     clamped = command[CLAMPED] != 0.0
@@ -422,14 +275,14 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
         if clamped:
             stretch_to(command[PLACE], parts)
         else:
-            load_to(command[LOAD] / c[AREA], parts)
-        offset = c[AMBIENT_DECAY] * state[AMBIENT_OFFSET] + c[AMBIENT_KICK] * normals[row]
+            load_to(command[LOAD] / c.area, parts)
+        offset = c.ambient_decay * state[AMBIENT_OFFSET] + c.ambient_kick * normals[row]
         state[AMBIENT_OFFSET] = offset
-        rise = c[HEATING] * (1.0 + c[AMBIENT_GAIN] * offset) * command[VOLTAGE] * command[VOLTAGE]
-        decay = c[STILL_DECAY]
+        rise = c.heating * (1.0 + c.ambient_gain * offset) * command[VOLTAGE] * command[VOLTAGE]
+        decay = c.still_decay
         if command[FAN] != 0.0:
-            rise *= c[FAN_SHARE]
-            decay = c[FAN_DECAY]
-        steady = c[AMBIENT] + offset + rise
+            rise *= c.fan_share
+            decay = c.fan_decay
+        steady = c.ambient + offset + rise
         warm = steady + (state[TEMPERATURE] - steady) * decay
         heat_to(warm, clamped, parts)

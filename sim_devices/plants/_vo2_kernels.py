@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
+from sim_devices.plants.grid import Floats, Record
 
 ZERO_CELSIUS = 273.15
 
@@ -26,63 +27,25 @@ STATE_SIZE = 7
 ON_COUNT, UP_BELOW, DOWN_BELOW = range(3)
 COUNTER_SIZE = 3
 
-# Coefficients, prepared once from the parameters.
-(
-    STEP,
-    LOOP_EE,
-    LOOP_EV,
-    LOOP_VE,
-    LOOP_VV,
-    SLEW,
-    SLEW_DECAY,
-    CURRENT_DECAY,
-    SEEBECK,
-    RESISTANCE,
-    CONDUCTANCE,
-    PLATE_LOSS,
-    PLATE_CAPACITY,
-    SINK_CAPACITY,
-    SINK_LOSS,
-    AMBIENT,
-    WANDER_DECAY,
-    WANDER_KICK,
-    DRIFT_DECAY,
-    DRIFT_KICK,
-    OFFSET,
-    COUPLING,
-    RELAY_STEP,
-) = range(23)
-COEFFICIENT_SIZE = 23
-
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
 class Parts(NamedTuple):
-    """All numbers of the film and its plate, as the compiled loops take them.
-
-    Attributes
-    ----------
-    state, c : ndarray
-        State and coefficients.
-    counters : ndarray
-        Relay counters.
-    up, down : ndarray
-        Up- and down-thresholds, °C, each sorted.
-    down_relay : ndarray
-        Relay number of each element of `down`.
-    on : ndarray
-        Relay states.
-    """
+    """All numbers of the film and its plate, as the compiled loops take them."""
 
     state: Floats
-    c: Floats
+    c: Record
+    """State and coefficients."""
     counters: Integers
+    """Relay counters."""
     up: Floats
     down: Floats
+    """Up- and down-thresholds, °C, each sorted."""
     down_relay: Integers
+    """Relay number of each element of `down`."""
     on: Flags
+    """Relay states."""
 
 
 @njit(cache=True)
@@ -94,19 +57,6 @@ def switch_relays(
     A relay is on above its up-threshold, off below its down-threshold and otherwise keeps its state.
     Relays are numbered in the order of their up-thresholds, so only those whose threshold lies in the
     swept interval are touched.
-
-    Parameters
-    ----------
-    drive : float
-        New value of the effective temperature, °C.
-    counters : ndarray
-        Relay counters, changed in place.
-    up, down : ndarray
-        Up- and down-thresholds, °C, each sorted.
-    down_relay : ndarray
-        Relay number of each element of `down`.
-    on : ndarray
-        Relay states, changed in place.
     """
     size = up.size
     count = counters[ON_COUNT]
@@ -138,18 +88,11 @@ def settle_film(film: float, parts: Parts) -> None:
 
     The R fraction of the previous sub-step feeds back (causal), so relays that switch in the last
     sub-step act one grid step later, as an avalanche does.
-
-    Parameters
-    ----------
-    film : float
-        Film temperature, °C.
-    parts : Parts
-        The effective temperature in the state, counters and relays are changed.
     """
     state, c, counters, up, down, down_relay, on = parts
-    relay_step = c[RELAY_STEP]
+    relay_step = c.relay_step
     while True:
-        wanted = film + c[COUPLING] * (counters[ON_COUNT] / up.size - 0.5)
+        wanted = film + c.coupling * (counters[ON_COUNT] / up.size - 0.5)
         move = wanted - state[DRIVE]
         if abs(move) <= relay_step:
             state[DRIVE] = wanted
@@ -160,120 +103,61 @@ def settle_film(film: float, parts: Parts) -> None:
 
 
 @njit(cache=True)
-def plate_rate(plate: float, current: float, sink: float, c: Floats) -> float:
-    """Evaluate the heat balance: rate of the plate temperature under a current.
-
-    Parameters
-    ----------
-    plate, sink : float
-        Temperatures of plate and heat sink, °C.
-    current : float
-        Peltier current, A; positive heats the plate.
-    c : ndarray
-        Coefficients.
-
-    Returns
-    -------
-    float
-        Rate, K/s.
-    """
-    heat = c[SEEBECK] * (plate + ZERO_CELSIUS) * current + 0.5 * c[RESISTANCE] * current * current
-    heat -= c[CONDUCTANCE] * (plate - sink) + c[PLATE_LOSS] * (plate - c[AMBIENT])
-    rate: float = heat / c[PLATE_CAPACITY]
+def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
+    """Evaluate the heat balance: rate of the plate temperature (K/s) under a current (A, positive heats)."""
+    heat = c.seebeck * (plate + ZERO_CELSIUS) * current + 0.5 * c.resistance * current * current
+    heat -= c.conductance * (plate - sink) + c.plate_loss * (plate - c.ambient)
+    rate: float = heat / c.plate_capacity
     return rate
 
 
 @njit(cache=True)
-def current_for(plate: float, rate: float, sink: float, c: Floats) -> float:
-    """Find the current that gives the plate a rate: the inverse of `plate_rate` on the useful branch.
-
-    Parameters
-    ----------
-    plate, sink : float
-        Temperatures of plate and heat sink, °C.
-    rate : float
-        Rate of the plate temperature, K/s.
-    c : ndarray
-        Coefficients.
-
-    Returns
-    -------
-    float
-        Current, A, the root of smaller magnitude.
-    """
-    heat = c[PLATE_CAPACITY] * rate
-    heat += c[CONDUCTANCE] * (plate - sink) + c[PLATE_LOSS] * (plate - c[AMBIENT])
-    pumped = c[SEEBECK] * (plate + ZERO_CELSIUS)
+def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
+    """Find the current (A) that gives the plate a rate: inverse of `plate_rate`, the root of smaller magnitude."""
+    heat = c.plate_capacity * rate
+    heat += c.conductance * (plate - sink) + c.plate_loss * (plate - c.ambient)
+    pumped = c.seebeck * (plate + ZERO_CELSIUS)
     # The rate never asks for more cooling than the Peltier maximum: a negative root is rounding only.
-    root = math.sqrt(max(pumped * pumped + 2.0 * c[RESISTANCE] * heat, 0.0))
+    root = math.sqrt(max(pumped * pumped + 2.0 * c.resistance * heat, 0.0))
     current: float = 2.0 * heat / (pumped + root)
     return current
 
 
 @njit(cache=True)
-def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Floats) -> float:
-    """Limit a rate to the slew limit and to the heat flow that the current limit allows.
-
-    Parameters
-    ----------
-    rate : float
-        Rate that the loop wants, K/s.
-    slew : float
-        Slew limit, K/s.
-    limit : float
-        Current limit, A, of either sign; may be infinite.
-    plate, sink : float
-        Temperatures of plate and heat sink, °C.
-    c : ndarray
-        Coefficients.
-
-    Returns
-    -------
-    float
-        Rate, K/s.
-    """
+def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Record) -> float:
+    """Limit a rate (K/s) to the slew limit and the heat flow that the current limit (A, may be infinite) allows."""
     # Beyond this current the Joule heat outgrows the pumping and more current cools less.
-    best_cooling = c[SEEBECK] * (plate + ZERO_CELSIUS) / c[RESISTANCE]
+    best_cooling = c.seebeck * (plate + ZERO_CELSIUS) / c.resistance
     rate = min(max(rate, -slew), slew)
     rate = min(rate, plate_rate(plate, limit, sink, c))
     return max(rate, plate_rate(plate, -min(limit, best_cooling), sink, c))
 
 
 @njit(cache=True)
-def step_plate(state: Floats, command: Floats, c: Floats) -> None:
-    """Advance plate, current and sink by one grid step.
-
-    Parameters
-    ----------
-    state : ndarray
-        State, changed in place.
-    command : ndarray
-        Commands to the amplifier.
-    c : ndarray
-        Coefficients.
-    """
-    step = c[STEP]
+def step_plate(state: Floats, command: Floats, c: Record) -> None:
+    """Advance plate, current and sink by one grid step."""
+    step = c.step
     plate = state[PLATE]
     rate = state[RATE]
     current = state[CURRENT]
     sink = state[SINK]
 
-    taken = c[SEEBECK] * (sink + ZERO_CELSIUS) * current - 0.5 * c[RESISTANCE] * current * current
-    taken -= c[CONDUCTANCE] * (plate - sink)
-    sink += step * (-taken - c[SINK_LOSS] * (sink - c[AMBIENT])) / c[SINK_CAPACITY]
+    taken = c.seebeck * (sink + ZERO_CELSIUS) * current - 0.5 * c.resistance * current * current
+    taken -= c.conductance * (plate - sink)
+    sink += step * (-taken - c.sink_loss * (sink - c.ambient)) / c.sink_capacity
 
     if command[CLOSED] == 0.0:
-        current = command[COMMAND] + (current - command[COMMAND]) * c[CURRENT_DECAY]
+        current = command[COMMAND] + (current - command[COMMAND]) * c.current_decay
         ahead = plate_rate(plate + step * rate, current, sink, c)
         plate += 0.5 * step * (rate + ahead)
         rate = plate_rate(plate, current, sink, c)
     else:
         error = command[TARGET] - plate
-        wanted = c[LOOP_VE] * error + c[LOOP_VV] * rate
-        moved = command[TARGET] - (c[LOOP_EE] * error + c[LOOP_EV] * rate)
+        wanted = c.loop_ve * error + c.loop_vv * rate
+        moved = command[TARGET] - (c.loop_ee * error + c.loop_ev * rate)
         # A mode change may hand over more speed or current than the limits allow: it decays into them.
-        slew = c[SLEW] + max(abs(rate) - c[SLEW], 0.0) * c[SLEW_DECAY]
-        limit = command[LIMIT] + max(abs(current) - command[LIMIT], 0.0) * c[CURRENT_DECAY]
+        slew = c.slew + max(abs(rate) - c.slew, 0.0) * c.slew_decay
+        limit = command[LIMIT] + max(abs(current) - command[LIMIT], 0.0) * c.current_decay
         reached = limited_rate(wanted, slew, limit, plate + step * rate, sink, c)
         plate = moved if reached == wanted else plate + 0.5 * step * (rate + reached)
         # Once more where the plate has come to, so that the current never leaves its limit.
@@ -288,21 +172,11 @@ def step_plate(state: Floats, command: Floats, c: Floats) -> None:
 
 @njit(cache=True)
 def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
-    """Advance the whole plant by one grid step for each row of `normals`.
-
-    Parameters
-    ----------
-    normals : ndarray
-        Standard normal numbers, one row a step: wander, drift.
-    command : ndarray
-        Command.
-    parts : Parts
-        See `settle_film`.
-    """
+    """Advance the whole plant by one grid step for each row of `normals`: wander, drift."""
     state, c = parts.state, parts.c
     for row in range(normals.shape[0]):
         step_plate(state, command, c)
-        state[WANDER] = c[WANDER_DECAY] * state[WANDER] + c[WANDER_KICK] * normals[row, 0]
-        state[DRIFT] = c[DRIFT_DECAY] * state[DRIFT] + c[DRIFT_KICK] * normals[row, 1]
-        film = state[PLATE] + state[WANDER] + state[DRIFT] + c[OFFSET]
+        state[WANDER] = c.wander_decay * state[WANDER] + c.wander_kick * normals[row, 0]
+        state[DRIFT] = c.drift_decay * state[DRIFT] + c.drift_kick * normals[row, 1]
+        film = state[PLATE] + state[WANDER] + state[DRIFT] + c.offset
         settle_film(film, parts)

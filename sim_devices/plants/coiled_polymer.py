@@ -20,53 +20,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
-from sim_devices.plants.grid import NotNegative, Signed, check_temperature
-from sim_devices.plants.muscle import MILLIMETRE
+from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, coefficients
+from sim_devices.plants.grid import NotNegative, Record, Signed
+from sim_devices.plants.muscle import MILLIMETRE, HeatedParameters
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoiledPolymerParameters(MuscleParameters):
-    """Every number of the plant; those shared with the braided muscle are described in `MuscleParameters`.
+class CoiledPolymerParameters(FrictionParameters, HeatedParameters):
+    """Every number of the plant; those shared with other muscles are described in its base classes.
 
-    Attributes
-    ----------
-    cold_stiffness, hot_stiffness : float
-        Stiffness of the coil well below and well above the glass transition, N/m.
-    softening, softening_width : float
-        Middle and width of the softening, °C and K; nylon 6,6 has its glass transition near 50 °C.
-    expansion, expansion_above : float
-        Contraction of the unloaded coil per temperature below the softening, and what is added above it, m/K.
-    coil_contact : float
-        Force with which touching coils resist contraction, per square of it, N/m².
-    coil_length : float
-        Elongation below which coils touch, m.
-    friction : float
-        Yield force of all contacts of the cold unloaded muscle, N. It softens with the coil.
-    friction_load : float
-        Yield force of all contacts per tension of the coil, in [0, 1).
-    friction_coils : float
-        Yield force of all contacts per force between touching coils, in [0, 1).
-    slip : float
-        How much of the free contraction an average contact sees as the heated thread untwists at constant length.
-    arm_stiffness, arm_time : float
-        Stiffness (N/m) and relaxation time (s) of the Maxwell arm: the viscoelastic part.
-    ambient_temperature : float
-        Mean temperature of the room, °C.
-    time_constant, fan_time_constant : float
-        Thermal time constants in still air and with the fan on, s. The fan raises the heat loss, so that the
-        steady temperature rise falls in the same ratio. The heat of 100 mm of coil, some 0.06 J/K, and 0.75 W at
-        3 V go with 8 s and 95 K.
-    rise : float
-        Steady temperature rise in still air at the rated voltage, K. It goes as the voltage squared: 3 V are
-        120 °C. Nylon is spoilt above some 180 °C, at 3.8 V, which the plant leaves to the rig's limits.
-    temperature_step : float
-        Largest sub-step of the temperature, K.
-    ambient_sd, ambient_time : float
-        Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default, switches it off;
-        0.3 K is sensible for dynamic tests.
-    ambient_gain : float
-        Relative change of the heating gain with the deviation of the room temperature, 1/K.
+    The heat of 100 mm of coil, some 0.06 J/K, and 0.75 W at 3 V go with a time constant of 8 s and a rise of 95 K.
+    3 V are 120 °C. Nylon is spoilt above some 180 °C, at 3.8 V, which the plant leaves to the rig's limits.
     """
 
     contact_stiffness: float = 600.0
@@ -74,28 +38,33 @@ class CoiledPolymerParameters(MuscleParameters):
     rest_length: float = 100e-3
     force_limit: float = 15.0
     resistance: float = 12.0
-    cold_stiffness: float = 1.3e3
-    hot_stiffness: float = 0.9e3
-    softening: Signed = 60.0
-    softening_width: float = 15.0
-    expansion: NotNegative = 0.07e-3
-    expansion_above: NotNegative = 0.07e-3
-    coil_contact: NotNegative = 1.0e6
-    coil_length: Signed = -6.0e-3
-    friction: NotNegative = 0.35
-    friction_load: NotNegative = 0.06
-    friction_coils: NotNegative = 0.1
-    slip: NotNegative = 0.4
-    arm_stiffness: NotNegative = 100.0
-    arm_time: float = 6.0
-    ambient_temperature: Signed = 25.0
     time_constant: float = 8.0
     fan_time_constant: float = 3.0
     rise: float = 95.0
-    temperature_step: float = 1.0
-    ambient_sd: NotNegative = 0.0
-    ambient_time: float = 120.0
-    ambient_gain: Signed = 0.004
+    cold_stiffness: float = 1.3e3
+    hot_stiffness: float = 0.9e3
+    """Stiffness of the coil well below and well above the glass transition, N/m."""
+    softening: Signed = 60.0
+    softening_width: float = 15.0
+    """Middle and width of the softening, °C and K; nylon 6,6 has its glass transition near 50 °C."""
+    expansion: NotNegative = 0.07e-3
+    expansion_above: NotNegative = 0.07e-3
+    """Contraction of the unloaded coil per temperature below the softening, and what is added above it, m/K."""
+    coil_contact: NotNegative = 1.0e6
+    """Force with which touching coils resist contraction, per square of it, N/m²."""
+    coil_length: Signed = -6.0e-3
+    """Elongation below which coils touch, m."""
+    friction: NotNegative = 0.35
+    """Yield force of all contacts of the cold unloaded muscle, N. It softens with the coil."""
+    friction_load: NotNegative = 0.06
+    """Yield force of all contacts per tension of the coil, in [0, 1)."""
+    friction_coils: NotNegative = 0.1
+    """Yield force of all contacts per force between touching coils, in [0, 1)."""
+    slip: NotNegative = 0.4
+    """How much of the free contraction an average contact sees as the heated thread untwists at constant length."""
+    arm_stiffness: NotNegative = 100.0
+    arm_time: float = 6.0
+    """Stiffness (N/m) and relaxation time (s) of the Maxwell arm: the viscoelastic part."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,7 +76,6 @@ class CoiledPolymerParameters(MuscleParameters):
             raise ValueError(
                 f"hot_stiffness must not exceed cold_stiffness, not {self.hot_stiffness} > {self.cold_stiffness} N/m"
             )
-        check_temperature("ambient_temperature", self.ambient_temperature)
 
 
 class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
@@ -129,13 +97,9 @@ class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
 
     Parameters
     ----------
-    parameters : CoiledPolymerParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from it.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
-
-    OUTPUTS = ("temperature", "ambient_temperature", "voltage", "current", "force", "length", "position")
 
     def __init__(self, parameters: CoiledPolymerParameters, rng: np.random.Generator) -> None:
         room = parameters.ambient_temperature

@@ -4,21 +4,20 @@ Both are an elastic backbone whose law depends on the drive, pressure or tempera
 contacts and with one weak Maxwell arm. The compiled loops keep their numbers in records, which they change in
 place: passing records into a compiled function costs a few microseconds, and a plant is advanced hundreds of
 thousands of times a run. Here lengths are in mm, forces in N, pressures in bar and temperatures in °C;
-`MuscleParameters` and the muscles' commands and outputs are in SI units.
+`FrictionParameters` and the muscles' commands and outputs are in SI units.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from sim_devices.plants.grid import NotNegative, PlantParameters, Seed, fluctuation
-from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, MILLIMETRE, PLACE, VOLTAGE, Muscle
+from sim_devices.plants.grid import Floats, NotNegative, Record, fluctuation
+from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, MILLIMETRE, PLACE, VOLTAGE, Muscle, MuscleParameters
 
 
 def _record(names: str) -> np.dtype[np.void]:
@@ -57,47 +56,23 @@ _MOST_TRIALS = 200
 # An arm that carries less has relaxed, N.
 _RELAXED = 1e-12
 
-Floats = NDArray[np.float64]
-Record = Any
-"""A record of one of the types above."""
-
 
 class Parts(NamedTuple):
-    """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place.
-
-    Attributes
-    ----------
-    state, law, c : record
-        State, law at the present drive, and coefficients.
-    contacts : ndarray
-        Contact table, three rows.
-    forces : ndarray
-        Forces of the contacts, N.
-    """
+    """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place."""
 
     state: Record
     law: Record
     c: Record
+    """State, law at the present drive, and coefficients."""
     contacts: Floats
+    """Contact table, three rows."""
     forces: Floats
+    """Forces of the contacts, N."""
 
 
 @njit(cache=True)
 def expansion(temperature: float, c: Record) -> float:
-    """Contraction of the unloaded coiled muscle, mm, from 0 °C on; steeper above the softening temperature.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature, °C.
-    c : record
-        Coefficients.
-
-    Returns
-    -------
-    float
-        Contraction, mm; rises with temperature.
-    """
+    """Contraction of the unloaded coiled muscle, mm, from 0 °C on; steeper above the softening temperature."""
     above = (temperature - c.softening) / c.softening_width
     # log(1 + exp(above)) without overflow.
     soft = max(above, 0.0) + math.log1p(math.exp(-abs(above)))
@@ -107,17 +82,7 @@ def expansion(temperature: float, c: Record) -> float:
 
 @njit(cache=True)
 def law_at(drive: float, c: Record, law: Record) -> None:
-    """Write the muscle's law at one value of its drive.
-
-    Parameters
-    ----------
-    drive : float
-        Pressure (bar) or temperature (°C).
-    c : record
-        Coefficients.
-    law : record
-        Written to.
-    """
+    """Write the muscle's law at one value of its drive, pressure or temperature."""
     law.square = law.cube = law.stretch = law.press = law.press_from = 0.0
     law.yield_stretch = law.yield_press = law.yield_load = 0.0
     if c.pneumatic:
@@ -147,20 +112,7 @@ def law_at(drive: float, c: Record, law: Record) -> None:
 
 @njit(cache=True)
 def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
-    """Tension of the elastic backbone and yield force of all contacts together.
-
-    Parameters
-    ----------
-    length : float
-        Length, mm.
-    law : record
-        Law at the present drive.
-
-    Returns
-    -------
-    tuple of float
-        Tension (N) and its slope (N/mm), yield force and its slope; the tension rises with the length.
-    """
+    """Tension of the elastic backbone and its slope, yield force of all contacts together and its slope."""
     smooth = law.level + length * (law.slope + length * (law.square + length * law.cube))
     smooth_slope = law.slope + length * (2.0 * law.square + 3.0 * length * law.cube)
     beyond = max(length, 0.0)
@@ -179,20 +131,7 @@ def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
 
 @njit(cache=True)
 def tension(length: float, parts: Parts) -> tuple[float, float]:
-    """Tension of a trial from the committed state.
-
-    Parameters
-    ----------
-    length : float
-        Length of the trial, mm.
-    parts : Parts
-        With the law at the trial's drive, and the committed state and forces; nothing is changed.
-
-    Returns
-    -------
-    tuple of float
-        Tension, N, and its slope, N/mm.
-    """
+    """Tension of a trial from the committed state, and its slope; nothing is changed."""
     state, law, contacts, forces = parts.state, parts.law, parts.contacts, parts.forces
     total, slope, yielding, yielding_slope = backbone(length, law)
     moved = length - state.length
@@ -214,24 +153,10 @@ def tension(length: float, parts: Parts) -> tuple[float, float]:
 
 @njit(cache=True)
 def solve_length(clamped: bool, target: float, parts: Parts) -> float:
-    """Find the length at which the tension is what the load or the held end asks for.
+    """Find the length at which the tension is that of a load, or of a held end (clamped) at a position.
 
     The tension of a trial rises with its length, in smooth pieces: Newton's steps, inside an interval that
     holds the solution and is halved where they leave it. A state that is the solution already stays.
-
-    Parameters
-    ----------
-    clamped : bool
-        Whether the position is imposed; the load is otherwise.
-    target : float
-        Position, mm, or load, N.
-    parts : Parts
-        See `tension`; nothing is changed.
-
-    Returns
-    -------
-    float
-        Length, mm.
     """
     c = parts.c
     length = float(parts.state.length)
@@ -261,15 +186,7 @@ def solve_length(clamped: bool, target: float, parts: Parts) -> float:
 
 @njit(cache=True)
 def settle(clamped: bool, target: float, parts: Parts) -> None:
-    """Find the equilibrium at the law's drive and take it over.
-
-    Parameters
-    ----------
-    clamped, target
-        See `solve_length`.
-    parts : Parts
-        State and forces are changed.
-    """
+    """Find the equilibrium at the law's drive and take over its length, force and forces of the contacts."""
     state, law, c, contacts, forces = parts
     length = solve_length(clamped, target, parts)
     force = target
@@ -294,17 +211,7 @@ def settle(clamped: bool, target: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def carry(clamped: bool, target: float, seconds: float, parts: Parts) -> None:
-    """Go to an equilibrium while the Maxwell arm relaxes for some time: exact for a length that moves evenly.
-
-    Parameters
-    ----------
-    clamped, target
-        See `solve_length`.
-    seconds : float
-        Time that passes, s; 0 for a move at once.
-    parts : Parts
-        See `settle`; the arm is added to the law.
-    """
+    """Go to an equilibrium while the Maxwell arm relaxes for some time: exact for a length that moves evenly."""
     state, law, c = parts.state, parts.law, parts.c
     if c.arm == 0.0:
         settle(clamped, target, parts)
@@ -325,15 +232,7 @@ def carry(clamped: bool, target: float, seconds: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def load_to(load: float, parts: Parts) -> None:
-    """Move the imposed force at a constant drive, at once, in sub-steps.
-
-    Parameters
-    ----------
-    load : float
-        Force to reach, N.
-    parts : Parts
-        See `carry`.
-    """
+    """Move the imposed force at a constant drive, at once, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
     begin = state.force
     steps = math.ceil(abs(load - begin) / c.force_step)
@@ -347,15 +246,7 @@ def load_to(load: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def stretch_to(position: float, parts: Parts) -> None:
-    """Move the imposed position at a constant drive, at once, in sub-steps.
-
-    Parameters
-    ----------
-    position : float
-        Position to reach, mm.
-    parts : Parts
-        See `carry`.
-    """
+    """Move the imposed position at a constant drive, at once, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
     begin = state.position
     steps = math.ceil(abs(position - begin) / c.length_step)
@@ -367,19 +258,7 @@ def stretch_to(position: float, parts: Parts) -> None:
 
 @njit(cache=True)
 def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
-    """Move pressure or temperature at constant load or at constant position, in sub-steps.
-
-    Parameters
-    ----------
-    drive : float
-        Pressure (bar) or temperature (°C) to reach.
-    seconds : float
-        Time that it takes, s.
-    clamped : bool
-        Whether the position is held; the load is otherwise.
-    parts : Parts
-        See `carry`.
-    """
+    """Move pressure or temperature at constant load or at constant position, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
     begin = state.drive
     if drive == begin and state.relaxing == 0.0:
@@ -394,20 +273,7 @@ def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
 
 @njit(cache=True)
 def next_drive(state: Record, command: Floats, c: Record) -> float:
-    """Pressure or temperature after one grid step: exact for a constant command.
-
-    Parameters
-    ----------
-    state, c : record
-        State, in which the regulator's aim is changed, and coefficients.
-    command : ndarray
-        Command.
-
-    Returns
-    -------
-    float
-        Pressure, bar, or temperature, °C.
-    """
+    """Pressure or temperature after one grid step: exact for a constant command; moves the regulator's aim."""
     decay = c.decay
     if c.pneumatic:
         wanted = c.gain * command[VOLTAGE]
@@ -430,15 +296,6 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each element of `normals`.
 
     The mechanical command is carried out first, at the drive of the step before, and then the drive moves.
-
-    Parameters
-    ----------
-    normals : ndarray
-        Standard normal numbers, one a step: the deviation of supply or room.
-    command : ndarray
-        Command.
-    parts : Parts
-        See `carry`.
     """
     state, c = parts.state, parts.c
     clamped = command[CLAMPED] != 0.0
@@ -452,67 +309,28 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MuscleParameters(PlantParameters):
-    """Numbers that both muscles have; the defaults are theirs.
-
-    Attributes
-    ----------
-    contact_count : int
-        Number of dry contacts, at least 1.
-    specimen_seed : int
-        Seed of the contacts. The specimen does not depend on the session's seed.
-    contact_stiffness : float
-        Stiffness of all contacts together before any has slipped, N/m.
-    contact_spread : float
-        Standard deviation of the logarithm of a contact's share of the yield force.
-    rest_length : float
-        Length of the unloaded muscle as made, m.
-    series_stiffness : float
-        Stiffness of frame and load cell in series with the muscle, N/m.
-    force_limit : float
-        Largest load, N. A larger one is refused, and the force of a muscle that is stretched further stays there.
-    pretension : float
-        Load under which the muscle is first driven when it is conditioned, N.
-    step : float
-        Step of the internal time grid, s.
-    force_step, length_step : float
-        Largest sub-steps of a path: N and m.
-    rated_voltage, maximum_voltage : float
-        Voltage to which the muscle is conditioned and highest voltage, V. Higher commands are refused.
-    resistance : float
-        Electrical resistance that the supply sees, ohm.
-    """
+class FrictionParameters(MuscleParameters):
+    """Numbers that both muscles have."""
 
     contact_count: int = 40
-    specimen_seed: Seed = 2017
+    """Number of dry contacts, at least 1."""
     contact_stiffness: float
+    """Stiffness of all contacts together before any has slipped, N/m."""
     contact_spread: NotNegative
-    rest_length: float
-    series_stiffness: float = 20e3
+    """Standard deviation of the logarithm of a contact's share of the yield force."""
     force_limit: float
-    pretension: NotNegative = 0.3
-    step: float = 0.1
+    """Largest load, N."""
     force_step: float = 0.1
-    length_step: float = 0.1e-3
-    rated_voltage: float = 3.0
-    maximum_voltage: float = 5.0
-    resistance: float
+    """Largest sub-step of the force, N."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.pretension <= self.force_limit:
-            raise ValueError(f"pretension must not exceed {self.force_limit:.4g} N, not {self.pretension} N")
-        if not self.rated_voltage <= self.maximum_voltage:
-            raise ValueError(f"rated_voltage must not exceed {self.maximum_voltage} V, not {self.rated_voltage} V")
+    @property
+    def largest_load(self) -> float:
+        """Largest load, N."""
+        return self.force_limit
 
 
-def contact_table(parameters: MuscleParameters) -> Floats:
+def contact_table(parameters: FrictionParameters) -> Floats:
     """Make the specimen: the properties of its contacts.
-
-    Parameters
-    ----------
-    parameters : MuscleParameters
-        Parameters of the population.
 
     Returns
     -------
@@ -528,13 +346,11 @@ def contact_table(parameters: MuscleParameters) -> Floats:
     return np.array([stiffness, weight / weight.sum(), share / share.mean()])
 
 
-def coefficients(parameters: MuscleParameters, deviation: float, time: float, **own: float) -> Record:
+def coefficients(parameters: FrictionParameters, deviation: float, time: float, **own: float) -> Record:
     """Prepare the coefficients of the compiled loops.
 
     Parameters
     ----------
-    parameters : MuscleParameters
-        The numbers.
     deviation, time : float
         Standard deviation (bar or K) and correlation time (s) of supply or room.
     **own : float
@@ -564,10 +380,10 @@ def coefficients(parameters: MuscleParameters, deviation: float, time: float, **
     return record
 
 
-M = TypeVar("M", bound=MuscleParameters)
+F = TypeVar("F", bound=FrictionParameters)
 
 
-class FrictionMuscle(Muscle[M]):
+class FrictionMuscle(Muscle[F]):
     """A muscle with dry contacts, driven by pressure or temperature, that carries a load or is held.
 
     Each contact is a spring behind a slider (Iwan, Journal of Applied Mechanics 33, 1966): its force follows the
@@ -577,32 +393,21 @@ class FrictionMuscle(Muscle[M]):
 
     Parameters
     ----------
-    parameters : MuscleParameters
-        The numbers.
     coefficients : record
         Coefficients of the compiled loops.
     cold, rated : float
         Drive at 0 V and at the rated voltage: bar or °C.
-    rng : numpy.random.Generator
-        The session's randomness. The plant spawns its own generator from it and never draws from `rng` itself.
     """
 
     def __init__(
         self,
-        parameters: M,
+        parameters: F,
         coefficients: Record,
         cold: float,
         rated: float,
         rng: np.random.Generator,
     ) -> None:
-        super().__init__(
-            parameters,
-            rng,
-            maximum_voltage=parameters.maximum_voltage,
-            resistance=parameters.resistance,
-            largest_load=parameters.force_limit,
-            reach=0.5 * parameters.rest_length,
-        )
+        super().__init__(parameters, rng)
         self._coefficients = coefficients
         self._state = np.zeros(1, STATE)[0]
         self._parts = Parts(

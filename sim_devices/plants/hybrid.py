@@ -21,11 +21,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_devices.plants import _hybrid_kernels as kernels
 from sim_devices.plants.cooler import CooledPlant
-from sim_devices.plants.grid import ABSOLUTE_ZERO, GRID_TOLERANCE, check_temperature, fluctuation
+from sim_devices.plants.grid import (
+    ABSOLUTE_ZERO,
+    GRID_TOLERANCE,
+    Floats,
+    Record,
+    check_temperature,
+    fluctuation,
+    record,
+)
 from sim_devices.plants.hybrid_parameters import HybridParameters, piezo_dynamics, thermal_sensitivity
 
 # Rise (K) at which the free convection's share is that of the parameters.
@@ -64,25 +71,9 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
     Parameters
     ----------
-    parameters : HybridParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from it
-        and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
-
-    OUTPUTS = (
-        "base_temperature",
-        "tip_temperature",
-        "sink_temperature",
-        "ambient_temperature",
-        "current",
-        "tec_voltage",
-        "piezo_voltage",
-        "thermal_deflection",
-        "piezo_deflection",
-        "deflection",
-    )
 
     def __init__(self, parameters: HybridParameters, rng: np.random.Generator) -> None:
         super().__init__(parameters, rng)
@@ -120,7 +111,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
             kernels.look_ahead(self._thermal)
             self._ahead = True
 
-    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+    def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._ahead, self._thermal)
         self._ahead = False
 
@@ -261,13 +252,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
 
 class PeltierTerminals:
-    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them.
-
-    Parameters
-    ----------
-    plant : HybridCantilever
-        The plant.
-    """
+    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them."""
 
     def __init__(self, plant: HybridCantilever) -> None:
         self._plant = plant
@@ -296,7 +281,7 @@ class PeltierTerminals:
         return self._plant.tec_voltage
 
 
-def _node_table(parameters: HybridParameters) -> NDArray[np.float64]:
+def _node_table(parameters: HybridParameters) -> Floats:
     """Build the thermal chain: heat capacities and conductances of its nodes."""
     p, strip = parameters, parameters.bimorph
     beam = slice(kernels.BEAM, kernels.NODES)
@@ -328,31 +313,30 @@ def _node_table(parameters: HybridParameters) -> NDArray[np.float64]:
     return nodes
 
 
-def _coefficients(parameters: HybridParameters) -> NDArray[np.float64]:
+def _coefficients(parameters: HybridParameters) -> Record:
     """Prepare the numbers that the compiled thermal step needs."""
     p = parameters
     room_decay, room_kick = fluctuation(p.ambient_sd, p.ambient_time, p.step)
     capacity = p.face_capacity + p.bimorph.line_capacity * p.bimorph.length
-    values = {
-        kernels.STEP: p.step,
-        kernels.KELVIN: p.ambient_temperature - ABSOLUTE_ZERO,
-        kernels.SEEBECK: p.seebeck,
-        kernels.RESISTANCE: p.resistance,
-        kernels.ROOM_DECAY: room_decay,
-        kernels.ROOM_KICK: room_kick,
-        kernels.LOOP_PROPORTIONAL: 2.0 * p.loop_damping * p.loop_frequency * capacity,
-        kernels.LOOP_INTEGRAL: p.loop_frequency**2 * capacity * p.step,
-        kernels.MAXIMUM_CURRENT: p.maximum_current,
-        kernels.STRAIGHT: p.ambient_temperature - p.straight_temperature,
-        kernels.SENSITIVITY: thermal_sensitivity(p.bimorph),
-        kernels.QUADRATIC: p.bending_quadratic,
-        kernels.CUBIC: p.bending_cubic,
-        kernels.WARM_GAIN: p.piezo_warming,
-    }
-    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])
+    return record(
+        step=p.step,
+        kelvin=p.ambient_temperature - ABSOLUTE_ZERO,
+        seebeck=p.seebeck,
+        resistance=p.resistance,
+        room_decay=room_decay,
+        room_kick=room_kick,
+        loop_proportional=2.0 * p.loop_damping * p.loop_frequency * capacity,
+        loop_integral=p.loop_frequency**2 * capacity * p.step,
+        maximum_current=p.maximum_current,
+        straight=p.ambient_temperature - p.straight_temperature,
+        sensitivity=thermal_sensitivity(p.bimorph),
+        quadratic=p.bending_quadratic,
+        cubic=p.bending_cubic,
+        warm_gain=p.piezo_warming,
+    )
 
 
-def _fast_coefficients(parameters: HybridParameters) -> NDArray[np.float64]:
+def _fast_coefficients(parameters: HybridParameters) -> Floats:
     """Prepare the numbers that the compiled piezo part needs."""
     p = parameters
     poles, shares = piezo_dynamics(p)

@@ -18,39 +18,28 @@ from sim_devices.plants.grid import NotNegative, Numbers, Signed, check_temperat
 
 @dataclass(frozen=True, kw_only=True)
 class Bimorph(Numbers):
-    """The strip: a piezo layer and a passive layer, from the paper's tables I and II.
-
-    Attributes
-    ----------
-    length, width : float
-        Free length and width, m.
-    piezo_thickness, passive_thickness : float
-        Thickness of the PZT and of the copper layer, m.
-    piezo_compliance, passive_compliance : float
-        Axial compliance, m²/N.
-    piezo_coefficient : float
-        Transverse piezoelectric coefficient d31, m/V; negative.
-    piezo_expansion, passive_expansion : float
-        Coefficient of thermal expansion, 1/K. The table prints PZT's 3.3e-6 without its unit.
-    piezo_conductivity, passive_conductivity : float
-        Thermal conductivity, W/(m K). PZT's is 1.4; the table has a hundred times that.
-    piezo_heat, passive_heat : float
-        Heat capacity of the volume, J/(m³ K). Copper's with its density of 8960 kg/m³; the table has zinc's.
-    """
+    """The strip: a piezo layer and a passive layer, from the paper's tables I and II."""
 
     length: float = 15e-3
     width: float = 2e-3
+    """Free length and width, m."""
     piezo_thickness: float = 0.2e-3
     passive_thickness: float = 0.1e-3
+    """Thickness of the PZT and of the copper layer, m."""
     piezo_compliance: float = 15e-12
     passive_compliance: float = 9.1e-12
+    """Axial compliance, m²/N."""
     piezo_coefficient: Signed = -100e-12
+    """Transverse piezoelectric coefficient d31, m/V; negative."""
     piezo_expansion: Signed = 3.3e-6
     passive_expansion: Signed = 17e-6
+    """Coefficient of thermal expansion, 1/K. The table prints PZT's 3.3e-6 without its unit."""
     piezo_conductivity: float = 1.4
     passive_conductivity: float = 381.5
+    """Thermal conductivity, W/(m K). PZT's is 1.4; the table has a hundred times that."""
     piezo_heat: float = 7500.0 * 420.0
     passive_heat: float = 8960.0 * 386.0
+    """Heat capacity of the volume, J/(m³ K). Copper's with its density of 8960 kg/m³; the table has zinc's."""
 
     @property
     def perimeter(self) -> float:
@@ -78,11 +67,6 @@ class Bimorph(Numbers):
 def piezo_sensitivity(bimorph: Bimorph) -> float:
     """Compute the tip deflection per volt (Rakotondrabe and Ivan, eq. 10, after Smits and Choi 1992).
 
-    Parameters
-    ----------
-    bimorph : Bimorph
-        The strip.
-
     Returns
     -------
     float
@@ -96,11 +80,6 @@ def thermal_sensitivity(bimorph: Bimorph) -> float:
 
     Rakotondrabe and Ivan, eq. 10, with the thickness of the piezo layer that the printed coefficient lacks:
     an electric field is a voltage over that thickness, an expansion is not.
-
-    Parameters
-    ----------
-    bimorph : Bimorph
-        The strip.
 
     Returns
     -------
@@ -128,119 +107,84 @@ class HybridParameters(CooledParameters):
     The strip, the block, the convection coefficient and the poles and zeros of the piezo dynamics come from
     the paper. All others are assumed. The capacities of the cooler's faces are what makes the paper's 4 mHz:
     the block, the strip and a cooler without mass would have ten times that.
-
-    Attributes
-    ----------
-    bimorph : Bimorph
-        The strip.
-    convection : float
-        Heat transfer coefficient to air at 10 K, W/(m² K) (paper: 30).
-    convection_share : float
-        Share of it that grows with the fourth root of the rise above the room, in [0, 1].
-    seebeck : float
-        Seebeck coefficient of the cooler, V/K (the paper's table: 12e-3).
-    conductance : float
-        Thermal conductance of the cooler, W/K (the paper's table: 12e-3).
-    resistance : float
-        Electrical resistance of the cooler, ohm.
-    face_capacity, back_capacity : float
-        Heat capacities of the cooler's actuator face with clamp and thermistor, and of its back face, J/K.
-    contact_resistance : float
-        Thermal resistance from the actuator face to the first element of the beam, K/W.
-    base_loss : float
-        Conductance from the actuator face to air, W/K.
-    maximum_current : float
-        Rating of the cooler, A; larger commands are refused. The beam is coldest at about -0.43 A; beyond,
-        more current cools less.
-    block_capacity : float
-        Heat capacity of either half of the block, J/K (38 by 20 by 25 mm of aluminium).
-    block_resistance : float
-        Thermal resistance along the block, K/W.
-    block_side_resistance : float
-        Thermal resistance from the sides of either half to air, K/W.
-    block_front_resistance : float
-        Thermal resistance from the front beside the cooler to air, K/W.
-    glue_resistance : float
-        Thermal resistance of the glue between cooler and block, K/W: 0.1 mm of 1 W/(m K) on 8 by 5 mm.
-    step : float
-        Step of the thermal time grid, s.
-    loop_frequency, loop_damping : float
-        Natural frequency (rad/s) and damping ratio of the closed temperature loop.
-    ambient_temperature : float
-        Mean temperature of the room, °C.
-    ambient_sd, ambient_time : float
-        Standard deviation (K) and correlation time (s) of the room temperature.
-    straight_temperature : float
-        Temperature at which the strip has no thermal deflection, °C.
-    bending_quadratic, bending_cubic : float
-        How the local curvature departs from proportionality to the rise d above the straight temperature:
-        it goes as ``d + bending_quadratic d² + bending_cubic d³`` (1/K and 1/K²).
-    piezo_gain, piezo_quadratic : float
-        Deflection per voltage (m/V) and its part with the square of the voltage (m/V²).
-    hysteresis_share : float
-        Share of the gain that the hysteretic part takes back after a reversal.
-    hysteresis_rate, hysteresis_skew : float
-        Rates at which it saturates, 1/V; the second adds while it grows and takes off while it shrinks and
-        must be the smaller.
-    creep_share : float
-        Contribution of each of the creep's lags, as a share of the deflection.
-    creep_times : tuple of float
-        Time constants of the three lags, s.
-    piezo_warming : float
-        Relative growth of the piezo deflection with the beam's rise above the straight temperature, 1/K.
-    maximum_voltage : float
-        Largest voltage on the piezo, V, of either sign; larger commands are refused. The paper's range is ±40 V.
-    real_pole : float
-        Real pole of the piezo dynamics D(s), 1/s (paper, eq. 21).
-    resonance_decay, resonance_square : float
-        Coefficients of the resonance ``s² + resonance_decay s + resonance_square``, 1/s and 1/s² (paper, eq. 21).
-    numerator_linear, numerator_constant : float
-        Coefficients of the numerator, in the same form. The gain is normalised: D(s)/D(0) acts.
-    resonance_offset : float
-        Relative shift of the resonance frequency at constant damping ratio, within ±0.5; ±0.03 is a sensible
-        test of a notch.
     """
 
     bimorph: Bimorph = field(default_factory=Bimorph)
+    """The strip."""
     convection: float = 30.0
+    """Heat transfer coefficient to air at 10 K, W/(m² K) (paper: 30)."""
     convection_share: Signed = 0.25
+    """Share of it that grows with the fourth root of the rise above the room, in [0, 1]."""
     seebeck: float = 11.6e-3
+    """Seebeck coefficient of the cooler, V/K (the paper's table: 12e-3)."""
     conductance: float = 12.5e-3
+    """Thermal conductance of the cooler, W/K (the paper's table: 12e-3)."""
     resistance: float = 5.2
+    """Electrical resistance of the cooler, ohm."""
     face_capacity: float = 0.55
     back_capacity: float = 0.09
+    """Heat capacities of the cooler's actuator face with clamp and thermistor, and of its back face, J/K."""
     contact_resistance: float = 6.0
+    """Thermal resistance from the actuator face to the first element of the beam, K/W."""
     base_loss: NotNegative = 2e-3
+    """Conductance from the actuator face to air, W/K."""
     maximum_current: float = 0.4
+    """Rating of the cooler, A; larger commands are refused. The beam is coldest at about -0.43 A; beyond, more
+    current cools less."""
     block_capacity: float = 23.14
+    """Heat capacity of either half of the block, J/K (38 by 20 by 25 mm of aluminium)."""
     block_resistance: float = 0.148
+    """Thermal resistance along the block, K/W."""
     block_side_resistance: float = 23.0
+    """Thermal resistance from the sides of either half to air, K/W."""
     block_front_resistance: float = 46.3
+    """Thermal resistance from the front beside the cooler to air, K/W."""
     glue_resistance: float = 2.5
+    """Thermal resistance of the glue between cooler and block, K/W: 0.1 mm of 1 W/(m K) on 8 by 5 mm."""
     step: float = 0.01
+    """Step of the thermal time grid, s."""
     loop_frequency: float = 0.3
     loop_damping: float = 1.0
+    """Natural frequency (rad/s) and damping ratio of the closed temperature loop."""
     ambient_temperature: Signed = 22.0
+    """Mean temperature of the room, °C."""
     ambient_sd: NotNegative = 0.15
     ambient_time: float = 400.0
+    """Standard deviation (K) and correlation time (s) of the room temperature."""
     straight_temperature: Signed = 22.0
+    """Temperature at which the strip has no thermal deflection, °C."""
     bending_quadratic: Signed = 0.006
     bending_cubic: Signed = -1e-4
+    """How the local curvature departs from proportionality to the rise d above the straight temperature: it goes as
+    ``d + bending_quadratic d² + bending_cubic d³`` (1/K and 1/K²)."""
     piezo_gain: float = 0.283e-6
     piezo_quadratic: Signed = 2.5e-10
+    """Deflection per voltage (m/V) and its part with the square of the voltage (m/V²)."""
     hysteresis_share: NotNegative = 0.30
+    """Share of the gain that the hysteretic part takes back after a reversal."""
     hysteresis_rate: float = 0.040
     hysteresis_skew: NotNegative = 0.006
+    """Rates at which it saturates, 1/V; the second adds while it grows and takes off while it shrinks and must be the
+    smaller."""
     creep_share: NotNegative = 0.012
+    """Contribution of each of the creep's lags, as a share of the deflection."""
     creep_times: tuple[float, float, float] = (1.0, 10.0, 100.0)
+    """Time constants of the three lags, s."""
     piezo_warming: Signed = 0.003
+    """Relative growth of the piezo deflection with the beam's rise above the straight temperature, 1/K."""
     maximum_voltage: float = 60.0
+    """Largest voltage on the piezo, V, of either sign; larger commands are refused. The paper's range is ±40 V."""
     real_pole: float = 1274.0
+    """Real pole of the piezo dynamics D(s), 1/s (paper, eq. 21)."""
     resonance_decay: float = 34.1
     resonance_square: float = 1.9e7
+    """Coefficients of the resonance ``s² + resonance_decay s + resonance_square``, 1/s and 1/s² (paper, eq. 21)."""
     numerator_linear: float = 2.58e4
     numerator_constant: float = 2.4e8
+    """Coefficients of the numerator, in the same form. The gain is normalised: D(s)/D(0) acts."""
     resonance_offset: Signed = 0.0
+    """Relative shift of the resonance frequency at constant damping ratio, within ±0.5; ±0.03 is a sensible test of a
+    notch."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -261,11 +205,6 @@ class HybridParameters(CooledParameters):
 
 def piezo_dynamics(parameters: HybridParameters) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Split D(s)/D(0) together with the creep into modes.
-
-    Parameters
-    ----------
-    parameters : HybridParameters
-        The numbers.
 
     Returns
     -------

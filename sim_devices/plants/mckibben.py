@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.plants.friction_muscle import FrictionMuscle, MuscleParameters, Record, coefficients
-from sim_devices.plants.grid import NotNegative
+from sim_devices.plants.friction_muscle import FrictionMuscle, FrictionParameters, coefficients
+from sim_devices.plants.grid import NotNegative, Record
 from sim_devices.plants.muscle import MILLIMETRE
 
 _BAR = 1e5
@@ -31,45 +31,8 @@ _BAR_NEWTON = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class McKibbenParameters(MuscleParameters):
-    """Every number of the plant; those shared with the coiled muscle are described in `MuscleParameters`.
-
-    Attributes
-    ----------
-    thread_length : float
-        Length of a braid thread, m; with `turns` and `rest_length` it makes a rest angle of 33° and a braid
-        diameter of 6.5 mm at rest, 9.7 mm at the angle of 54.7° where the muscle pulls no longer.
-    turns : float
-        Turns of a thread around the muscle.
-    bladder_stiffness : float
-        Stiffness of the bladder and the braid about the resting length, N/m.
-    bladder_cube : float
-        Cubic stiffening of the bladder, N/m³.
-    jam : float
-        Force with which the braid jams on the bladder, per square of the elongation, N/m².
-    friction : float
-        Yield force of all contacts of the empty muscle, N.
-    friction_coefficient : float
-        Yield force of all contacts per pressure and contact surface, the latter being that of the resting braid.
-        The surface changes by less than a tenth over the stroke, which is left out.
-    friction_jam : float
-        Yield force of all contacts per jamming force, in [0, 1).
-    slip : float
-        How far an average contact slips at constant length as the bladder presses the braid outward, m/Pa.
-    pressure_gain : float
-        Pressure per voltage, Pa/V.
-    pressure_band : float
-        Half-width of the regulator's hysteresis, Pa: a quarter of a percent of a span of 5 bar.
-    time_constant : float
-        Time constant of the pressure, s.
-    exhaust_time_constant : float
-        Time constant of a falling pressure with the quick exhaust open, s.
-    pressure_step : float
-        Largest sub-step of the pressure, Pa.
-    supply_sd, supply_time : float
-        Standard deviation (Pa) and correlation time (s) of the pressure that the regulator gives. Zero, the
-        default, switches it off; 500 Pa is sensible for dynamic tests.
-    """
+class McKibbenParameters(FrictionParameters):
+    """Every number of the plant; those shared with other muscles are described in its base classes."""
 
     contact_stiffness: float = 1.2e3
     contact_spread: float = 0.8
@@ -78,21 +41,39 @@ class McKibbenParameters(MuscleParameters):
     length_step: float = 0.25e-3
     resistance: float = 10e3
     thread_length: float = 131e-3
+    """Length of a braid thread, m; with `turns` and `rest_length` it makes a rest angle of 33° and a braid diameter
+    of 6.5 mm at rest, 9.7 mm at the angle of 54.7° where the muscle pulls no longer."""
     turns: float = 3.5
+    """Turns of a thread around the muscle."""
     bladder_stiffness: float = 300.0
+    """Stiffness of the bladder and the braid about the resting length, N/m."""
     bladder_cube: NotNegative = 0.12e6
+    """Cubic stiffening of the bladder, N/m³."""
     jam: NotNegative = 0.22e6
+    """Force with which the braid jams on the bladder, per square of the elongation, N/m²."""
     friction: NotNegative = 0.2
+    """Yield force of all contacts of the empty muscle, N."""
     friction_coefficient: NotNegative = 0.0025
+    """Yield force of all contacts per pressure and contact surface, the latter being that of the resting braid. The
+    surface changes by less than a tenth over the stroke, which is left out."""
     friction_jam: NotNegative = 0.08
+    """Yield force of all contacts per jamming force, in [0, 1)."""
     slip: NotNegative = 1.5e-8
+    """How far an average contact slips at constant length as the bladder presses the braid outward, m/Pa."""
     pressure_gain: float = 0.5e5
+    """Pressure per voltage, Pa/V."""
     pressure_band: NotNegative = 1.25e3
+    """Half-width of the regulator's hysteresis, Pa: a quarter of a percent of a span of 5 bar."""
     time_constant: float = 0.3
+    """Time constant of the pressure, s."""
     exhaust_time_constant: float = 0.1
+    """Time constant of a falling pressure with the quick exhaust open, s."""
     pressure_step: float = 2e3
+    """Largest sub-step of the pressure, Pa."""
     supply_sd: NotNegative = 0.0
     supply_time: float = 10.0
+    """Standard deviation (Pa) and correlation time (s) of the pressure that the regulator gives. Zero, the default,
+    switches it off; 500 Pa is sensible for dynamic tests."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -137,13 +118,9 @@ class McKibbenMuscle(FrictionMuscle[McKibbenParameters]):
 
     Parameters
     ----------
-    parameters : McKibbenParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the regulator's supply. The plant spawns its own generator from it.
+        The session's randomness: the regulator's supply; see `GridPlant`.
     """
-
-    OUTPUTS = ("pressure", "voltage", "current", "force", "length", "position")
 
     def __init__(self, parameters: McKibbenParameters, rng: np.random.Generator) -> None:
         rated = parameters.pressure_gain * parameters.rated_voltage / _BAR

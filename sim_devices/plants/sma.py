@@ -18,11 +18,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_devices.plants import _sma_kernels as kernels
-from sim_devices.plants.grid import NotNegative, PlantParameters, Seed, Signed, check_temperature, fluctuation
-from sim_devices.plants.muscle import MILLIMETRE, Muscle
+from sim_devices.plants.grid import Floats, NotNegative, Record, Signed, fluctuation, record
+from sim_devices.plants.muscle import MILLIMETRE, HeatedParameters, Muscle
 
 _MEGAPASCAL = 1e6
 
@@ -35,118 +34,60 @@ _RETWIN_GAP = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class SMAParameters(PlantParameters):
+class SMAParameters(HeatedParameters):
     """Every number of the plant.
 
-    The values that come from the paper are the wire's length and diameter, the rated voltage, the time
-    constant and the ranges that the rest was tuned to. All others are assumed.
-
-    Attributes
-    ----------
-    grain_count : int
-        Number of grains; at least 1.
-    specimen_seed : int
-        Seed of the grains. The specimen does not depend on the session's seed.
-    austenite_finish, austenite_finish_spread : float
-        Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes
-        austenite.
-    width, width_spread : float
-        Mean and standard deviation of a grain's transformation hysteresis, K; at least 3 K each.
-    slope, slope_spread : float
-        Mean and standard deviation of the Clausius-Clapeyron slope, MPa/K.
-    unoriented_share : float
-        Share of the stress that stabilises an unoriented grain against austenite, in (0, 1].
-    detwin, detwin_spread : float
-        Mean and standard deviation of the stress that orients martensite, MPa; at least 5 MPa each.
-    orient, orient_spread : float
-        Mean and standard deviation of the stress above which a grain that cools to martensite comes out
-        oriented, MPa. Negative is a trained grain.
-    orient_correlation : float
-        Correlation of orientation and detwinning stress, in [-1, 1].
-    retwin, retwin_spread : float
-        Mean and standard deviation of the stress below which martensite loses its orientation, MPa; at
-        least 10 MPa below the detwinning stress.
-    martensite_modulus, austenite_modulus : float
-        Elastic moduli, Pa.
-    transformation_strain : float
-        Strain of a completely oriented wire.
-    expansion : float
-        Coefficient of thermal expansion, 1/K.
-    rest_length : float
-        Length of the unloaded cold wire, m (paper: 105 mm).
-    diameter : float
-        Diameter of the wire, m (paper: 0.20 mm).
-    series_stiffness : float
-        Stiffness of frame and load cell in series with the wire, N/m.
-    stress_limit : float
-        Largest stress that is solved for, Pa; 600 MPa are 18.85 N. A load beyond it is refused, and
-        the force of a wire that is stretched further stays there.
-    pretension : float
-        Load under which the wire is cooled when it is conditioned, N (paper: 0.3 N).
-    step : float
-        Step of the internal time grid, s.
-    temperature_step, stress_step, length_step : float
-        Largest sub-steps of a path: K, Pa and m.
-    ambient_temperature : float
-        Mean temperature of the room, °C.
-    time_constant : float
-        Thermal time constant in still air, s (paper: about 5 s).
-    fan_time_constant : float
-        Thermal time constant with the fan on, s (assumed). The fan raises the heat loss, so that the
-        steady temperature rise falls in the same ratio.
-    rise, rated_voltage : float
-        Steady temperature rise (K) in still air at the rated voltage (V). It goes as the voltage squared.
-    maximum_voltage : float
-        Highest effective voltage, V; 5 V would be 261 °C. Higher commands are refused.
-    resistance : float
-        Electrical resistance of the wire, ohm, taken as constant as in the paper; 0.20 mm by 105 mm of
-        NiTi have about 3 ohm.
-    ambient_sd, ambient_time : float
-        Standard deviation (K) and correlation time (s) of the room temperature. Zero, the default,
-        switches it off; 0.3 K is sensible for dynamic tests.
-    ambient_gain : float
-        Relative change of the heating gain with the deviation of the room temperature, 1/K.
+    The values that come from the paper are the wire's length (105 mm) and diameter, the rated voltage, the time
+    constant in still air (about 5 s), the pretension and the ranges that the rest was tuned to. All others are
+    assumed: the fan's time constant, 0.20 mm by 105 mm of NiTi with about 3 ohm, and 261 °C at 5 V.
     """
 
-    grain_count: int = 2000
-    specimen_seed: Seed = 2017
-    austenite_finish: float = 48.0
-    austenite_finish_spread: NotNegative = 15.0
-    width: float = 11.0
-    width_spread: NotNegative = 3.0
-    slope: float = 7.0
-    slope_spread: NotNegative = 0.8
-    unoriented_share: float = 0.4
-    detwin: Signed = 110.0
-    detwin_spread: NotNegative = 60.0
-    orient: Signed = -5.0
-    orient_spread: NotNegative = 60.0
-    orient_correlation: Signed = 0.6
-    retwin: Signed = -40.0
-    retwin_spread: NotNegative = 35.0
-    martensite_modulus: float = 28e9
-    austenite_modulus: float = 55e9
-    transformation_strain: NotNegative = 0.045
-    expansion: NotNegative = 6.6e-6
     rest_length: float = 105e-3
-    diameter: float = 0.20e-3
-    series_stiffness: float = 20e3
-    stress_limit: float = 600e6
-    pretension: NotNegative = 0.3
-    step: float = 0.1
-    temperature_step: float = 1.0
-    stress_step: float = 4e6
     length_step: float = 0.03e-3
-    ambient_temperature: Signed = 25.0
     time_constant: float = 5.0
     fan_time_constant: float = 2.0
     rise: float = 85.0
-    rated_voltage: float = 3.0
-    maximum_voltage: float = 5.0
     resistance: float = 3.05
-    ambient_sd: NotNegative = 0.0
-    ambient_time: float = 120.0
-    ambient_gain: Signed = 0.004
+    grain_count: int = 2000
+    """Number of grains; at least 1."""
+    austenite_finish: float = 48.0
+    austenite_finish_spread: NotNegative = 15.0
+    """Mean (°C) and standard deviation (K) of the temperature at which an unstressed grain becomes austenite."""
+    width: float = 11.0
+    width_spread: NotNegative = 3.0
+    """Mean and standard deviation of a grain's transformation hysteresis, K; at least 3 K each."""
+    slope: float = 7.0
+    slope_spread: NotNegative = 0.8
+    """Mean and standard deviation of the Clausius-Clapeyron slope, MPa/K."""
+    unoriented_share: float = 0.4
+    """Share of the stress that stabilises an unoriented grain against austenite, in (0, 1]."""
+    detwin: Signed = 110.0
+    detwin_spread: NotNegative = 60.0
+    """Mean and standard deviation of the stress that orients martensite, MPa; at least 5 MPa each."""
+    orient: Signed = -5.0
+    orient_spread: NotNegative = 60.0
+    """Mean and standard deviation of the stress above which a grain that cools to martensite comes out oriented, MPa.
+    Negative is a trained grain."""
+    orient_correlation: Signed = 0.6
+    """Correlation of orientation and detwinning stress, in [-1, 1]."""
+    retwin: Signed = -40.0
+    retwin_spread: NotNegative = 35.0
+    """Mean and standard deviation of the stress below which martensite loses its orientation, MPa; at least 10 MPa
+    below the detwinning stress."""
+    martensite_modulus: float = 28e9
+    austenite_modulus: float = 55e9
+    """Elastic moduli, Pa."""
+    transformation_strain: NotNegative = 0.045
+    """Strain of a completely oriented wire."""
+    expansion: NotNegative = 6.6e-6
+    """Coefficient of thermal expansion, 1/K."""
+    diameter: float = 0.20e-3
+    """Diameter of the wire, m (paper: 0.20 mm)."""
+    stress_limit: float = 600e6
+    """Largest stress that is solved for, Pa; 600 MPa are 18.85 N. A load beyond it is refused, and the force of a
+    wire that is stretched further stays there."""
+    stress_step: float = 4e6
+    """Largest sub-step of the stress, Pa."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,9 +101,6 @@ class SMAParameters(PlantParameters):
                 f"martensite_modulus must not exceed austenite_modulus, not {self.martensite_modulus} "
                 f"> {self.austenite_modulus} Pa"
             )
-        if not self.pretension <= self.largest_load:
-            raise ValueError(f"pretension must not exceed {self.largest_load:.4g} N, not {self.pretension} N")
-        check_temperature("ambient_temperature", self.ambient_temperature)
 
     @property
     def area(self) -> float:
@@ -174,14 +112,14 @@ class SMAParameters(PlantParameters):
         """Force at the stress limit, N."""
         return self.stress_limit * self.area
 
+    @property
+    def reach(self) -> float:
+        """Farthest that the end may be held from its resting position, to either side, m."""
+        return self.rest_length
 
-def grain_table(parameters: SMAParameters) -> NDArray[np.float64]:
+
+def grain_table(parameters: SMAParameters) -> Floats:
     """Make the specimen: the properties of its grains.
-
-    Parameters
-    ----------
-    parameters : SMAParameters
-        Parameters of the population.
 
     Returns
     -------
@@ -225,34 +163,12 @@ class SMAWire(Muscle[SMAParameters]):
 
     Parameters
     ----------
-    parameters : SMAParameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: the temperature of the room. The plant spawns its own generator from
-        it and never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: the temperature of the room; see `GridPlant`.
     """
 
-    OUTPUTS = (
-        "temperature",
-        "ambient_temperature",
-        "voltage",
-        "current",
-        "force",
-        "length",
-        "position",
-        "martensite_fraction",
-        "oriented_fraction",
-    )
-
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
-        super().__init__(
-            parameters,
-            rng,
-            maximum_voltage=parameters.maximum_voltage,
-            resistance=parameters.resistance,
-            largest_load=parameters.largest_load,
-            reach=parameters.rest_length,
-        )
+        super().__init__(parameters, rng)
         self._coefficients = _coefficients(parameters)
         self._state = np.zeros(kernels.STATE_SIZE)
         self._parts = kernels.Parts(
@@ -269,7 +185,7 @@ class SMAWire(Muscle[SMAParameters]):
         self._state[kernels.AMBIENT_OFFSET] = offset
         self._heat(parameters.ambient_temperature + offset, clamped=False)
 
-    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+    def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._command, self._parts)
 
     @property
@@ -285,7 +201,7 @@ class SMAWire(Muscle[SMAParameters]):
     @property
     def force(self) -> float:
         """Tension of the wire, N; 0 to about 11.3 N at constant length between 0 and 3 V."""
-        return float(self._state[kernels.STRESS] * self._coefficients[kernels.AREA])
+        return float(self._state[kernels.STRESS] * self._coefficients["area"])
 
     @property
     def length(self) -> float:
@@ -332,42 +248,41 @@ class SMAWire(Muscle[SMAParameters]):
             self._heat(cold, clamped=True)
         self._load(0.0)
         # Lengths so far count from the strain-free state: the cold length is the resting strain.
-        self._coefficients[kernels.REST_STRAIN] = self.length / p.rest_length
+        self._coefficients["rest_strain"] = self.length / p.rest_length
         self._load(0.0)
 
     def _load(self, newton: float) -> None:
-        kernels.load_to(newton / self._coefficients[kernels.AREA], self._parts)
+        kernels.load_to(newton / self._coefficients["area"], self._parts)
 
     def _heat(self, celsius: float, clamped: bool) -> None:
         kernels.heat_to(celsius, clamped, self._parts)
 
 
-def _coefficients(parameters: SMAParameters) -> NDArray[np.float64]:
+def _coefficients(parameters: SMAParameters) -> Record:
     """Prepare the numbers that the compiled loop needs every step."""
     p = parameters
     ambient_decay, ambient_kick = fluctuation(p.ambient_sd, p.ambient_time, p.step)
-    values = {
-        kernels.AMBIENT: p.ambient_temperature,
-        kernels.HEATING: p.rise / p.rated_voltage**2,
-        kernels.STILL_DECAY: math.exp(-p.step / p.time_constant),
-        kernels.FAN_DECAY: math.exp(-p.step / p.fan_time_constant),
-        kernels.FAN_SHARE: p.fan_time_constant / p.time_constant,
-        kernels.AMBIENT_DECAY: ambient_decay,
-        kernels.AMBIENT_KICK: ambient_kick,
-        kernels.AMBIENT_GAIN: p.ambient_gain,
-        kernels.AREA: p.area / MILLIMETRE**2,
-        kernels.REST_LENGTH: p.rest_length / MILLIMETRE,
-        kernels.SERIES_COMPLIANCE: 1.0 / (p.series_stiffness * MILLIMETRE),
-        kernels.MARTENSITE_MODULUS: p.martensite_modulus / _MEGAPASCAL,
-        kernels.AUSTENITE_MODULUS: p.austenite_modulus / _MEGAPASCAL,
-        kernels.EXPANSION: p.expansion,
-        kernels.EXPANSION_REFERENCE: p.ambient_temperature,
-        kernels.TRANSFORMATION_STRAIN: p.transformation_strain,
-        kernels.UNORIENTED_SHARE: p.unoriented_share,
-        kernels.REST_STRAIN: 0.0,
-        kernels.STRESS_LIMIT: p.stress_limit / _MEGAPASCAL,
-        kernels.TEMPERATURE_STEP: p.temperature_step,
-        kernels.STRESS_STEP: p.stress_step / _MEGAPASCAL,
-        kernels.LENGTH_STEP: p.length_step / MILLIMETRE,
-    }
-    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])
+    return record(
+        ambient=p.ambient_temperature,
+        heating=p.rise / p.rated_voltage**2,
+        still_decay=math.exp(-p.step / p.time_constant),
+        fan_decay=math.exp(-p.step / p.fan_time_constant),
+        fan_share=p.fan_time_constant / p.time_constant,
+        ambient_decay=ambient_decay,
+        ambient_kick=ambient_kick,
+        ambient_gain=p.ambient_gain,
+        area=p.area / MILLIMETRE**2,
+        rest_length=p.rest_length / MILLIMETRE,
+        series_compliance=1.0 / (p.series_stiffness * MILLIMETRE),
+        martensite_modulus=p.martensite_modulus / _MEGAPASCAL,
+        austenite_modulus=p.austenite_modulus / _MEGAPASCAL,
+        expansion=p.expansion,
+        expansion_reference=p.ambient_temperature,
+        transformation_strain=p.transformation_strain,
+        unoriented_share=p.unoriented_share,
+        rest_strain=0.0,
+        stress_limit=p.stress_limit / _MEGAPASCAL,
+        temperature_step=p.temperature_step,
+        stress_step=p.stress_step / _MEGAPASCAL,
+        length_step=p.length_step / MILLIMETRE,
+    )

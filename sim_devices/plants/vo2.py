@@ -18,12 +18,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
 from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
-from sim_devices.plants.grid import NotNegative, Seed, Signed, check_temperature, fluctuation
+from sim_devices.plants.grid import Floats, NotNegative, Record, Seed, Signed, check_temperature, fluctuation, record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,125 +32,87 @@ class VO2Parameters(CooledParameters):
     The values that come from the paper are the beam length and the operating range that the rest was
     tuned to: curvature change about [-104, 1846] 1/m between 21 and 84 °C, transition within 30 to
     70 °C, temperature held to ±0.1 K. All others are assumed.
-
-    Attributes
-    ----------
-    relay_count : int
-        Number of hysteresis relays; at least 1.
-    specimen_seed : int
-        Seed of the relay thresholds. The specimen does not depend on the session's seed.
-    correlation : float
-        Correlation of threshold and width in normal scores, in (-1, 1).
-    minor_share : float
-        Share of relays in population B (the wide loops), in [0, 1].
-    major_centre, minor_centre : float
-        Mean up-threshold of populations A and B, °C.
-    major_spread, minor_spread : float
-        Standard deviation of the up-threshold of populations A and B, K.
-    major_width, minor_width : float
-        Mean of the lognormal loop width of populations A and B, K.
-    major_width_spread, minor_width_spread : float
-        Standard deviation of the loop width of populations A and B, K.
-    highest_threshold, lowest_threshold : float
-        Thresholds beyond these are reflected back, °C, so that none sits on the limits of the
-        transition range.
-    coupling : float
-        Mean-field (stress) coupling lambda of R fraction and drive, K.
-    relay_step : float
-        Largest sub-step of the effective temperature, K.
-    curvature_offset : float
-        Curvature at the expansion reference without transition, 1/m.
-    transition_curvature : float
-        Curvature of the complete transition, 1/m.
-    cold_expansion, hot_expansion : float
-        Bending by thermal expansion mismatch in the M1 and in the R phase, 1/(m K).
-    expansion_reference : float
-        Temperature of no expansion bending, °C.
-    beam_length : float
-        Length of the cantilever, m (paper: 300 µm).
-    residual_curvature : float
-        Curvature of the beam before any change, 1/m.
-    step : float
-        Step of the internal time grid, s.
-    loop_frequency : float
-        Natural frequency of the closed temperature loop, rad/s.
-    loop_damping : float
-        Damping ratio of the closed temperature loop, in (0, 1).
-    slew_limit : float
-        Largest rate of the regulated plate, K/s.
-    ambient_temperature : float
-        Temperature of the room, °C.
-    seebeck : float
-        Seebeck coefficient of the Peltier module, V/K (a 127-couple module).
-    resistance : float
-        Electrical resistance of the module, ohm.
-    conductance : float
-        Thermal conductance of the module between plate and heat sink, W/K.
-    plate_loss : float
-        Conductance from plate to room, W/K.
-    plate_capacity : float
-        Heat capacity of the plate with cantilever chip, glass and sensor, J/K.
-    sink_capacity : float
-        Heat capacity of the heat sink, J/K.
-    sink_resistance : float
-        Thermal resistance from heat sink to room, K/W.
-    current_lag : float
-        Time constant with which the amplifier's current follows a change of command, s.
-    maximum_current : float
-        Rating of the module, A; larger commands are refused. Must stay below the thermal runaway
-        ``conductance / seebeck``.
-    wander_sd, wander_time : float
-        Standard deviation (K) and correlation time (s) of the fast temperature wander, which stands
-        for the ±0.1 K of the controller.
-    drift_sd, drift_time : float
-        Standard deviation (K) and correlation time (s) of the drift of laser heating.
-    session_offset : float
-        Constant difference of the film temperature in this session, K. Zero while a model is
-        identified; ±0.2 K for a later validation and ±0.12 K for tracking are sensible.
     """
 
     relay_count: int = 16384
+    """Number of hysteresis relays; at least 1."""
     specimen_seed: Seed = 2013
+    """Seed of the relay thresholds. The specimen does not depend on the session's seed."""
     correlation: Signed = -0.3
+    """Correlation of threshold and width in normal scores, in (-1, 1)."""
     minor_share: Signed = 0.05
+    """Share of relays in population B (the wide loops), in [0, 1]."""
     major_centre: Signed = 63.5
-    major_spread: NotNegative = 3.0
-    major_width: float = 4.0
-    major_width_spread: NotNegative = 2.0
     minor_centre: Signed = 62.0
+    """Mean up-threshold of populations A and B, °C."""
+    major_spread: NotNegative = 3.0
     minor_spread: NotNegative = 3.0
+    """Standard deviation of the up-threshold of populations A and B, K."""
+    major_width: float = 4.0
     minor_width: float = 14.0
+    """Mean of the lognormal loop width of populations A and B, K."""
+    major_width_spread: NotNegative = 2.0
     minor_width_spread: NotNegative = 6.0
+    """Standard deviation of the loop width of populations A and B, K."""
     highest_threshold: Signed = 69.8
     lowest_threshold: Signed = 30.2
+    """Thresholds beyond these are reflected back, °C, so that none sits on the limits of the transition range."""
     coupling: NotNegative = 1.0
+    """Mean-field (stress) coupling lambda of R fraction and drive, K."""
     relay_step: float = 0.05
+    """Largest sub-step of the effective temperature, K."""
     curvature_offset: Signed = 8.0
+    """Curvature at the expansion reference without transition, 1/m."""
     transition_curvature: Signed = 2034.0
+    """Curvature of the complete transition, 1/m."""
     cold_expansion: Signed = 3.05
     hot_expansion: Signed = 4.25
+    """Bending by thermal expansion mismatch in the M1 and in the R phase, 1/(m K)."""
     expansion_reference: Signed = 20.0
+    """Temperature of no expansion bending, °C."""
     beam_length: float = 300e-6
+    """Length of the cantilever, m (paper: 300 µm)."""
     residual_curvature: Signed = 0.0
+    """Curvature of the beam before any change, 1/m."""
     step: float = 0.05
+    """Step of the internal time grid, s."""
     loop_frequency: float = 2.2
+    """Natural frequency of the closed temperature loop, rad/s."""
     loop_damping: Signed = 0.9
+    """Damping ratio of the closed temperature loop, in (0, 1)."""
     slew_limit: float = 15.0
+    """Largest rate of the regulated plate, K/s."""
     ambient_temperature: Signed = 22.0
+    """Temperature of the room, °C."""
     seebeck: float = 0.051
+    """Seebeck coefficient of the Peltier module, V/K (a 127-couple module)."""
     resistance: float = 3.1
+    """Electrical resistance of the module, ohm."""
     conductance: float = 0.35
+    """Thermal conductance of the module between plate and heat sink, W/K."""
     plate_loss: NotNegative = 0.01
+    """Conductance from plate to room, W/K."""
     plate_capacity: float = 2.2
+    """Heat capacity of the plate with cantilever chip, glass and sensor, J/K."""
     sink_capacity: float = 300.0
+    """Heat capacity of the heat sink, J/K."""
     sink_resistance: float = 0.4
+    """Thermal resistance from heat sink to room, K/W."""
     current_lag: float = 0.1
+    """Time constant with which the amplifier's current follows a change of command, s."""
     maximum_current: float = 5.0
+    """Rating of the module, A; larger commands are refused. Must stay below the thermal runaway ``conductance /
+    seebeck``."""
     wander_sd: NotNegative = 0.03
     wander_time: float = 5.0
+    """Standard deviation (K) and correlation time (s) of the fast temperature wander, which stands for the ±0.1 K of
+    the controller."""
     drift_sd: NotNegative = 0.04
     drift_time: float = 1800.0
+    """Standard deviation (K) and correlation time (s) of the drift of laser heating."""
     session_offset: Signed = 0.0
+    """Constant difference of the film temperature in this session, K. Zero while a model is identified; ±0.2 K for a
+    later validation and ±0.12 K for tracking are sensible."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -163,16 +124,11 @@ class VO2Parameters(CooledParameters):
             raise ValueError(f"minor_share must lie in [0, 1], not {self.minor_share}")
 
 
-def relay_thresholds(parameters: VO2Parameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def relay_thresholds(parameters: VO2Parameters) -> tuple[Floats, Floats]:
     """Make the specimen: the thresholds of its relays.
 
     The relays are a low-discrepancy sample of the two populations, shifted by the specimen's seed:
     a smooth density without the graininess of a random one.
-
-    Parameters
-    ----------
-    parameters : VO2Parameters
-        Parameters of the populations.
 
     Returns
     -------
@@ -225,11 +181,8 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
 
     Parameters
     ----------
-    parameters : VO2Parameters
-        The numbers.
     rng : numpy.random.Generator
-        The session's randomness: wander and drift. The plant spawns its own generator from it and
-        never draws from `rng` itself, so that other users of it do not disturb the trajectory.
+        The session's randomness: wander and drift; see `GridPlant`.
     initial_temperature : float, optional
         Temperature of the plate at the start, °C; the room's by default. The film arrives there from
         negative saturation (cold), the heat sink is at room temperature, the output is off.
@@ -239,18 +192,6 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
     ValueError
         If `initial_temperature` is not a temperature.
     """
-
-    OUTPUTS = (
-        "plate_temperature",
-        "film_temperature",
-        "sink_temperature",
-        "plate_rate",
-        "current",
-        "voltage",
-        "r_fraction",
-        "curvature",
-        "tip_deflection",
-    )
 
     def __init__(
         self,
@@ -281,7 +222,7 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
         kernels.settle_film(self.film_temperature, self._parts)
 
-    def _take_steps(self, normals: NDArray[np.float64]) -> None:
+    def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._command, self._parts)
 
     @property
@@ -364,7 +305,7 @@ def arc_deflection(curvature: float, length: float) -> float:
     return length * half * ratio * ratio
 
 
-def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
+def _coefficients(parameters: VO2Parameters) -> Record:
     """Prepare the numbers that the compiled loop needs every step."""
     p = parameters
     step = p.step
@@ -376,29 +317,28 @@ def _coefficients(parameters: VO2Parameters) -> NDArray[np.float64]:
     sine = shrink * math.sin(swing * step) / swing
     wander_decay, wander_kick = fluctuation(p.wander_sd, p.wander_time, step)
     drift_decay, drift_kick = fluctuation(p.drift_sd, p.drift_time, step)
-    values = {
-        kernels.STEP: step,
-        kernels.LOOP_EE: cosine + decay * sine,
-        kernels.LOOP_EV: -sine,
-        kernels.LOOP_VE: p.loop_frequency**2 * sine,
-        kernels.LOOP_VV: cosine - decay * sine,
-        kernels.SLEW: p.slew_limit,
-        kernels.SLEW_DECAY: math.exp(-2.0 * decay * step),
-        kernels.CURRENT_DECAY: math.exp(-step / p.current_lag),
-        kernels.SEEBECK: p.seebeck,
-        kernels.RESISTANCE: p.resistance,
-        kernels.CONDUCTANCE: p.conductance,
-        kernels.PLATE_LOSS: p.plate_loss,
-        kernels.PLATE_CAPACITY: p.plate_capacity,
-        kernels.SINK_CAPACITY: p.sink_capacity,
-        kernels.SINK_LOSS: 1.0 / p.sink_resistance,
-        kernels.AMBIENT: p.ambient_temperature,
-        kernels.WANDER_DECAY: wander_decay,
-        kernels.WANDER_KICK: wander_kick,
-        kernels.DRIFT_DECAY: drift_decay,
-        kernels.DRIFT_KICK: drift_kick,
-        kernels.OFFSET: p.session_offset,
-        kernels.COUPLING: p.coupling,
-        kernels.RELAY_STEP: p.relay_step,
-    }
-    return np.array([values[place] for place in range(kernels.COEFFICIENT_SIZE)])
+    return record(
+        step=step,
+        loop_ee=cosine + decay * sine,
+        loop_ev=-sine,
+        loop_ve=p.loop_frequency**2 * sine,
+        loop_vv=cosine - decay * sine,
+        slew=p.slew_limit,
+        slew_decay=math.exp(-2.0 * decay * step),
+        current_decay=math.exp(-step / p.current_lag),
+        seebeck=p.seebeck,
+        resistance=p.resistance,
+        conductance=p.conductance,
+        plate_loss=p.plate_loss,
+        plate_capacity=p.plate_capacity,
+        sink_capacity=p.sink_capacity,
+        sink_loss=1.0 / p.sink_resistance,
+        ambient=p.ambient_temperature,
+        wander_decay=wander_decay,
+        wander_kick=wander_kick,
+        drift_decay=drift_decay,
+        drift_kick=drift_kick,
+        offset=p.session_offset,
+        coupling=p.coupling,
+        relay_step=p.relay_step,
+    )

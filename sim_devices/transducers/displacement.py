@@ -10,31 +10,21 @@ import numpy as np
 
 @dataclass(eq=False)
 class DisplacementSensor:
-    """An optical displacement sensor with a voltage in proportion to the displacement.
-
-    Parameters
-    ----------
-    displacement : callable
-        The displacement in m, from the plant.
-    volts_per_metre : float
-        Sensitivity in V/m.
-    reach : float
-        Displacement of either sign in m beyond which the output stays where it is.
-    noise : float
-        White noise in m rms, drawn anew for every conversion; zero or positive.
-    resolution : float
-        Steps in which the sensor gives the displacement, in m.
-    rng : numpy.random.Generator
-        Source of the noise.
-    """
+    """An optical displacement sensor with a voltage in proportion to the displacement."""
 
     displacement: Callable[[], float]
+    """The displacement in m, from the plant."""
     volts_per_metre: float = 5e4
+    """Sensitivity in V/m."""
     reach: float = 200e-6
+    """Displacement of either sign in m beyond which the output stays where it is."""
     noise: float = 10e-9
+    """White noise in m rms, drawn anew for every conversion; zero or positive."""
     resolution: float = 10e-9
+    """Steps in which the sensor gives the displacement, in m."""
     _: KW_ONLY
     rng: np.random.Generator
+    """Source of the noise."""
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""

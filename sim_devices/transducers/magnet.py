@@ -14,36 +14,23 @@ class RatiometricSensor:
 
     Assumption: the output goes from 10 to 90 % of a supply of 5 V over the stroke, and stays at its end for a
     magnet that is beyond it.
-
-    Parameters
-    ----------
-    position : callable
-        The position of the magnet in m, counted from the start of the stroke, from the plant.
-    stroke : float
-        Stroke in m.
-    noise : float
-        White noise in m rms, drawn anew for every conversion; zero or positive.
-    resolution : float
-        Steps in which the sensor gives the position, in m.
-    supply_error : float
-        Deviation of the supply of one instance from 5 V, V rms; drawn once.
-    rng : numpy.random.Generator
-        Source of the noise and of the error of the supply.
-
-    Attributes
-    ----------
-    supply_volts : float
-        Voltage of the supply in V; for faults and drift.
     """
 
     position: Callable[[], float]
+    """The position of the magnet in m, counted from the start of the stroke, from the plant."""
     stroke: float = 0.035
+    """Stroke in m."""
     noise: float = 0.01e-3
+    """White noise in m rms, drawn anew for every conversion; zero or positive."""
     resolution: float = 0.04e-3
+    """Steps in which the sensor gives the position, in m."""
     supply_error: float = 20e-3
+    """Deviation of the supply of one instance from 5 V, V rms; drawn once."""
     _: KW_ONLY
     rng: np.random.Generator
+    """Source of the noise and of the error of the supply."""
     supply_volts: float = field(init=False)
+    """Voltage of the supply in V; for faults and drift."""
 
     def __post_init__(self) -> None:
         self.supply_volts = 5.0 + self.supply_error * self.rng.standard_normal()

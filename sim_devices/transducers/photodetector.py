@@ -13,29 +13,20 @@ import numpy as np
 class NormalisedPSD:
     """A position-sensitive detector whose amplifier gives one voltage in proportion to the deflection.
 
-    Parameters
-    ----------
-    deflection : callable
-        The deflection in m, from the plant.
-    volts_per_metre : float
-        Sensitivity in V/m.
-    noise_volts : float
-        White noise of the amplifier in V rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Notes
-    -----
     The amplifier saturates at ±10 V, noise included.
     """
 
     SATURATION: ClassVar[float] = 10.0
 
     deflection: Callable[[], float]
+    """The deflection in m, from the plant."""
     volts_per_metre: float = 1e5
+    """Sensitivity in V/m."""
     noise_volts: float = 5e-3
+    """White noise of the amplifier in V rms, drawn anew for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
+    """Source of the noise."""
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
@@ -49,41 +40,25 @@ class TwoCurrentPSD:
 
     The spot at x on a detector of length L gives x = (L/2)(I2 − I1)/(I1 + I2) (Hamamatsu, S3270 datasheet).
 
-    Parameters
-    ----------
-    deflection : callable
-        The deflection in m, from the plant.
-    metres_per_metre : float
-        Movement of the spot per deflection, by the optical lever.
-    psd_length : float
-        Length of the detector in m.
-    sum_volts : float
-        Sum of both voltages in V while the light is on.
-    noise_volts : float
-        White noise of either amplifier in V rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Attributes
-    ----------
-    light : float
-        Share of the light that reaches the detector, 0 to 1; for faults and drift.
-
-    Notes
-    -----
     A spot beyond the end of the detector gives no current at all. The amplifiers saturate at 0 and 10 V.
     """
 
     SATURATION: ClassVar[float] = 10.0
-
     deflection: Callable[[], float]
+    """The deflection in m, from the plant."""
     metres_per_metre: float = 185.0
+    """Movement of the spot per deflection, by the optical lever."""
     psd_length: float = 0.037
+    """Length of the detector in m."""
     sum_volts: float = 8.0
+    """Sum of both voltages in V while the light is on."""
     noise_volts: float = 5e-3
+    """White noise of either amplifier in V rms, drawn anew for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
+    """Source of the noise."""
     light: float = field(default=1.0, init=False)
+    """Share of the light that reaches the detector, 0 to 1; for faults and drift."""
 
     def first(self) -> float:
         """Return the voltage in V of current 1 at this instant."""

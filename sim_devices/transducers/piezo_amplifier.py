@@ -31,8 +31,6 @@ class PiezoAmplifier:
 
     Parameters
     ----------
-    world : World
-        The laboratory that the amplifier stands in.
     load : PiezoLoad
         The driven load, 0 V at first.
     gain : float

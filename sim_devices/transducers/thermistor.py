@@ -19,42 +19,26 @@ class Thermistor:
     """An NTC thermistor from the input of a divider to ground, with a reference resistor to the excitation.
 
     Assumptions: no self-heating, an exact reference resistor.
-
-    Parameters
-    ----------
-    temperature : callable
-        The temperature in °C, from the plant.
-    reference_ohms : float
-        Reference resistor in Ω.
-    steinhart_hart : tuple of float
-        A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive.
-    excitation_volts : float
-        Excitation in V.
-    excitation_error : float
-        Deviation of the excitation of one instance, V rms; drawn once.
-    noise : float
-        White noise in K rms, drawn anew for every conversion; zero or positive.
-    rng : numpy.random.Generator
-        Source of the noise and of the error of the excitation.
-
-    Attributes
-    ----------
-    excitation_volts : float
-        Voltage of the excitation in V; for faults and drift.
-    open, shorted : bool
-        Whether a wire of the thermistor is broken, or its wires are shorted; for faults.
     """
 
     temperature: Callable[[], float]
+    """The temperature in °C, from the plant."""
     reference_ohms: float = 10e3
+    """Reference resistor in Ω."""
     steinhart_hart: tuple[float, float, float] = STEINHART_HART
+    """A, B and C of 1/T = A + B ln R + C (ln R)³, T in K and R in Ω; B and C positive."""
     excitation_volts: float = 2.5
+    """Excitation in V; a fault or drift changes it."""
     excitation_error: float = 10e-3
+    """Deviation of the excitation of one instance, V rms; drawn once."""
     noise: float = 0.02
+    """White noise in K rms, drawn anew for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
+    """Source of the noise and of the error of the excitation."""
     open: bool = field(default=False, init=False)
     shorted: bool = field(default=False, init=False)
+    """Whether a wire of the thermistor is broken, or its wires are shorted; for faults."""
 
     def __post_init__(self) -> None:
         self.excitation_volts += self.excitation_error * self.rng.standard_normal()

@@ -6,11 +6,11 @@ the channel, `L` opens it for listening, `Sn` selects the bit rate; `t` and `T` 
 a 29-bit identifier, `r` and `R` remote frames. Closing a closed channel, opening an open one and empty lines are
 obeyed, as python-can sends all of these.
 
-The node serves SDO as CiA 301 has it: expedited download and upload, segmented upload of texts, aborts; network
+The node serves SDO as in CiA 301: expedited download and upload, segmented upload of texts, aborts; network
 management commands and its heartbeat. It takes the simplified command bytes of Roboteq CANBus Networking Manual
 V2.0, whose bits e and s are 0, as well, and answers them by the standard ones.
 
-Assumptions: a frame that is sent at another bit rate than the bus has is lost without a word; segmented and
+Assumptions: a frame that is sent at another bit rate than that of the bus is lost without an error; segmented and
 block downloads are refused; a remote frame is not answered.
 """
 
@@ -47,13 +47,7 @@ _SEGMENT = 7  # bytes in a segment
 
 
 class CanopenSlcanServer:
-    """The serial side of an slcan adapter with one emulated controller on its bus.
-
-    Parameters
-    ----------
-    device : EmulatedRoboteq
-        The device that acts on the requests.
-    """
+    """The serial side of an slcan adapter with one emulated controller on its bus."""
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
@@ -136,13 +130,7 @@ class CanopenSlcanServer:
 
 
 class SdoServer:
-    """The service data objects of one node (CiA 301).
-
-    Parameters
-    ----------
-    device : EmulatedRoboteq
-        Whose objects they are.
-    """
+    """The service data objects of one node (CiA 301)."""
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device

@@ -7,7 +7,7 @@ FF FF FD, so that FF FF FD 00 is always the beginning of a packet.
 
 Assumptions, where the e-Manual is silent:
 
-- A packet that the CRC does not vouch for is dropped in silence, as nothing in it can be trusted.
+- A packet with a wrong CRC is dropped without an answer, as nothing in it can be trusted.
 - In a sync or bulk read, a servo that is not there leaves a gap; those after it answer all the same. The one
   answer of a fast read ends before the first servo that is not there.
 - The e-Manual lists the fast reads for other series only; these servos know them, too. A servo that refuses

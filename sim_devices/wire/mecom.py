@@ -7,8 +7,8 @@ carries the CRC of its request, not its own.
 
 Assumptions, as the specification's text was not at hand:
 
-- A frame that the CRC or the header does not vouch for is dropped in silence, as nothing in it can be
-  trusted, the address included; the host times out and sends it again. A frame that is whole but whose
+- A frame with a wrong CRC or header is dropped without an answer, as nothing in it can be trusted, the
+  address included; the host times out and sends it again. A frame that is whole but whose
   payload makes no sense is answered with server error 04.
 - The same frame again, sequence number included, is a repetition: it is answered as before and not acted
   on again. Only the last request is remembered.
@@ -40,11 +40,6 @@ class MeComServer:
 
     Answers `?VR`, `VS`, `?VL`, `?VM`, `?IF`, `ES`, `RS` and `CS`; a change of speed is acknowledged and has
     no effect, as an emulated line has no speed of its own.
-
-    Parameters
-    ----------
-    device : EmulatedTEC
-        The device that acts on the requests.
     """
 
     def __init__(self, device: EmulatedTEC) -> None:

@@ -1,9 +1,9 @@
 """Modbus RTU on a serial line, for any emulated instrument that is a bank of registers.
 
 On a real line a pause of 3.5 characters ends a frame. A stream of bytes has no pauses, so frames are found by
-what is in them: the function code says how long a request is, the CRC whether it is one. Whatever does not
-become a request that way is passed over, and a whole request to this instrument is found behind it at once,
-not only after as many bytes as the garbage seemed to announce.
+their content: the function code gives the length of a request, the CRC confirms it. Data that does not
+form a request is skipped, and a whole request to this instrument is found behind it at once,
+not only after the number of bytes that the garbage seemed to announce.
 
 Functions 3, 4, 6 and 16 are carried out. The other functions of the specification are refused with exception
 1; to a function code that it does not define there is no answer, as the length of such a request is unknown.
@@ -64,8 +64,6 @@ class ModbusRtuServer:
 
     Parameters
     ----------
-    bank : RegisterBank
-        The instrument.
     address : int
         Address of the instrument on its line, 1 to 247.
 

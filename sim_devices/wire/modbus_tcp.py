@@ -2,7 +2,7 @@
 
 A small server of our own rather than pymodbus's, which was tried in its version 3.16: of several requests in
 one segment it answers the first only, and after a frame with a foreign protocol identifier it keeps waiting
-with the bytes in its buffer, so that the client is neither served again nor told. It also shares its framing
+with the bytes in its buffer, so that the client is no longer served and gets no error. It also shares its framing
 with the client that the drivers use, where a misunderstanding would hide on both ends of the wire. A round
 trip takes 0.03 to 0.1 ms, no more than with that server. One thread serves all clients in turn: no event
 loop, nothing to leak.
@@ -30,13 +30,7 @@ class FramingError(Exception):
 
 
 class ModbusTcpStream:
-    """The instrument's end of one connection: bytes in, bytes out.
-
-    Parameters
-    ----------
-    bank : RegisterBank
-        The instrument.
-    """
+    """The instrument's end of one connection: bytes in, bytes out."""
 
     def __init__(self, bank: RegisterBank) -> None:
         self._bank = bank
@@ -45,10 +39,7 @@ class ModbusTcpStream:
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the client, in pieces of any size; return the replies to whole frames.
 
-        Raises
-        ------
-        FramingError
-            If the header is not one of Modbus; the connection is to be closed.
+        Raises `FramingError` if the header is not one of Modbus; the connection is to be closed.
         """
         self._received += data
         replies = bytearray()
@@ -71,8 +62,6 @@ class ModbusTcpServer:
 
     Parameters
     ----------
-    bank : RegisterBank
-        The instrument; it is asked from the thread of the server.
     host : str
         Address to listen on; anything but loopback lets other machines in.
     port : int

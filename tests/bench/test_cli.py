@@ -14,7 +14,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import FILE_NAME, Record
-from bench.results.model_file import load_model
+from bench.model_file import load_model
 
 FAST = ["--rig", "vo2", "--clock", "virtual"]
 # On the clock of a busy machine: neither the watchdog of the output nor a late answer ends the run.
@@ -527,7 +527,7 @@ class TestTheCoreOnTheCommandLine:
         assert (tmp_path / "figures" / "residuals.png").stat().st_size > 0
 
     def test_designs_are_compared_by_what_they_cover_and_cost(self, bench, tmp_path):
-        code, out, _ = bench("design", "--levels", "8", "--json", tmp_path / "design.json")
+        code, out, _ = bench("design", "--rig", "vo2", "--levels", "8", "--json", tmp_path / "design.json")
         assert code == 0
         assert "covering" in out
         designs = json.loads((tmp_path / "design.json").read_text())
@@ -535,7 +535,7 @@ class TestTheCoreOnTheCommandLine:
         for design in designs.values():
             assert design["covered"] == design["cells"] == 36
         assert designs["covering, fine"]["time"] < 0.5 * designs["damped-oscillation"]["time"]
-        code, _, err = bench("design", "--plane", "30", "90")
+        code, _, err = bench("design", "--rig", "vo2", "--plane", "30", "90")
         assert code == 2
         assert "design" in err
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.clock import VIRTUAL_EPOCH, ScaledClock, Stopwatch, VirtualClock, WallClock, make_clock, room_date
+from bench.clock import VIRTUAL_EPOCH, ScaledClock, Stopwatch, VirtualClock, WallClock, make_clock, wall_time
 from bench.errors import ConfigurationError
 
 
@@ -146,7 +146,7 @@ class TestScaledClock:
         with pytest.raises(ValueError, match="factor: expected a positive number"):
             ScaledClock(factor)
 
-    def test_runs_faster_than_the_room(self):
+    def test_runs_faster_than_the_wall_clock(self):
         clock, watch = ScaledClock(1e5), Stopwatch()
         clock.sleep(3600.0)
         assert clock.now() >= 3600.0 * (1 - 1e-9)
@@ -171,5 +171,5 @@ class TestMakeClock:
         assert caught.value.exit_code == 2
 
 
-def test_dates_of_the_room_carry_their_zone():
-    assert room_date().utcoffset() == timedelta(0)
+def test_wall_time_carries_its_zone():
+    assert wall_time().utcoffset() == timedelta(0)

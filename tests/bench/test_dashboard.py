@@ -33,8 +33,8 @@ from bench.hysteresis import (
 )
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.layout import DashboardLayout, XYPlot
+from bench.model_file import ModelFile
 from bench.protocol import TRACES
-from bench.results.model_file import ModelFile
 from bench.settling import Settled
 
 

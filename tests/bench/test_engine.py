@@ -251,7 +251,7 @@ class TestWrongSetpoints:
         def wrong(parameters):
             yield Step({"probe": 30.0}, Dwell(1.0))
 
-        assert "probe is no device that takes a set-point" in bench().run(define(wrong)).reason
+        assert "probe is not a device that takes a set-point" in bench().run(define(wrong)).reason
 
     def test_an_unknown_signal_to_settle_is_found_before_anything_is_sent(self, bench):
         b = bench()
@@ -748,7 +748,10 @@ class TestPrompt:
         b = bench()
         self.by_hand(b)
         outcome = b.run(prompt())
-        assert (outcome.status, outcome.reason) == ("aborted", "nobody is there to do it: Turn the plate to 33 °C")
+        assert (outcome.status, outcome.reason) == (
+            "aborted",
+            "no operator is present to do it: Turn the plate to 33 °C",
+        )
         b.assert_safe()
 
     def test_the_dry_run_counts_them(self):
@@ -827,7 +830,7 @@ class TestInterrupted:
         self.b = b = bench()
         outcome = b.run(self.request(pause_requested=True))
         assert (outcome.status, outcome.steps) == ("aborted", 1)
-        assert "nobody is there" in outcome.reason
+        assert "no operator is present" in outcome.reason
         b.assert_safe()
 
     def test_abort_at_once(self, bench):

@@ -10,7 +10,7 @@ import pytest
 import bench
 import bench.face
 from bench.errors import BenchError, ConfigurationError, DataError, InterlockError
-from bench.results.model_file import ModelFile
+from bench.model_file import ModelFile
 
 
 @pytest.mark.parametrize("name", ["", "run", "identify"])

@@ -622,10 +622,13 @@ class TestTrouble:
     @pytest.mark.parametrize(
         ("keys", "words"),
         [
-            ({"inputs": ("prob_temperature",)}, "prob_temperature is no signal of this rig; there are: tec_setpoint"),
-            ({"watched": ("spot_position",)}, "spot_position is no signal of this rig"),
-            ({"actuators": ("heater",)}, "heater is no device that takes a set-point; there are: tec"),
-            ({"actuators": ("probe",)}, "probe is no device that takes a set-point"),
+            (
+                {"inputs": ("prob_temperature",)},
+                "prob_temperature is not a signal of this rig; there are: tec_setpoint",
+            ),
+            ({"watched": ("spot_position",)}, "spot_position is not a signal of this rig"),
+            ({"actuators": ("heater",)}, "heater is not a device that takes a set-point; there are: tec"),
+            ({"actuators": ("probe",)}, "probe is not a device that takes a set-point"),
         ],
     )
     def test_wrong_names_are_found_before_anything_is_sent(self, bench, keys, words):
@@ -653,7 +656,7 @@ class TestTrouble:
                 check_before_moving(rig, wrong, plan(wrong, Nothing()))
 
 
-class TestTimeOfTheRoom:
+class TestWallClockTime:
     @pytest.mark.parametrize(("rate", "duration"), [(200.0, 1.0), (2000.0, 0.25)])
     def test_the_record_is_consistent_however_busy_the_machine_is(self, bench, rate, duration):
         b, controller = bench(clock=WallClock()), Controller()

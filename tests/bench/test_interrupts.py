@@ -88,7 +88,7 @@ class TestFlags:
 
 
 class Process:
-    """A run in a process of its own, on the clock of the room."""
+    """A run in a process of its own, on the wall clock."""
 
     def __init__(self, tmp_path, rig, protocol, *settings, clock="wall", terminal=False, **keys):
         self.folder = tmp_path / "runs"
@@ -214,7 +214,7 @@ class TestProcesses:
         process = start("stairs", "dwell=0.5", "count=1000", "increment=0.05")
         process.until("step 0 at")
         process.send(signal.SIGINT)
-        steps = self.assert_aborted(process, "nobody is there to be asked")
+        steps = self.assert_aborted(process, "no operator is present")
         assert "pausing at the next step" in process.output
         assert 1 <= steps < 100
 

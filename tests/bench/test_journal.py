@@ -296,7 +296,7 @@ class TestTelemetryThatWaits:
         np.testing.assert_array_equal(ticks["force"], np.arange(count))
 
     def test_do_not_wait_for_ever(self, journal, tmp_path):
-        # More ticks alone bring them into the file, as soon as a tenth of a second of the room is over.
+        # More ticks alone bring them into the file, as soon as a tenth of a wall-clock second is over.
         waited = Stopwatch()
         with Record(tmp_path) as run:
             count = 0

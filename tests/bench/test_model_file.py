@@ -20,7 +20,7 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.results.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
+from bench.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 

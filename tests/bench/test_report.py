@@ -10,8 +10,8 @@ from rich.console import Console
 from bench.devices import Signal
 from bench.hysteresis import Polynomial
 from bench.journal import FILE_NAME, Journal, StepRecord, add_model
+from bench.model_file import ModelFile
 from bench.protocol import TRACES
-from bench.results.model_file import ModelFile
 from bench.results.report import report_run
 from bench.results.tracking import FOLLOW, REACH, READING
 from bench.settling import Settled

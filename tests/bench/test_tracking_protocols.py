@@ -13,7 +13,7 @@ from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_le
 from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
-from bench.results.model_file import ModelFile
+from bench.model_file import ModelFile
 from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
@@ -43,7 +43,8 @@ def operator():
     plain = Preisach(levels, density)
     density *= 2034.0 / 2.0 / (density @ plain.cell_areas())
     return Preisach(
-        levels, density, bias=1025.0, reversible=ThermalExpansion(3.0, 4.3), input_range=(21.0, 84.0),
+        levels, density, bias=1025.0,
+        reversible=ThermalExpansion(3.0, 4.3, 30.0, 70.0, 20.0), input_range=(21.0, 84.0),
         input_unit="°C", output_unit="1/m",
     )  # fmt: skip
 
@@ -51,7 +52,7 @@ def operator():
 @pytest.fixture(scope="module")
 def models(operator, tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
-    inputs = damped_oscillation()
+    inputs = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
     fitted = identify("polynomial", inputs, operator.evaluate(inputs), input_unit="°C", output_unit="1/m").model
     paths = {"preisach": folder / "preisach.json", "polynomial": folder / "polynomial.json"}
     ModelFile("preisach-nonmonotonic", operator, operator.initial_state().advance(inputs)).save(paths["preisach"])

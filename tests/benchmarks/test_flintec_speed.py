@@ -1,12 +1,8 @@
 """Round trips over a pseudo-terminal, beside the clients a user would otherwise take. Prints, asserts no time."""
 
-import os
-import select
 import struct
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -39,30 +35,6 @@ def served() -> tuple[ModbusRtuServer, VirtualClock]:
     world = World(Still(), clock)
     instrument = EmulatedDAD141("load", world, lambda: FORCE, rng=np.random.default_rng(1), noise=0.0)
     return ModbusRtuServer(instrument), clock
-
-
-@contextmanager
-def pseudo_terminal(server: ModbusRtuServer) -> Iterator[str]:
-    import tty
-
-    master, slave = os.openpty()
-    wake, waker = os.pipe()
-    tty.setraw(master)
-    tty.setraw(slave)
-
-    def serve() -> None:
-        while wake not in select.select([master, wake], [], [])[0]:
-            os.write(master, server.receive(os.read(master, 4096)))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield os.ttyname(slave)
-    finally:
-        os.write(waker, b"x")
-        thread.join()
-        for end in (master, slave, wake, waker):
-            os.close(end)
 
 
 def rate(take: Callable[[], float], seconds: float = 0.5, repeats: int = 5) -> float:
@@ -118,7 +90,7 @@ def of_minimalmodbus(port: str) -> float:
         client.serial.close()
 
 
-def test_round_trips(capsys):
+def test_round_trips(capsys, pseudo_terminal):
     server, clock = served()
     with pseudo_terminal(server) as path:
         rows = [

@@ -31,7 +31,7 @@ def film(order):
     i, j = np.tril_indices(order)
     density = np.exp(-0.5 * ((middle[i] - 62.0) / 3.0) ** 2 - 0.5 * ((middle[j] - 56.0) / 4.0) ** 2)
     density *= 1018.7 / (density @ Preisach(levels, density).cell_areas())
-    return Preisach(levels, density, 1026.7, ThermalExpansion(2.8, 4.3), (21.0, 84.0))
+    return Preisach(levels, density, 1026.7, ThermalExpansion(2.8, 4.3, 30.0, 70.0, 20.0), (21.0, 84.0))
 
 
 def by_relays(operator, inputs, per_cell):
@@ -59,7 +59,7 @@ def by_dense_areas(operator, inputs):
 
 
 def test_forward(capsys):
-    inputs = damped_oscillation()
+    inputs = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
     many = np.tile(inputs, 30)
     rows = []
     for order in (20, 50, 100, 200):

@@ -83,6 +83,26 @@ class OnABench:
         return bench.instrument.unplug
 
 
+class OnAServo(OnABench):
+    """The fixtures of the contracts that an MX-28 keeps."""
+
+    @pytest.fixture
+    def identity(self):
+        return "ROBOTIS MX-28, serial number id 1, firmware 45"
+
+    @pytest.fixture
+    def sent(self, bench):
+        return lambda: (len(bench.requests), bench.instrument.read_item(116))
+
+
+class Spoilt(OnABench):
+    """The fixture that spoils the next answer by a `fault`, over the wire."""
+
+    @pytest.fixture(params=["corrupt_next_answer", "drop_next_answer"])
+    def spoil(self, bench, request):
+        return getattr(bench.instrument, request.param)
+
+
 def check_reproducible(record):
     """Check that `record(seed)` is the same for one seed and another for another."""
     assert record(7) == record(7)

@@ -158,7 +158,7 @@ def test_on_a_real_rig_an_actuator_moves_between_the_set_points_that_are_given(c
     stranger(coil="Supply")
     code, output = contracts("--device", "coil", "--rig", "own.toml")
     assert code == pytest.ExitCode.USAGE_ERROR
-    assert "own.toml is a real rig, on which coil will move: say between which values by --set-points" in output
+    assert "own.toml is a real rig, on which coil will move; give the two values by --set-points" in output
     code, output = contracts("--device", "coil", "--rig", "own.toml", "--set-points", "0.5", "1")
     assert code == 0, output
 

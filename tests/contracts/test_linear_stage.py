@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
-from emulated_bench import Bench, OnABench, over_the_wire, serial_port
+from emulated_bench import Bench, OnABench, OnAServo, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
 from bench.contracts.faults import SilentInstrumentContract
@@ -49,8 +49,7 @@ class StageBench(Bench):
         return (math.pi - self.instrument.position) * RADIUS
 
 
-@pytest.fixture
-def bench(kind, stack):
+def connected(kind, stack):
     clock, plant = VirtualClock(), Wall()
     servo = EmulatedMX28("stage", World(plant, clock), plant)
     drum = EmulatedDrum(servo, RADIUS, zero_counts=ZERO, direction=-1)
@@ -90,15 +89,7 @@ class OnADrum(OnABench):
         return lambda: bench.where()
 
 
-class TestContract(OnADrum, LinearStageContract):
-    @pytest.fixture
-    def identity(self):
-        return "ROBOTIS MX-28, serial number id 1, firmware 45"
-
-    @pytest.fixture
-    def sent(self, bench):
-        return lambda: (len(bench.requests), bench.instrument.read_item(116))
-
+class TestContract(OnAServo, OnADrum, LinearStageContract):
     @pytest.fixture
     def tolerance(self):
         return 0.02 * RADIUS

@@ -42,11 +42,6 @@ def connected(kind, stack, seed=1, **options):
     return CellBench(clock=clock, device=cell, instrument=instrument, plant=specimen)
 
 
-@pytest.fixture
-def bench(kind, stack):
-    return connected(kind, stack)
-
-
 class TestContract(OnABench, LoadCellContract):
     @pytest.fixture
     def device(self, bench):

@@ -2,13 +2,10 @@
 
 import itertools
 import math
-import os
-import select
 import sys
-import threading
 
 import pytest
-from emulated_bench import Bench, OnABench, over_the_wire, serial_port
+from emulated_bench import Bench, OnABench, OnAServo, Spoilt, over_the_wire, serial_port
 
 from bench.clock import VirtualClock, WallClock
 from bench.contracts.faults import SilentInstrumentContract, SpoiltAnswerContract
@@ -90,11 +87,6 @@ def connected(kind, stack, loaded=False):
 
 
 @pytest.fixture
-def bench(kind, stack):
-    return connected(kind, stack)
-
-
-@pytest.fixture
 def loaded(kind, stack):
     return connected(kind, stack, loaded=True)
 
@@ -109,14 +101,8 @@ class OnAShaft(OnABench):
         return lambda: bench.where() - math.pi
 
 
-class TestContract(OnAShaft, ServoContract):
-    @pytest.fixture
-    def identity(self):
-        return "ROBOTIS MX-28, serial number id 1, firmware 45"
-
-    @pytest.fixture
-    def sent(self, bench):
-        return lambda: (len(bench.requests), bench.instrument.read_item(116))
+class TestContract(OnAServo, OnAShaft, ServoContract):
+    pass
 
 
 class TestSilence(OnAShaft, SilentInstrumentContract):
@@ -320,11 +306,8 @@ def test_torque_that_goes_off_lets_the_weight_fall(loaded):
 
 
 @over_the_wire
-@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
-class TestSpoiltAnswer(OnAShaft, SpoiltAnswerContract):
-    @pytest.fixture
-    def spoil(self, bench, fault):
-        return getattr(bench.instrument, fault)
+class TestSpoiltAnswer(Spoilt, OnAShaft, SpoiltAnswerContract):
+    pass
 
 
 @over_the_wire
@@ -427,27 +410,12 @@ def test_connecting_under_torque_switches_it_off(bench):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pty")
-def test_over_a_pty_in_the_time_of_the_room():
-    import tty
-
+def test_over_a_pty_in_wall_clock_time(pseudo_terminal):
     clock = WallClock()
     instrument = EmulatedMX28("servo", World(Pendulum(), clock))
-    server = Dynamixel2Server([instrument])
-    ours, theirs = os.openpty()
-    tty.setraw(ours)
-    tty.setraw(theirs)
-    wake, ending = os.pipe()
-
-    def serve():
-        while wake not in (ready := select.select([ours, wake], [], [])[0]):
-            if ready:
-                os.write(ours, server.receive(os.read(ours, 4096)))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
+    with pseudo_terminal(Dynamixel2Server([instrument])) as path:
         settings = DynamixelMX28.Settings(
-            port=os.ttyname(theirs), timeout=10.0, position_limits=(0.0, 6.0), profile_velocity=5.0, watchdog=0,
+            port=path, timeout=10.0, position_limits=(0.0, 6.0), profile_velocity=5.0, watchdog=0,
             arrival_timeout=60.0,
         )  # fmt: skip
         device = DynamixelMX28.connect("servo", settings, clock)
@@ -467,8 +435,3 @@ def test_over_a_pty_in_the_time_of_the_room():
         device.safe()
         assert not device.torque_enabled
         device.close()
-    finally:
-        os.write(ending, b"x")
-        thread.join()
-        for each in (ours, theirs, wake, ending):
-            os.close(each)

@@ -5,7 +5,7 @@ from itertools import dropwhile
 
 import numpy as np
 import pytest
-from emulated_bench import Bench, OnABench, over_the_wire, serial_port
+from emulated_bench import Bench, OnABench, Spoilt, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
 from bench.contracts.faults import SilentInstrumentContract, SpoiltAnswerContract
@@ -69,11 +69,6 @@ def connected(kind, stack):
     device = connect()
     stack.callback(device.close)
     return Bench(clock=clock, device=device, instrument=instrument, plant=plant, connect=connect, requests=requests)
-
-
-@pytest.fixture
-def bench(kind, stack):
-    return connected(kind, stack)
 
 
 class OnAPlate(OnABench):
@@ -268,12 +263,7 @@ def test_ticks_of_two_seconds_keep_the_output_on(bench):
 
 
 @over_the_wire
-@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
-class TestSpoiltAnswer(OnAPlate, SpoiltAnswerContract):
-    @pytest.fixture
-    def spoil(self, bench, fault):
-        return getattr(bench.instrument, fault)
-
+class TestSpoiltAnswer(Spoilt, OnAPlate, SpoiltAnswerContract):
     def test_the_order_is_carried_out_once(self, bench, spoil):
         bench.device.set(45.0).wait()
         bench.plant.commands.clear()

@@ -48,11 +48,6 @@ def connected(kind, stack, seed=1):
     return SensorBench(clock=clock, device=sensor, instrument=instrument, plant=plate, thermistor=thermistor)
 
 
-@pytest.fixture
-def bench(kind, stack):
-    return connected(kind, stack)
-
-
 class TestContract(OnABench, TemperatureSensorContract):
     @pytest.fixture
     def identity(self):

@@ -32,7 +32,7 @@ def models():
     """Identify the plant once, as a protocol would: steps of 8 s, one reading each."""
     rng = np.random.default_rng(11)
     plant = VO2Cantilever(VO2Parameters(), rng, 21.0)
-    setpoints, readings = damped_oscillation(), []
+    setpoints, readings = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35), []
     for setpoint in setpoints:
         plant.regulate(float(setpoint))
         plant.advance(8.0)

@@ -115,19 +115,6 @@ class Script:
         return orders
 
 
-@pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
-def script(clock):
-    script = Script()
-    register("scripted-servo", script, clock)
-    yield script
-    unregister("scripted-servo")
-
-
 def make_settings(**changes):
     keys = {"port": PORT, "position_limits": (-3.0, 3.0)}
     return DynamixelMX28.Settings(**keys | changes)
@@ -815,15 +802,11 @@ def test_drum_with_an_error_is_refused_and_recovered_on_request(script, clock):
 # A line that is not good.
 
 
-def flipped(sent, right):
-    return right[:9] + bytes((right[9] ^ 1,)) + right[10:]
-
-
 @pytest.mark.parametrize(
     "damaged",
     [
         b"",
-        flipped,
+        lambda _sent, right: right[:9] + bytes((right[9] ^ 1,)) + right[10:],
         lambda _sent, right: right[:-1],
         lambda _sent, right: right[1:],
         lambda _sent, right: right[:5],

@@ -5,6 +5,7 @@ import math
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -565,7 +566,7 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
     [
         (lambda _, words: words[::-1], "swapped order"),
         (lambda _, words: [(w & 0xFF) << 8 | w >> 8 for w in words], "bytes of a word in swapped"),
-        (lambda _, words: [0] * len(words), "no LabJack T-series: register TEST is 0x00000000"),
+        (lambda _, words: [0] * len(words), "is not a LabJack T-series: register TEST is 0x00000000"),
         (lambda address, words: [0] * len(words) if address == 55124 else words, "TEST_FLOAT32 is 0"),
         (lambda address, words: [0x4080, 0] if address == 60000 else words, "LabJack T4, not a T7"),
         (lambda address, words: [0x4110, 0] if address == 60000 else words, "another product.*is 9"),
@@ -586,7 +587,7 @@ def test_a_device_without_test_registers_is_refused(bench):
 
     with (
         ModbusTcpServer(Altered(bench.t7, refuse)) as server,
-        pytest.raises(DeviceConnectionError, match=r"no LabJack T-series.*exception 2"),
+        pytest.raises(DeviceConnectionError, match=r"is not a LabJack T-series.*exception 2"),
     ):
         T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
 
@@ -871,11 +872,16 @@ def test_requests_of_a_thermistor(bench):
 # A high-voltage supply
 
 
-def test_requests_of_a_high_voltage_supply(bench):
-    bench.wire()
+@contextmanager
+def recorded_supply(bench) -> Iterator[tuple[T7HighVoltageSupply, Recorded]]:
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
-        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+        yield T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock), recorded
+
+
+def test_requests_of_a_high_voltage_supply(bench):
+    bench.wire()
+    with recorded_supply(bench) as (supply, recorded):
 
         def asked(call: Callable[[], object]) -> list[tuple[str, int, int]]:
             recorded.requests.clear()
@@ -900,9 +906,7 @@ def test_requests_of_a_high_voltage_supply(bench):
 
 def test_a_loop_that_looks_sends_in_one_request(bench):
     bench.wire()
-    recorded = Recorded(bench.t7)
-    with ModbusTcpServer(recorded) as server:
-        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+    with recorded_supply(bench) as (supply, recorded):
         supply.set(0.0)
         recorded.requests.clear()
         for step in range(200):
@@ -1141,9 +1145,7 @@ def test_closing_a_high_voltage_supply(bench):
 @pytest.mark.parametrize("value", [-40.01, 40.01, math.nan, math.inf])
 def test_a_voltage_beyond_the_limits_is_not_sent(bench, value):
     bench.wire()
-    recorded = Recorded(bench.t7)
-    with ModbusTcpServer(recorded) as server:
-        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
+    with recorded_supply(bench) as (supply, recorded):
         recorded.requests.clear()
         with pytest.raises(LimitError, match=r"^hv: set-point \S+ V is outside of -40 to 40 V$"):
             supply.set(value)

@@ -91,19 +91,6 @@ class Script:
         return [data[7:-5].decode() for data in frames]
 
 
-@pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
-def script(clock):
-    script = Script()
-    register("scripted-tec", script, clock)
-    yield script
-    unregister("scripted-tec")
-
-
 def make_settings(**changes):
     keys = {"port": PORT, "temperature_limits": (15, 90), "current_limit": 3.0, "voltage_limit": 12.0}
     return MeerstetterTEC.Settings(**keys | changes)
@@ -345,15 +332,11 @@ def test_value_that_is_no_hex_number(script, tec):
         tec.measure()
 
 
-def flipped(sent, right):
-    return right[:9] + bytes((right[9] ^ 1,)) + right[10:]
-
-
 @pytest.mark.parametrize(
     "damaged",
     [
         b"",
-        flipped,
+        lambda _sent, right: right[:9] + bytes((right[9] ^ 1,)) + right[10:],
         lambda _sent, right: right[:-1],
         lambda _sent, _right: b"\r",
         lambda _sent, _right: b"noise\r",

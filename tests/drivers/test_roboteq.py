@@ -110,19 +110,6 @@ class Script:
         ]
 
 
-@pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
-def script(clock):
-    script = Script()
-    register("scripted-supply", script, clock)
-    yield script
-    unregister("scripted-supply")
-
-
 def make_settings(**changes):
     keys = {"port": PORT, "output": "average", "voltage_limits": (0, 12), "heartbeat": 60}
     return RoboteqSupply.Settings(**keys | changes)
@@ -886,7 +873,7 @@ class LocalNode:
         for text in data.split(b"\r"):
             if text.startswith(b"t"):
                 self.network.notify(int(text[1:4], 16), bytearray.fromhex(text[5:].decode()), 0.0)
-        # Its heartbeat would come from a timer of the room.
+        # Its heartbeat would come from a wall-clock timer.
         sent, self.sent = line(0x709, b"\x05") + self.sent, b""
         return sent
 

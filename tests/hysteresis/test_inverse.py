@@ -23,7 +23,7 @@ def film(order=20, zeros=0.6, seed=0, k0=2.8, k1=4.3):
     density *= rng.uniform(0.5, 1.5, density.size)
     density[rng.random(density.size) < zeros] = 0.0
     density *= 1018.7 / (density @ Preisach(levels, density).cell_areas())
-    return Preisach(levels, density, 1026.7, ThermalExpansion(k0, k1), (LOW, HIGH))
+    return Preisach(levels, density, 1026.7, ThermalExpansion(k0, k1, 30.0, 70.0, 20.0), (LOW, HIGH))
 
 
 def plain(order=12, seed=0, zeros=0.3, term=None, signed=False):

@@ -112,62 +112,6 @@ def test_saturations():
     assert MemoryCurve.from_positive_saturation(50.0).corners(30.0, 70.0)[0, 1] == 70.0
 
 
-@given(inputs, inputs, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]), st.booleans())
-def test_priming_reaches_the_wanted_memory(history, past, first, second, unknown):
-    low, high = -5.0, 40.0
-    wanted, present = driven(history, first), driven(past, second)
-    setpoints = wanted.priming(low, high, None if unknown else present)
-    reached = present
-    for value in setpoints:
-        assert low <= value <= high
-        reached = reached.step(value)
-    assert reached.staircase(low, high) == wanted.staircase(low, high)
-    assert wanted.priming(low, high, reached) == ()
-    assert len(present.priming(low, high, present)) == 0
-
-
-@pytest.mark.parametrize("top", [1, 2, 3, 4, 5])
-def test_no_shorter_priming_exists(top):
-    """Breadth first through all states of a small lattice."""
-
-    def key(memory):
-        left, height, present = memory.staircase(0.0, float(top))
-        return tuple(left), tuple(height), present
-
-    start = MemoryCurve.from_negative_saturation(0.0)
-    known, frontier = {key(start): start}, [start]
-    while frontier:
-        frontier = [memory.step(float(v)) for memory in frontier for v in range(top + 1)]
-        frontier = list({key(m): m for m in frontier if key(m) not in known}.values())
-        known.update((key(m), m) for m in frontier)
-    assert len(known) == 2**top
-    for origin in known.values():
-        moves = {key(origin): 0}
-        layer = [origin]
-        while layer:
-            following = []
-            for memory in layer:
-                for v in range(top + 1):
-                    after = memory.step(float(v))
-                    if key(after) not in moves:
-                        moves[key(after)] = moves[key(memory)] + 1
-                        following.append(after)
-            layer = following
-        for goal, wanted in known.items():
-            assert len(wanted.priming(0.0, float(top), origin)) == moves[goal]
-
-
-def test_priming_an_unknown_specimen_takes_no_more_than_the_worst_known_one():
-    for history in ([3.0, 1.0, 2.0], [4.0, 1.0], [0.0], [4.0], [2.0]):
-        wanted = driven(history)
-        worst = max(
-            len(wanted.priming(0.0, 4.0, driven(list(past), saturation)))
-            for past in np.ndindex(5, 5, 5)
-            for saturation in (-1, 1)
-        )
-        assert len(wanted.priming(0.0, 4.0)) == worst
-
-
 def test_description_tells_branch_and_reversals():
     text = driven([60.0, 40.0, 50.0, 45.0]).describe("°C")
     assert text.splitlines() == [
@@ -191,7 +135,6 @@ def test_description_tells_branch_and_reversals():
         (lambda: MemoryCurve((), 1.0, 0), "saturation"),
         (lambda: MemoryCurve((), 1.0).step(math.nan), "value"),
         (lambda: MemoryCurve((), 1.0).advance([]), "inputs"),
-        (lambda: MemoryCurve((), 1.0).priming(1.0, 1.0), "low, high"),
         (lambda: MemoryCurve((), 1.0).advance([1.0, math.nan]), "inputs: .* at index 1"),
         (lambda: MemoryCurve.from_json({"input": 1.0, "saturation": -1}), "extrema"),
     ],

@@ -62,7 +62,9 @@ def test_first_order_reversals_measure_every_pair_of_levels(seed, order, per_cel
 
 @pytest.mark.parametrize("design", [covering_sequence, first_order_reversals])
 @pytest.mark.parametrize(
-    "term", [QuadraticTerm(0.0), QuadraticTerm(0.0, 0.0), ThermalExpansion()], ids=["linear", "quadratic", "thermal"]
+    "term",
+    [QuadraticTerm(0.0), QuadraticTerm(0.0, 0.0), ThermalExpansion(0.0, 0.0, 30.0, 70.0, 20.0)],
+    ids=["linear", "quadratic", "thermal"],
 )
 def test_reversible_part_is_determined_too(design, term):
     operator = plane(uniform_levels(30.0, 70.0, 10), term, (21.0, 84.0))
@@ -78,11 +80,11 @@ def test_reversible_part_is_determined_too(design, term):
 
 
 def test_designs_beside_the_damped_oscillation():
-    operator = plane(uniform_levels(30.0, 70.0, 20), ThermalExpansion(), (21.0, 84.0))
+    operator = plane(uniform_levels(30.0, 70.0, 20), ThermalExpansion(0.0, 0.0, 30.0, 70.0, 20.0), (21.0, 84.0))
     sequences = [
         covering_sequence(operator.levels, (21.0, 84.0)),
         first_order_reversals(operator.levels, (21.0, 84.0)),
-        damped_oscillation(),
+        damped_oscillation(21.0, 84.0, 54.0, 36, 0.35),
     ]
     found = [assess(operator, inputs, dwell=8.0, rate=1.0) for inputs in sequences]
     assert all(entry.rank == 212 and entry.covered == 210 for entry in found)
@@ -117,7 +119,7 @@ def measure(setpoints, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_design_reaches_the_oscillation_in_half_the_time_on_the_film(seed):
     span = (21.0, 84.0)
-    oscillation = damped_oscillation()
+    oscillation = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
     # Loops 1 K apart, a reading every 0.5 K.
     design = covering_sequence(uniform_levels(30.0, 70.0, 40), span, per_cell=2)
     assert laboratory_time(design, 8.0) <= 0.5 * laboratory_time(oscillation, 8.0)
@@ -129,7 +131,9 @@ def test_design_reaches_the_oscillation_in_half_the_time_on_the_film(seed):
     ]
     errors = []
     for session in range(3):
-        fresh = random_validation(np.random.default_rng(100 + session))
+        fresh = random_validation(
+            np.random.default_rng(100 + session), 600, operating=(21.0, 84.0), transition=(40.0, 72.0), step=1.2
+        )
         measured = measure(fresh, 500 + session)
         errors.append([measure_errors(measured, model.evaluate(fresh)).rms for model in models])
     usual, designed = np.mean(errors, axis=0)

@@ -16,6 +16,8 @@ from bench.identification import (
 
 FILM = {"plane": (30.0, 70.0), "reference": 20.0, "input_unit": "°C", "output_unit": "1/m"}
 
+FRESH = {"operating": (21.0, 84.0), "transition": (40.0, 72.0), "step": 1.2}
+
 
 def film(seed=0):
     """A VO2-like specimen on a finer lattice than the model's."""
@@ -26,8 +28,8 @@ def film(seed=0):
     alpha, beta = middle[i], middle[j]
     density = np.exp(-0.5 * ((alpha - 62.0) / 2.5) ** 2 - 0.5 * ((beta - 57.0) / 2.5) ** 2)
     density *= 1018.0 / (density @ Preisach(levels, density).cell_areas())
-    specimen = Preisach(levels, density, 1027.0, ThermalExpansion(3.0, 4.3), (21.0, 84.0))
-    inputs = damped_oscillation()
+    specimen = Preisach(levels, density, 1027.0, ThermalExpansion(3.0, 4.3, 30.0, 70.0, 20.0), (21.0, 84.0))
+    inputs = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
     return specimen, inputs, specimen.evaluate(inputs) + 0.4 * rng.normal(size=inputs.size)
 
 
@@ -46,7 +48,7 @@ def test_nonmonotonic_beats_signed_beats_polynomial():
     assert best.model.output_range() == pytest.approx(specimen.output_range(), abs=15.0)
     assert best.certificate.kkt_residual < 1e-10
     assert (best.model.input_unit, best.model.output_unit) == ("°C", "1/m")
-    fresh = random_validation(np.random.default_rng(1))
+    fresh = random_validation(np.random.default_rng(1), 600, **FRESH)
     validation = measure_errors(specimen.evaluate(fresh), best.model.evaluate(fresh))
     assert validation.rms_percent < 2.0
 
@@ -139,7 +141,7 @@ def test_error_measures():
 
 
 def test_damped_oscillation_nests_towards_the_center():
-    points = damped_oscillation()
+    points = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
     assert points.size == 3439
     assert (points[0], points.max(), points[-1]) == (21.0, 84.0, 54.0)
     steps = np.diff(points)
@@ -151,15 +153,15 @@ def test_damped_oscillation_nests_towards_the_center():
 
 
 def test_random_validation_follows_the_recipe():
-    points = random_validation(np.random.default_rng(7), 5000)
+    points = random_validation(np.random.default_rng(7), 5000, **FRESH)
     assert points.size == 5000
     assert points.min() >= 21.0
     assert points.max() <= 84.0
     assert np.abs(np.diff(points)).max() <= 1.2 + 1e-9
     assert 0.6 < np.mean((points >= 40.0) & (points <= 72.0)) < 0.95
-    again = random_validation(np.random.default_rng(7), 5000)
+    again = random_validation(np.random.default_rng(7), 5000, **FRESH)
     np.testing.assert_array_equal(points, again)
-    assert random_validation(np.random.default_rng(7), 1).tolist() == [21.0]
+    assert random_validation(np.random.default_rng(7), 1, **FRESH).tolist() == [21.0]
 
 
 def test_ramps_divide_evenly_and_keep_the_extrema():
@@ -171,13 +173,16 @@ def test_ramps_divide_evenly_and_keep_the_extrema():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: damped_oscillation(center=90.0), "low, center, high"),
-        (lambda: damped_oscillation(half_cycles=0), "half_cycles"),
-        (lambda: damped_oscillation(step=0.0), "step"),
+        (lambda: damped_oscillation(21.0, 84.0, 90.0, 36, 0.35), "low, center, high"),
+        (lambda: damped_oscillation(21.0, 84.0, 54.0, 0, 0.35), "half_cycles"),
+        (lambda: damped_oscillation(21.0, 84.0, 54.0, 36, 0.0), "step"),
         (lambda: ramps([], 1.0), "extrema"),
-        (lambda: random_validation(np.random.default_rng(0), 0), "count"),
-        (lambda: random_validation(np.random.default_rng(0), inside=1.5), "inside"),
-        (lambda: random_validation(np.random.default_rng(0), operating=(1.0, 0.0)), "operating"),
+        (lambda: random_validation(np.random.default_rng(0), 0, **FRESH), "count"),
+        (lambda: random_validation(np.random.default_rng(0), 600, **FRESH, inside=1.5), "inside"),
+        (
+            lambda: random_validation(np.random.default_rng(0), 600, **(FRESH | {"operating": (1.0, 0.0)})),
+            "operating",
+        ),
     ],
 )
 def test_wrong_excitation_is_named(make, message):

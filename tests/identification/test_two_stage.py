@@ -247,8 +247,6 @@ def test_chained_and_paired_regressors(make):
     assert chain.dense() == pytest.approx(np.vstack([r.dense() for r in parts]), abs=1e-12)
     weights = rng.random(chain.shape[1])
     assert chain.product(weights) == pytest.approx(chain.dense() @ weights, abs=1e-12)
-    residuals = rng.random(chain.shape[0])
-    assert chain.transpose_product(residuals) == pytest.approx(chain.dense().T @ residuals, abs=1e-12)
     other = preisach(0.0, 1.0, 0.0, 1.0, 3, order=4).regressor(rng.random(9))
     both = _beside(parts[2], other)
     cells = parts[2].base.size

@@ -15,7 +15,7 @@ from bench.controllers import ControllerSetup, make_controller
 from bench.errors import DataError
 from bench.hysteresis import Preisach, QuadraticTerm, Reach, operator_from_json, uniform_levels
 from bench.identification import damped_oscillation, identify
-from bench.results.model_file import ModelFile, load_model
+from bench.model_file import ModelFile, load_model
 
 PACKAGE = Path(__file__).parent / "boucwen_package"
 TRUE = {"rho": 1.2, "sigma": 1.6, "n": 1.8}

@@ -9,7 +9,7 @@ from bench.cli import main
 from bench.identification import measure_errors
 from bench.identification.two_stage import measure_series
 from bench.journal import Record
-from bench.results.model_file import load_model
+from bench.model_file import load_model
 from bench.results.tracking import target_results
 from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 

@@ -8,7 +8,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import Record
-from bench.results.model_file import load_model
+from bench.model_file import load_model
 
 MODELS = ("nonmonotonic", "signed", "polynomial")
 

@@ -1,15 +1,10 @@
 """The emulated DAD 141.1: its registers, its filter and motion detection, its wire, and independent clients."""
 
 import math
-import os
-import select
 import shutil
 import struct
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 
 import numpy as np
@@ -301,7 +296,7 @@ def test_a_long_silence_costs_no_more_than_a_short_one(setting):
     assert cell.load.splits < 80
 
 
-def test_on_the_clock_of_the_room_it_costs_no_more():
+def test_on_the_wall_clock_it_costs_no_more():
     cell = Cell(clock=WallClock())
     for _ in range(20):
         cell.clock.sleep(0.01)
@@ -545,39 +540,12 @@ def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
 # Independent clients, over a pseudo-terminal
 
 
-@contextmanager
-def pseudo_terminal(server: ModbusRtuServer) -> Iterator[str]:
-    """Serve an instrument at the path that this gives."""
-    import tty
-
-    master, slave = os.openpty()
-    wake, waker = os.pipe()
-    # Raw at both ends before anybody opens it; and this slave stays open, as otherwise a client that closes its
-    # own makes reads from the master fail.
-    tty.setraw(master)
-    tty.setraw(slave)
-
-    def serve() -> None:
-        while wake not in select.select([master, wake], [], [])[0]:
-            os.write(master, server.receive(os.read(master, 4096)))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield os.ttyname(slave)
-    finally:
-        os.write(waker, b"x")
-        thread.join()
-        for end in (master, slave, wake, waker):
-            os.close(end)
-
-
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
 needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")
 
 
 @needs_pty
-def test_minimalmodbus():
+def test_minimalmodbus(pseudo_terminal):
     minimalmodbus = pytest.importorskip("minimalmodbus", reason="needs the package minimalmodbus")
     cell = vector_cell()
     with pseudo_terminal(ModbusRtuServer(cell, 42)) as path:
@@ -614,7 +582,7 @@ def values(result: subprocess.CompletedProcess[str]) -> list[str]:
 
 @needs_pty
 @needs_mbpoll
-def test_mbpoll():
+def test_mbpoll(pseudo_terminal):
     cell = vector_cell()
     with pseudo_terminal(ModbusRtuServer(cell, 7)) as path:
         both = mbpoll(path, "-t", "4:float", "-B", "-r", str(0x2000), "-c", "2", path)

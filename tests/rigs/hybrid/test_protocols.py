@@ -16,8 +16,8 @@ from bench.engine import check_before_moving
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
+from bench.model_file import ModelFile
 from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
-from bench.results.model_file import ModelFile
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
@@ -454,7 +454,7 @@ class TestRuns:
             (text,) = [event.text for event in found.events() if event.kind == "loop"]
         assert text == "5000 samples at 20000 Hz, 0 left out; late by 0 ms on average, 0 ms at most"
 
-    def test_the_same_loop_in_the_time_of_the_room(self, bench, tmp_path):
+    def test_the_same_loop_in_wall_clock_time(self, bench, tmp_path):
         code, _, err = bench(
             "run", "piezo-loops", "--rig", WIRED, "--clock", "wall", "--out", tmp_path,
             "--json", tmp_path / "run.json",

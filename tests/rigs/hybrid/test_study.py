@@ -8,7 +8,7 @@ import pytest
 
 from bench.cli import main
 from bench.journal import Record
-from bench.results.model_file import load_model
+from bench.model_file import load_model
 from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
 

@@ -11,8 +11,8 @@ from bench.errors import DataError
 from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
 from bench.identification.two_stage import measure_series, predict_series
 from bench.journal import FILE_NAME, Record
+from bench.model_file import load_model
 from bench.protocol import find_protocol
-from bench.results.model_file import load_model
 from bench.runs import Run, carry_out
 from protocols.muscles.force_voltage import scaled_steps
 from rigs.muscles.identification import (

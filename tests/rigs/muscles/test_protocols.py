@@ -12,8 +12,8 @@ from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
+from bench.model_file import ModelFile
 from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
-from bench.results.model_file import ModelFile
 from bench.results.tracking import target_results
 from bench.rig import Rig
 from bench.rig_file import load_rig

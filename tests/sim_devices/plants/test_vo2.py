@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plant_outputs import snapshot
 
 from sim_devices.plants import _vo2_kernels as kernels
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters, arc_deflection, relay_thresholds
@@ -68,23 +69,6 @@ class TestSpecimen:
         assert np.array_equal(*curves)
         other = relay_thresholds(dataclasses.replace(QUIET, specimen_seed=7))
         assert not np.array_equal(other[0], relay_thresholds(QUIET)[0])
-
-    @pytest.mark.parametrize(
-        "wrong",
-        [
-            {"relay_count": 0},
-            {"step": math.nan},
-            {"loop_damping": 1.0},
-            {"correlation": -1.0},
-            {"minor_share": 1.5},
-            {"wander_sd": -0.1},
-            {"maximum_current": 7.0},
-            {"ambient_temperature": math.nan},
-        ],
-    )
-    def test_wrong_parameters_are_refused(self, wrong):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            VO2Parameters(**wrong)
 
     def test_parameters_are_frozen(self):
         with pytest.raises(dataclasses.FrozenInstanceError):
@@ -331,7 +315,7 @@ class TestPeltier:
         """Electrical work equals the heat stored in plate and sink plus what went into the room."""
         p = QUIET
         plant = make(initial_temperature=30.0)
-        begin = plant.snapshot()
+        begin = snapshot(plant)
         work = loss = 0.0
 
         def flows():
@@ -349,7 +333,7 @@ class TestPeltier:
             after = flows()
             work += 0.025 * (before[0] + after[0])
             loss += 0.025 * (before[1] + after[1])
-        end = plant.snapshot()
+        end = snapshot(plant)
         stored = p.plate_capacity * (end.plate_temperature - begin.plate_temperature)
         stored += p.sink_capacity * (end.sink_temperature - begin.sink_temperature)
         assert work > 1000.0
@@ -403,9 +387,9 @@ class TestPeltier:
             lambda: plant.regulate(25.0),
         ]
         for command in commands * 3:
-            before = plant.snapshot()
+            before = snapshot(plant)
             command()
-            assert plant.snapshot() == before
+            assert snapshot(plant) == before
             plant.advance(0.05)
             assert abs(plant.plate_temperature - before.plate_temperature) < 0.05 * 45.0
             plant.advance(0.95)
@@ -519,7 +503,7 @@ class TestOutputs:
     def test_snapshot_agrees_with_the_outputs(self):
         plant = make(VO2Parameters())
         quasi_static(plant, [64.0])
-        for name, value in plant.snapshot()._asdict().items():
+        for name, value in snapshot(plant)._asdict().items():
             assert value == getattr(plant, name)
             assert type(value) is float
 
@@ -543,7 +527,7 @@ class TestTime:
             whole.advance(sum(parts) * 1e-6)
             for part in parts:
                 split.advance(part * 1e-6)
-            assert split.snapshot() == whole.snapshot()
+            assert snapshot(split) == snapshot(whole)
 
     @pytest.mark.parametrize("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
     def test_hours_in_parts(self, part):
@@ -555,7 +539,7 @@ class TestTime:
         for _ in range(parts):
             split.advance(part)
         whole.advance(part * parts)
-        assert split.snapshot() == whole.snapshot()
+        assert snapshot(split) == snapshot(whole)
 
     def test_time_stamps_of_a_real_clock(self):
         """Differences of a clock that counts from 1970 are rounded to a quarter of a microsecond."""
@@ -568,16 +552,16 @@ class TestTime:
             now = later
             second.regulate(30.0 + k % 40)
             second.advance(0.05)
-            assert first.snapshot() == second.snapshot()
+            assert snapshot(first) == snapshot(second)
 
     def test_outputs_are_held_between_grid_points(self):
         plant = make()
         plant.regulate(60.0)
-        begin = plant.snapshot()
+        begin = snapshot(plant)
         plant.advance(0.03)
-        assert plant.snapshot() == begin
+        assert snapshot(plant) == begin
         plant.advance(0.02)
-        assert plant.snapshot() != begin
+        assert snapshot(plant) != begin
 
     def test_one_seed_one_trajectory(self):
         runs = [quasi_static(make(VO2Parameters(), seed=s), [60.0, 66.0, 62.0]) for s in (1, 1, 2)]
@@ -591,7 +575,7 @@ class TestTime:
         reference = make(SMALL, seed=1)
         for each in (plant, reference):
             each.advance(1000.0)
-        assert plant.snapshot() == reference.snapshot()
+        assert snapshot(plant) == snapshot(reference)
 
     def test_nine_hours_take_seconds(self):
         plant = make(VO2Parameters())

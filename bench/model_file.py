@@ -1,4 +1,4 @@
-"""Model files: an identified model as versioned JSON, with its units and where it comes from.
+"""Model files: an identified model as versioned JSON, with its units and provenance.
 
 A file of version 2 is an object with these keys:
 
@@ -9,7 +9,7 @@ A file of version 2 is an object with these keys:
 `kind`
     The class of the model: the `kind` of a class that an entry of `bench.models` names.
 `model`
-    The model as it writes itself: its `type` (the kind), coefficients, ranges and units.
+    The content that the model's class writes: its `type` (the kind), coefficients, ranges and units.
 `memory`
     The state of an operator at the end of the data from which it was identified; null for a model without memory
     or of several inputs.
@@ -63,10 +63,7 @@ class ModelFile:
     def operator(self) -> Operator[Any]:
         """The model, if it is one of one input and one output.
 
-        Raises
-        ------
-        DataError
-            If it is another.
+        Raises DataError if it is another.
         """
         if not isinstance(self.model, Operator):
             raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one of one input")
@@ -84,13 +81,11 @@ class ModelFile:
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the file.
 
-        Raises
-        ------
-        DataError
-            If it cannot be written, or could not be loaded again because the class of the model is not registered.
+        Raises DataError if it cannot be written, or could not be loaded again because the class of the model is not
+        registered.
         """
         content = self.to_json()
         text = json.dumps(content, indent=1, ensure_ascii=False)
@@ -110,7 +105,7 @@ class ModelFile:
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
         try:
-            path.write_text(text + "\n", encoding="utf-8")
+            Path(path).write_text(text + "\n", encoding="utf-8")
         except OSError as error:
             raise DataError(f"model file {path} cannot be written: {error}") from None
 
@@ -151,10 +146,7 @@ def is_model(content: object) -> bool:
 def parse_model(content: object, source: str) -> ModelFile:
     """Make a model of the content of its file.
 
-    Raises
-    ------
-    DataError
-        If it is not one, is damaged, or its version or kind is unknown; names `source`.
+    Raises DataError if it is not one, is damaged, or its version or kind is unknown; names `source`.
     """
     if not isinstance(content, dict) or not is_model(content):
         raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")

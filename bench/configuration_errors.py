@@ -1,4 +1,4 @@
-"""What pydantic found wrong, said so that whoever wrote the file can mend it."""
+"""Problems that pydantic finds, as messages for the author of the file."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _find(model: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseMod
             field = owner.model_fields[part]
             nested = _models_in(field.annotation)
             if nested:
-                # The field's own meaning is told by the innermost key that is found.
+                # The innermost key that is found carries the description.
                 owner_next: type[BaseModel] | None = nested[0]
                 if part == location[-1]:
                     break

@@ -1,0 +1,55 @@
+"""The study: characterization, two models, and tracking by the inverse of each, in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.results.models import errors_json, identify_file
+
+MODELS: Mapping[str, Mapping[str, Any]] = {"quadratic-play": {}, "preisach-signed": {"plane": (-2.4, 2.4)}}
+"""Models and their options. The plane ends before the drive's range does, so that the reset saturates it."""
+
+CONTROLLERS = ("open-loop-inverse", "closed-loop-inverse")
+
+TABLE = ResultTable(
+    "models of the rod, RMS errors in µm/m (seed {seed})",
+    ("model", "identification", *CONTROLLERS),
+    [
+        (
+            name,
+            f"{{identification[{name}][rms]:.2f}}",
+            *(f"{{tracking[{name}][{key}][rms]:.2f}}" for key in CONTROLLERS),
+        )
+        for name in MODELS
+    ],
+)
+
+
+def carry_out(campaign: Campaign) -> StudyResult:
+    """Run the experiments and evaluate them; raises `BenchError` if a run did not complete."""
+    measured = campaign.run("damped-oscillation", {"half_cycles": "24"})
+    identification: dict[str, Any] = {}
+    tracking: dict[str, dict[str, Any]] = {}
+    for name, options in MODELS.items():
+        model = identify_file(
+            measured.folder, input_column="coil_current", output_column="strain", model=name, **options
+        )
+        path = campaign.folder / f"{name}.json"
+        model.file.save(path)
+        identification[name] = errors_json(model.identification.errors)
+        tracking[name] = {}
+        for controller in CONTROLLERS:
+            run = campaign.run("tracking", {"model": str(path), "controller": controller, "count": "20"})
+            tracking[name][controller] = reached_targets(run, "strain").summary()
+    return StudyResult({"identification": identification, "tracking": tracking}, (TABLE,), ())
+
+
+STUDY = Study(
+    "magnetostrictive-rod",
+    "Magnetostrictive rod: characterization, two models, and tracking by the inverse of each",
+    "Runs damped-oscillation, identifies the models quadratic-play and preisach-signed, and brings the strain to 20 "
+    "targets by the inverse of each, without and with feedback.",
+    carry_out,
+)

@@ -1,0 +1,43 @@
+"""What the tests of several folders share."""
+
+import os
+import select
+import threading
+from contextlib import contextmanager
+
+import pytest
+
+
+@contextmanager
+def _pseudo_terminal(server):
+    import tty
+
+    master, slave = os.openpty()
+    wake, waker = os.pipe()
+    # Raw at both ends before anybody opens it; and this slave stays open, as otherwise a client that closes its
+    # own makes reads from the master fail.
+    tty.setraw(master)
+    tty.setraw(slave)
+
+    def serve():
+        while wake not in select.select([master, wake], [], [])[0]:
+            # In two pieces, as a line may deliver them.
+            reply = server.receive(os.read(master, 4096))
+            os.write(master, reply[:4])
+            os.write(master, reply[4:])
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.write(waker, b"x")
+        thread.join()
+        for end in (master, slave, wake, waker):
+            os.close(end)
+
+
+@pytest.fixture(scope="session")
+def pseudo_terminal():
+    """Serve an instrument at the path that this context manager gives; afterwards it is gone."""
+    return _pseudo_terminal

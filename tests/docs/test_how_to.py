@@ -1,0 +1,74 @@
+"""The pages of `docs/how-to`, executed: a reader who copies their blocks in order gets what the page says.
+
+A block with `file: NAME` after its language is written to that file, `sh` and `python` without it are run, and each
+line of a `text` block has to occur in what the block before it has printed.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGES = Path(__file__).parents[2] / "docs" / "how-to"
+BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """What a reader has: the bench and pip, which here installs into a folder of its own, offline."""
+    site = tmp_path / "site"
+    scripts = Path(sys.executable).parent
+    return {
+        **os.environ,
+        "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(site),
+        "PIP_TARGET": str(site),
+        "PIP_NO_INDEX": "1",
+        "PIP_NO_DEPS": "1",
+        # This is how pip spells --no-build-isolation in its environment.
+        "PIP_NO_BUILD_ISOLATION": "0",
+        "COLUMNS": "200",
+    }
+
+
+@pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
+def test_page(page, tmp_path, environment):
+    printed = None
+    for language, name, text in BLOCK.findall((PAGES / f"{page}.md").read_text()):
+        if name:
+            (tmp_path / name).write_text(text)
+        elif language == "text":
+            assert printed is not None, f"{page}: a text block stands after no block that prints"
+            for line in filter(None, map(str.strip, text.splitlines())):
+                assert line in printed, f"{page}: {line!r} is not in\n{printed}"
+        else:
+            command = {"sh": ["sh", "-e", "-c"], "python": [sys.executable, "-c"]}[language]
+            done = subprocess.run(
+                [*command, text],
+                cwd=tmp_path,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=240,
+                check=False,
+            )
+            printed = done.stdout
+            assert done.returncode == 0, f"{page}: {text}\n{printed}{done.stderr}"
+
+
+def test_there_are_the_four_pages():
+    pages = {path.stem for path in PAGES.glob("*.md")}
+    assert pages >= {"add-a-device", "add-a-rig", "add-a-model", "add-a-protocol"}
+    for page in pages:
+        blocks = BLOCK.findall((PAGES / f"{page}.md").read_text())
+        assert any(name for _, name, _ in blocks), page
+        assert any(not name and language in ("sh", "python") for language, name, _ in blocks), page
+
+
+@pytest.mark.parametrize("page", sorted(PAGES.glob("*.md")), ids=lambda path: path.stem)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
+        assert (page.parent / target).resolve().exists(), target
