@@ -3,8 +3,8 @@
 A rig file binds a slot by a table::
 
     [roles.drive]
-    device = "tec"                      # takes the set-points
-    reading = "tec_temperature"         # signal that says what it did; the device's first signal if not given
+    device = "plate"                    # takes the set-points
+    reading = "plate_temperature"       # signal that says what it did; the device's first signal if not given
     unit = "°C"                         # of the reading, checked when the device is connected
     range = [21.0, 84.0]                # default range of protocols
     rest = 21.0                         # where it idles
@@ -16,7 +16,7 @@ A rig file binds a slot by a table::
     timeout = 300.0
 
     [roles.response]
-    signal = "curvature"
+    signal = "bending"
 
 A protocol names the slots that it needs and the kind of each, and takes its defaults from the binding.
 """
@@ -27,7 +27,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from bench.devices import Actuator, Device, Signal
 from bench.errors import ConfigurationError
@@ -91,6 +91,15 @@ class RoleTable(_Table):
         if self.signal and self.reading:
             raise ValueError("reading belongs to a device; a role that only measures has a signal")
         return self
+
+    @field_validator("prompt")
+    @classmethod
+    def _can_be_filled_in(cls, text: str) -> str:
+        try:
+            text.format(value=0.0, unit="")
+        except (KeyError, IndexError, ValueError, AttributeError) as error:
+            raise ValueError(f"only {{value}} and {{unit}} can stand in: {type(error).__name__}: {error}") from None
+        return text
 
     @property
     def low(self) -> float | None:
@@ -243,7 +252,10 @@ def _bind(
 
 def reading_of(table: RoleTable, devices: Mapping[str, Device]) -> str:
     """Return the signal of a role: the one that is named, else the first of its device."""
-    return table.signal or table.reading or devices[table.device].signals[0].name
+    if table.signal or table.reading:
+        return table.signal or table.reading
+    # A device without signals of its own has its set-point.
+    return next((signal.name for signal in devices[table.device].signals), f"{table.device}_setpoint")
 
 
 def check_roles(

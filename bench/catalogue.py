@@ -63,7 +63,7 @@ class Catalogue:
         packages |= {name: package for name, package in packaged.packages.items() if package != registry.OWN_PACKAGE}
         models = identifiable_models()
         return cls(
-            rigs=loaded(packaged_rigs(), lambda name, _: load_rig(name)),
+            rigs=loaded(packaged_rigs(problems), lambda name, _: load_rig(name)),
             protocols=packaged.protocols,
             models={
                 name: text for name, text in loaded(registry.entries("models"), _summary).items() if name in models

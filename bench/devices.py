@@ -55,7 +55,7 @@ class Signal:
     Attributes
     ----------
     name : str
-        Unique within the rig, such as `tec_temperature`.
+        Unique within the rig, such as `plate_temperature`.
     unit : str
         Unit of the values, such as `°C`, `A`, `1/m`; `1` for a plain number.
     description : str

@@ -122,9 +122,10 @@ def check_own_packages() -> None:
     home = Path(__file__).resolve().parents[1]
     for name in _OWN_FOLDERS:
         spec = importlib.util.find_spec(name)
-        folders = [Path(place).resolve() for place in (spec.submodule_search_locations or ())] if spec else []
-        if (home / name).is_dir() and folders and folders[0] != home / name:
+        # A folder, with or without `__init__.py`, or a single file.
+        places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
+        if (home / name).is_dir() and places and Path(places[0]).resolve() != home / name:
             raise ConfigurationError(
-                f"the folder {folders[0]} hides the bench's own package {name!r} ({home / name}); "
+                f"{Path(places[0]).resolve()} hides the bench's own package {name!r} ({home / name}); "
                 f"run the bench from another folder, or rename that one"
             )

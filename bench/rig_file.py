@@ -8,13 +8,13 @@ A rig file is TOML::
     [rig]
     title = "a heated plate"
 
-    [devices.tec]                                  # any name; its signals are named after it
+    [devices.plate]                                # any name; its signals are named after it
     driver = "drivers.meerstetter:MeerstetterTEC"  # module:Class, or a name registered in `bench.devices`
     port = "/dev/ttyUSB0"                          # all other keys are the driver's own
     ...
 
     [roles.drive]                                  # what protocols ask for; see `bench.binding`
-    device = "tec"
+    device = "plate"
     ...
 
     [protocols.creep]                              # parameters of a protocol on this rig, in place of its defaults
@@ -25,14 +25,14 @@ A rig file is TOML::
     ...
 
     [[interlocks]]                                 # the run ends in the safe state outside of these
-    signal = "tec_sink_temperature"
+    signal = "plate_sink_temperature"
     high = 60.0
 
     [telemetry]
     period = 1.0                                   # s between two quick readings during holds
 
     [dashboard]                                    # what the live view draws against what
-    input = "tec_temperature"
+    input = "plate_temperature"
     output = "bending"
     ...
 
@@ -183,19 +183,21 @@ class RigFile:
         return self.laboratory is not None
 
 
-def packaged_rigs() -> dict[str, registry.Entry]:
+def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
     """Return the rigs of all installed packages by name, each with the entry that brings it.
 
     An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is left
-    out. Raises ConfigurationError if two packages bring a rig of the same name.
+    out, and joins `problems`. Raises ConfigurationError if two packages bring a rig of the same name.
     """
     found: dict[str, registry.Entry] = {}
     for entry in registry.entries("rigs").values():
         try:
-            folder = resources.files(entry.load())
-        except ConfigurationError:
+            package = entry.load()
+        except ConfigurationError as error:
+            if problems is not None:
+                problems.append(str(error))
             continue
-        for file in folder.iterdir():
+        for file in resources.files(package).iterdir():
             name = file.name.removesuffix(".toml")
             if name == file.name:
                 continue
@@ -215,7 +217,7 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
     name : str
         Name of a packaged rig, or path of a file that ends in `.toml`.
     overrides : mapping of str to str, optional
-        Values by dotted key, such as `{"devices.tec.port": "/dev/ttyUSB1"}`, that replace the file's.
+        Values by dotted key, such as `{"devices.plate.port": "/dev/ttyUSB1"}`, that replace the file's.
 
     Raises
     ------
@@ -241,11 +243,11 @@ def _read(name: str) -> tuple[str, str]:
             # Last, so that nothing there hides an installed module.
             sys.path.append(folder)
         return name, text
-    packaged = packaged_rigs()
+    left_out: list[str] = []
+    packaged = packaged_rigs(left_out)
     if name not in packaged:
-        raise ConfigurationError(
-            f"there is no rig {name!r}; there are: {', '.join(packaged)} (or a file of your own, path/to/rig.toml)"
-        )
+        known = f"{', '.join(packaged)} (or a file of your own, path/to/rig.toml)"
+        raise ConfigurationError("\n".join([f"there is no rig {name!r}; there are: {known}", *left_out]))
     return f"{name}.toml", (resources.files(packaged[name].load()) / f"{name}.toml").read_text(encoding="utf-8")
 
 

@@ -103,7 +103,7 @@ def run(
         typer.Option(
             "--override",
             metavar="KEY=VALUE",
-            help="Replace a value of the rig file, such as devices.tec.port=/dev/ttyUSB1; may come several times.",
+            help="Replace a value of the rig file, such as devices.NAME.port=/dev/ttyUSB1; may come several times.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")] = 0,

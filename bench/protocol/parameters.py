@@ -204,7 +204,10 @@ class ProtocolDefinition:
         try:
             parameters = self.parameters.model_validate(merged)
         except ValidationError as error:
-            raise ConfigurationError("\n".join(self._explain(error))) from None
+            from_file = {
+                name: f"{path}: protocols.{self.name}.{name}: " for name in defaults or {} if name not in settings
+            }
+            raise ConfigurationError("\n".join(self._explain(error, from_file))) from None
         for name in self.parameters.model_fields:
             choices = self._extra(name).get("choices")
             if choices is not None and getattr(parameters, name) not in choices():
@@ -271,7 +274,7 @@ class ProtocolDefinition:
             default = "must be given" if info.default is PydanticUndefined else str(info.default)
         return ParameterHelp(name, default, unit, allowed, info.description or "")
 
-    def _explain(self, error: ValidationError) -> Iterator[str]:
+    def _explain(self, error: ValidationError, from_file: Mapping[str, str]) -> Iterator[str]:
         for problem in error.errors():
             name = ".".join(str(part) for part in problem["loc"]) or "parameters"
             if problem["type"] == "extra_forbidden":
@@ -284,7 +287,7 @@ class ProtocolDefinition:
                 if problem["type"] == "missing" and isinstance(source := self._extra(name).get("default"), FromSlot):
                     given += f" (the rig file does not say {source.text})"
                 yield (
-                    f"protocol {self.name}: parameter {name} {given}; "
+                    f"{from_file.get(name, '')}protocol {self.name}: parameter {name} {given}; "
                     f"allowed: {entry.allowed}{unit} ({problem['msg']})"
                 )
             else:

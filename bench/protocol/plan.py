@@ -100,7 +100,7 @@ class _Echo(dict[str, float]):
         self.setpoints: dict[str, float] = {}
 
     def __missing__(self, signal: str) -> float:
-        # The longest name that fits: beside `tec` there may be `tec_two`.
+        # The longest name that fits: beside `plate` there may be `plate_two`.
         device = signal
         while device and device not in self.setpoints:
             device = device.rpartition("_")[0]

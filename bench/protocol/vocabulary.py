@@ -6,11 +6,11 @@ once the step had settled::
     class Parameters(ProtocolParameters):
         target: float = parameter(60.0, unit="°C", low=-10, high=95, help="where to go")
 
-    @protocol(needs=("tec",))
+    @protocol(needs=("plate",))
     def soak(parameters: Parameters) -> Messages:
         \"\"\"Hold one temperature and read it.\"\"\"
-        reading = yield Step({"tec": parameters.target}, Dwell(30.0))
-        yield Note(f"arrived at {reading['tec_temperature']:.2f} °C")
+        reading = yield Step({"plate": parameters.target}, Dwell(30.0))
+        yield Note(f"arrived at {reading['plate_temperature']:.2f} °C")
 
 Messages name devices and signals of a rig. A protocol for any rig asks for slots instead, and takes the names from
 their binding in the rig file; see `bench.binding`.
