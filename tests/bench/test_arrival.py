@@ -23,7 +23,8 @@ def run(folder, rig, *steps, overrides=None):
 
     def go(parameters):
         """Go."""
-        yield from steps
+        for step in steps:
+            yield step  # noqa: UP028
 
     go.__annotations__ = {"parameters": Nothing}
     definition = protocol(needs=())(go)
