@@ -23,8 +23,9 @@ def run(folder, rig, *steps, overrides=None):
 
     def go(parameters):
         """Go."""
-        for step in steps:
-            yield step  # noqa: UP028
+        remaining = list(steps)
+        while remaining:
+            yield remaining.pop(0)
 
     go.__annotations__ = {"parameters": Nothing}
     definition = protocol(needs=())(go)
