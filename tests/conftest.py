@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from bench.cli import main
+
 
 @contextmanager
 def _pseudo_terminal(server):
@@ -41,3 +43,16 @@ def _pseudo_terminal(server):
 def pseudo_terminal():
     """Serve an instrument at the path that this context manager gives; afterwards it is gone."""
     return _pseudo_terminal
+
+
+@pytest.fixture
+def bench(capsys):
+    """Run a command in this process; return exit code, standard output and standard error."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stopped:
+            main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run

@@ -22,12 +22,8 @@ OF_A_RIG = re.compile(
 WHERE_A_RIG_IS_NAMED = {
     # Executed examples need a rig that is installed.
     "bench/face.py": {"vo2", "tec_temperature"},
-    "bench/cli/app.py": {"vo2"},
-    # The title of the paper, and where each default was found.
+    # The title of the paper.
     "bench/control/tracking.py": {"VO2"},
-    "bench/control/latched.py": {"VO2"},
-    "bench/control/baselines.py": {"VO2"},
-    "bench/hysteresis/preisach.py": {"VO2"},
     # A format that files of former versions have.
     "bench/model_file.py": {"hybrid"},
 }

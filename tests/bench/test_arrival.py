@@ -23,7 +23,9 @@ def run(folder, rig, *steps, overrides=None):
 
     def go(parameters):
         """Go."""
-        yield from steps
+        remaining = list(steps)
+        while remaining:
+            yield remaining.pop(0)
 
     go.__annotations__ = {"parameters": Nothing}
     definition = protocol(needs=())(go)

@@ -22,19 +22,6 @@ WATCHED = ["--rig", "vo2", "--override", "devices.tec.watchdog=0", "--override",
 SHORT_CREEP = ["--set", "duration=4", "--set", "settling=2"]
 
 
-@pytest.fixture
-def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
-
-
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")

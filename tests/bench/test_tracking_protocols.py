@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.cli import main
 from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_levels
 from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
@@ -17,19 +16,6 @@ from bench.model_file import ModelFile
 from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
-
-
-@pytest.fixture
-def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -27,19 +27,6 @@ CHARACTERIZATION = ("force-voltage", "length-voltage", "length-force", "length-v
 CONTROL = ("length-control", "force-control")
 
 
-@pytest.fixture
-def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
-
-
 def assignments(option, values):
     return [part for key, value in values.items() for part in (option, f"{key}={value}")]
 
