@@ -9,17 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bench import registry
-from bench.control.baselines import IntegralControl, LookUp
-from bench.control.following import ClosedLoopFollower, IntegralFollower, OpenLoopFollower
-from bench.control.latched import Latched
-from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
+from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
+from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
+from bench.control.latched import Latched, LatchParameters
+from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
 from bench.model_file import ModelFile, load_model
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +43,7 @@ class ControllerSetup:
     policy : {"nearest", "paper"}
         Which answer of the inverse is taken where there are several.
     options : mapping
-        Further numbers that a task's controllers need, such as the time for each target.
+        Numbers of the controller in place of its defaults, and others that the task has.
     """
 
     name: str = ""
@@ -60,6 +64,21 @@ class ControllerSetup:
                 f"{self.model.name}"
             )
         return self.model.operator.inverse(self.policy)
+
+    @property
+    def spans(self) -> Spans:
+        """Widths of the model's ranges."""
+        return Spans.of(self.model.operator)
+
+    def tuned(self, scaled: Callable[[Spans], T], options: Mapping[str, Any] | None = None) -> T:
+        """Return the controller's numbers: scaled to the model's ranges, with `options` in their place.
+
+        Raises ConfigurationError if there is no such number, or its value is not allowed.
+        """
+        try:
+            return tuned(scaled(self.spans), self.options if options is None else options)
+        except ValueError as error:
+            raise ConfigurationError(f"controller {self.name}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -112,7 +131,14 @@ def _latched(setup: ControllerSetup) -> Latched:
             f"controller {setup.name} needs a Preisach model with a reversible part, by which a locked output is "
             f"moved; this one is {setup.model.name}"
         )
-    return Latched(inverse, setup.state, setup.limits)
+    options = dict(setup.options)
+    correction = tuned(Latched.correction(setup.spans), options.pop("correction", {}))
+    return Latched(inverse, setup.state, setup.limits, setup.tuned(LatchParameters.scaled, options), correction)
+
+
+def _integral(setup: ControllerSetup) -> IntegralParameters:
+    low, high = setup.model.operator.evaluate(setup.model.operator.input_range)
+    return setup.tuned(partial(IntegralParameters.scaled, falls=bool(high < low)))
 
 
 OPEN_LOOP_INVERSE = ControllerSpec(
@@ -120,19 +146,22 @@ OPEN_LOOP_INVERSE = ControllerSpec(
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(s.inverse(), s.state, s.limits),
+    lambda s: ClosedLoopInverse(s.inverse(), s.state, s.limits, s.tuned(CorrectionParameters.scaled)),
 )
 LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
-INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits))
+INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits, _integral(s)))
 OPEN_LOOP_FOLLOWER = ControllerSpec(
-    "the inverse of the model, without feedback", lambda s: OpenLoopFollower(s.inverse(), s.state, s.limits)
+    "the inverse of the model, without feedback",
+    lambda s: OpenLoopFollower(s.inverse(), s.state, s.limits, s.tuned(FollowingParameters.scaled)),
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopFollower(s.inverse(), s.state, s.limits),
+    lambda s: ClosedLoopFollower(s.inverse(), s.state, s.limits, s.tuned(FollowingParameters.scaled)),
 )
-INTEGRAL_FOLLOWER = ControllerSpec("integral action without a model", lambda s: IntegralFollower(s.limits))
+INTEGRAL_FOLLOWER = ControllerSpec(
+    "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))
+)
 
 
 def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile:

@@ -62,7 +62,8 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
 
     reading = yield from reset_unknown_memory(parameters, slots)
     state = model.operator.saturated_state(-1, reading[drive.signal])
-    setup = ControllerSetup(model=model, limits=limits, state=state)
+    options = parameters.tuning.get(parameters.controller, {})
+    setup = ControllerSetup(model=model, limits=limits, state=state, options=options)
     follower = make_controller("follow", parameters.controller, setup)
 
     def follow(reference: Callable[[float], float], seconds: float, timeout: float, label: str) -> Control:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from bench.controllers import load_model_for, saturated_below
 from bench.devices import Actuator, Signal
@@ -71,6 +71,9 @@ class ControlledParameters(LoadedParameters):
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
     reset: float = parameter(from_slot("drive", "saturating"), unit=DRIVE, help="where the memory is reset")
     hottest: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point allowed")
+    tuning: dict[str, dict[str, Any]] = parameter(
+        {}, unit="", help="numbers of a controller in place of its defaults, as a table of the rig file for each"
+    )
 
 
 def load_checked_model(parameters: ControlledParameters, slots: Slots) -> ModelFile:

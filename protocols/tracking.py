@@ -62,7 +62,8 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
 
     reading = yield from reset_unknown_memory(parameters, slots)
     state = model.operator.saturated_state(-1, reading[drive.signal])
-    setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state)
+    options = parameters.tuning.get(parameters.controller, {})
+    setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state, options=options)
     controller = make_controller("target", parameters.controller, setup)
     yield Phase(parameters.controller)
     errors: list[float] = []

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from bench.control.tracking import Sample, Script, Scripted, Trace, check_positive
+from bench.control.tuning import Spans
 from bench.hysteresis import Operator, Reach
 from bench.hysteresis.inverse import TableInverse
 
@@ -75,15 +76,14 @@ class IntegralParameters:
     gain : float
         Input units per second for one output unit of error; negative for an actuator whose output falls.
         On a branch of slope s the closed loop has the time constant 1 / (gain s), which should not be
-        shorter than the input takes to follow: the default gives 0.7 s at 280 (1/m)/K, the steepest of
-        the film of Zhang et al. 2013, and 7 s where it is a tenth of that.
+        shorter than the input takes to follow.
     period : float
         Time between two corrections, s.
     duration : float
         Time for each target, s; not used where the reference moves.
     """
 
-    gain: float = 0.005
+    gain: float
     period: float = 0.5
     duration: float = 8.0
 
@@ -91,6 +91,11 @@ class IntegralParameters:
         check_positive(self, "period", "duration")
         if not math.isfinite(self.gain) or self.gain == 0.0:
             raise ValueError(f"gain: expected a number other than 0, got {self.gain}")
+
+    @classmethod
+    def scaled(cls, spans: Spans, *, falls: bool = False) -> IntegralParameters:
+        """Return the defaults for a model: 7 s where its slope is the mean one; `falls` turns the sign."""
+        return cls((-1.0 if falls else 1.0) * spans.input / spans.output / 7.0)
 
 
 class IntegralControl(Scripted):
@@ -107,9 +112,9 @@ class IntegralControl(Scripted):
         Gain and times.
     """
 
-    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
+    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters) -> None:
         super().__init__(limits)
-        self._parameters = parameters or IntegralParameters()
+        self._parameters = parameters
 
     def _run(self, target: float, reading: Sample) -> Script:
         p = self._parameters

@@ -10,6 +10,7 @@ from typing import Any
 from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.tracking import ControllerBase, check_positive
+from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Reach, _checks
 
 
@@ -22,7 +23,7 @@ class FollowingParameters:
     lead : float
         Time by which the reference is extrapolated beyond the end of the coming period, in periods: the
         input's lag behind its set-point, less the half period that a held set-point stands for. The default
-        is for 0.5 s and a plate of 2.2 rad/s and damping 0.9, that is a lag of 2 * 0.9 / 2.2 = 0.82 s.
+        is for an input that follows within half a period.
     walk_variance : float
         Variance by which the model's error changes within one period, output units squared. Large against
         the reading's, as model error and not sensor noise dominates: the gain then is near 1.
@@ -30,14 +31,20 @@ class FollowingParameters:
         Variance of one reading, and of what the input wanders unseen, output units squared.
     """
 
-    lead: float = 1.14
-    walk_variance: float = 30.0
-    reading_variance: float = 1.0
+    walk_variance: float
+    reading_variance: float
+    lead: float = 0.0
 
     def __post_init__(self) -> None:
         check_positive(self, "walk_variance", "reading_variance")
         if not 0.0 <= self.lead < math.inf:
             raise ValueError(f"lead: expected a number of periods, at least 0, got {self.lead}")
+
+    @classmethod
+    def scaled(cls, spans: Spans) -> FollowingParameters:
+        """Return the defaults for a model: 0.05 % of the output range is read, the model errs by 30 times that."""
+        reading = 5e-4 * spans.output
+        return cls(30.0 * reading**2, reading**2)
 
 
 class _Follower(ControllerBase, ABC):
@@ -84,7 +91,7 @@ class OpenLoopFollower(_Follower):
     ) -> None:
         super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
-        self._parameters = p = parameters or FollowingParameters()
+        self._parameters = p = parameters or FollowingParameters.scaled(Spans.of(inverse.operator))
         if self._corrects:
             self._estimator = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
 
@@ -138,9 +145,9 @@ class IntegralFollower(_Follower):
         Gain and period; the error is that against the reference which was for now.
     """
 
-    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters | None = None) -> None:
+    def __init__(self, limits: tuple[float, float], parameters: IntegralParameters) -> None:
         super().__init__(limits)
-        self._parameters = parameters or IntegralParameters()
+        self._parameters = parameters
 
     def _answer_to(self, step: float, output: float) -> float:
         if not self._is_known(output):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from bench.control.estimators import DisturbanceEstimator
@@ -16,6 +16,7 @@ from bench.control.tracking import (
     Script,
     check_positive,
 )
+from bench.control.tuning import Spans
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.hysteresis.inverse import PreisachInverse
 
@@ -77,31 +78,31 @@ class LatchParameters:
         inverse alone is used.
     """
 
-    approach: float = 25.0
+    approach: float
+    arrival: Arrival
+    creep_least: float
+    creep_most: float
+    creep_gain: float
+    creep_offset: float
+    creep_fast: float
+    creep_until: float
+    step_back: float
+    nearest: float
+    farthest: float
+    lock_within: float
+    accept: float
+    walk_variance: float
+    reading_variance: float
+    end_margin: float
     approach_done: float = 1.8
     approach_corrections: int = 8
-    arrival: Arrival = field(default_factory=lambda: Arrival(tolerance=0.1, hold=0.2))
-    creep_least: float = 0.015
-    creep_most: float = 0.12
-    creep_gain: float = 0.003
-    creep_offset: float = 1.8
     creep_horizon: float = 4.0
-    creep_fast: float = 0.3
-    creep_until: float = 3.3
     creep_limit: float = 60.0
-    step_back: float = 0.5
-    nearest: float = 0.08
-    farthest: float = 1.1
-    lock_within: float = 4.5
     tries: int = 10
     settle: float = 1.0
     fine_moves: int = 5
     fine_period: float = 1.0
     fine_gain: float = 1.0
-    accept: float = 1.5
-    walk_variance: float = 1e-2
-    reading_variance: float = 0.14
-    end_margin: float = 5.0
 
     def __post_init__(self) -> None:
         check_positive(self)
@@ -114,6 +115,29 @@ class LatchParameters:
             raise ValueError(f"creep_least: expected at most creep_most = {self.creep_most}, got {self.creep_least}")
         if self.fine_gain >= 2.0:
             raise ValueError(f"fine_gain: expected less than 2, where the loop is unstable, got {self.fine_gain}")
+
+    @classmethod
+    def scaled(cls, spans: Spans) -> LatchParameters:
+        """Return the defaults for a model, in proportion to its ranges; times suit an input that arrives in 1 s."""
+        u, y = spans
+        return cls(
+            approach=1.3e-2 * y,
+            arrival=Arrival(tolerance=1.6e-3 * u, hold=0.2),
+            creep_least=2.4e-4 * u,
+            creep_most=1.9e-3 * u,
+            creep_gain=0.09 * u / y,
+            creep_offset=9.5e-4 * y,
+            creep_fast=4.8e-3 * u,
+            creep_until=1.75e-3 * y,
+            step_back=8e-3 * u,
+            nearest=1.3e-3 * u,
+            farthest=1.75e-2 * u,
+            lock_within=2.4e-3 * y,
+            accept=8e-4 * y,
+            walk_variance=(5e-5 * y) ** 2,
+            reading_variance=(2e-4 * y) ** 2,
+            end_margin=2.6e-3 * y,
+        )
 
 
 class Latched(Correcting):
@@ -148,6 +172,11 @@ class Latched(Correcting):
         If the model has no reversible part.
     """
 
+    @staticmethod
+    def correction(spans: Spans) -> CorrectionParameters:
+        """Return the default numbers of the incremental inverse: more corrections, and closer, than alone."""
+        return replace(CorrectionParameters.scaled(spans), corrections=9, close_enough=1e-3 * spans.output)
+
     def __init__(
         self,
         inverse: PreisachInverse,
@@ -158,8 +187,9 @@ class Latched(Correcting):
     ) -> None:
         if inverse.operator.reversible is None:
             raise ValueError("inverse: expected a model with a reversible part, by which a locked output is moved")
-        super().__init__(inverse, state, limits, correction or CorrectionParameters(corrections=9, close_enough=2.0))
-        self._parameters = parameters or LatchParameters()
+        spans = Spans.of(inverse.operator)
+        super().__init__(inverse, state, limits, correction or Latched.correction(spans))
+        self._parameters = parameters or LatchParameters.scaled(spans)
         self._poll = self._parameters.arrival.poll
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._operator = inverse.operator

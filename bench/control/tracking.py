@@ -29,6 +29,7 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
 from bench.control.estimators import DisturbanceEstimator
+from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
 
 # Part of the output at stake within which a clipped answer still counts as met.
@@ -161,13 +162,18 @@ class Arrival:
         Time after which to go on without arrival, s. The estimators need none: they go by the measured input.
     """
 
-    tolerance: float = 0.03
+    tolerance: float
     hold: float = 0.4
     poll: float = 0.1
     patience: float = 15.0
 
     def __post_init__(self) -> None:
         check_positive(self)
+
+    @classmethod
+    def scaled(cls, spans: Spans) -> Arrival:
+        """Return the defaults for a model: a tolerance of 0.05 % of the input range."""
+        return cls(tolerance=5e-4 * spans.input)
 
 
 def check_positive(parameters: object, *names: str) -> None:
@@ -427,8 +433,8 @@ class CorrectionParameters:
         Error below which no further correction is made, output units: a correction that must turn back
         crosses a loop of the hysteresis, and then may well end further off.
     walk_variance : float
-        Variance by which the model's error changes between two corrections, output units squared. With the
-        default the gain settles at 0.8; results change little over a decade.
+        Variance by which the model's error changes between two corrections, output units squared. Three times
+        the other lets the gain settle at 0.8; results change little over a decade.
     reading_variance : float
         Variance of one value of the disturbance, output units squared: noise of the sensor, and what the
         input wanders unseen while it is read.
@@ -436,16 +442,22 @@ class CorrectionParameters:
         When the actuator has arrived at a set-point.
     """
 
+    close_enough: float
+    walk_variance: float
+    reading_variance: float
+    arrival: Arrival
     corrections: int = 3
-    close_enough: float = 5.0
-    walk_variance: float = 3.0
-    reading_variance: float = 1.0
-    arrival: Arrival = Arrival()
 
     def __post_init__(self) -> None:
         check_positive(self, "close_enough", "walk_variance", "reading_variance")
         if self.corrections < 0:
             raise ValueError(f"corrections: expected at least 0, got {self.corrections}")
+
+    @classmethod
+    def scaled(cls, spans: Spans) -> CorrectionParameters:
+        """Return the defaults for a model: 0.25 % of the output range is close, 0.05 % is read."""
+        reading = 5e-4 * spans.output
+        return cls(2.5e-3 * spans.output, 3.0 * reading**2, reading**2, Arrival.scaled(spans))
 
 
 class Correcting(Scripted):
@@ -460,7 +472,7 @@ class Correcting(Scripted):
     ) -> None:
         super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
         self._inverse = inverse
-        self._correction = parameters = parameters or CorrectionParameters()
+        self._correction = parameters = parameters or CorrectionParameters.scaled(Spans.of(inverse.operator))
         self._poll = parameters.arrival.poll
         self._estimator: DisturbanceEstimator = DisturbanceEstimator(
             walk_variance=parameters.walk_variance, reading_variance=parameters.reading_variance

@@ -267,7 +267,7 @@ class ProtocolDefinition:
             allowed = "any text" if info.annotation is str else "any number"
         source = extra.get("default")
         if name in given:
-            default = str(given[name])
+            default = "of the rig file" if isinstance(given[name], dict) else str(given[name])
         elif isinstance(source, FromSlot):
             default = f"the rig's: {source.text}"
         else:

@@ -1,6 +1,7 @@
 """Tracking controllers on the emulated VO2 film, and the rules that all of them keep."""
 
 import math
+from dataclasses import asdict, replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -13,6 +14,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
 from bench.control.references import modulated_sine, tracking_targets
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.control.tuning import Spans, tuned
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
 from bench.hysteresis.inverse import PreisachInverse, Reach
 
@@ -23,7 +25,26 @@ FOLLOWERS = ["open-follower", "closed-follower", "integral-follower"]
 WITH_MEMORY = ["open", "closed", "latched", "open-follower", "closed-follower"]
 
 
+# Numbers that suit the film, K, 1/m and s; the defaults are in proportion to the ranges of a model.
+CORRECTION = CorrectionParameters(5.0, 3.0, 1.0, Arrival(0.03))
+INTEGRAL = IntegralParameters(0.005)
+LATCH = LatchParameters(
+    approach=25.0, arrival=Arrival(0.1, hold=0.2), creep_least=0.015, creep_most=0.12, creep_gain=0.003,
+    creep_offset=1.8, creep_fast=0.3, creep_until=3.3, step_back=0.5, nearest=0.08, farthest=1.1, lock_within=4.5,
+    accept=1.5, walk_variance=1e-2, reading_variance=0.14, end_margin=5.0,
+)  # fmt: skip
+NUMBERS = {
+    "closed": {"parameters": CORRECTION},
+    "latched": {"parameters": LATCH, "correction": replace(CORRECTION, corrections=9, close_enough=2.0)},
+    "integral": {"parameters": INTEGRAL},
+    "integral-follower": {"parameters": INTEGRAL},
+    "open-follower": {"parameters": FollowingParameters(30.0, 1.0, lead=1.14)},
+    "closed-follower": {"parameters": FollowingParameters(30.0, 1.0, lead=1.14)},
+}
+
+
 def make(name, models, limits=(LOW, HIGH), **options):
+    options = NUMBERS.get(name, {}) | options
     inverse = PreisachInverse(models.film)
     makers = {
         "open": lambda: OpenLoopInverse(inverse, limits=limits, **options),
@@ -337,7 +358,7 @@ class TestReach:
 
 class TestAntiWindup:
     def test_an_integrator_leaves_its_limit_at_once(self):
-        controller = IntegralControl((LOW, HIGH), IntegralParameters(duration=1e4))
+        controller = IntegralControl((LOW, HIGH), replace(INTEGRAL, duration=1e4))
         setpoints = [controller.aim(1e4, 0.0, 50.0, 0.0).setpoint]
         setpoints += [controller.update(n, 50.0, 0.0).setpoint for n in range(1000)]
         assert setpoints[-1] == HIGH
@@ -345,7 +366,7 @@ class TestAntiWindup:
         assert controller.update(1001.0, 84.0, 1e4 + 100.0).setpoint == pytest.approx(HIGH - 0.5 * 0.005 * 100.0)
 
     def test_a_disturbance_is_measured_and_not_summed_up(self, models):
-        patient = CorrectionParameters(corrections=40)
+        patient = replace(CORRECTION, corrections=40)
         burdened, fresh = IdealActuator(models.film), IdealActuator(models.film)
         first, second = make("closed", models, parameters=patient), make("closed", models)
         burdened.reach(first, 5000.0)
@@ -379,7 +400,7 @@ class TestClosedLoop:
         assert controller.update(t, setpoint, 500.0).setpoint != setpoint
 
     def test_does_not_wait_for_ever(self, models):
-        parameters = CorrectionParameters(arrival=Arrival(patience=2.0))
+        parameters = replace(CORRECTION, arrival=Arrival(0.03, patience=2.0))
         controller = make("closed", models, parameters=parameters)
         first = controller.aim(900.0, 0.0, 21.0, -3.0)
         commands = [controller.update(0.1 * n, 50.0, 500.0) for n in range(1, 25)]
@@ -390,11 +411,11 @@ class TestClosedLoop:
         with pytest.raises(ValueError, match="tolerance"):
             Arrival(tolerance=0.0)
         with pytest.raises(ValueError, match="corrections"):
-            CorrectionParameters(corrections=-1)
+            replace(CORRECTION, corrections=-1)
         with pytest.raises(ValueError, match="walk_variance"):
-            CorrectionParameters(walk_variance=math.nan)
+            replace(CORRECTION, walk_variance=math.nan)
         with pytest.raises(ValueError, match="lead"):
-            FollowingParameters(lead=-1.0)
+            FollowingParameters(30.0, 1.0, lead=-1.0)
 
 
 class TestLatched:
@@ -405,7 +426,7 @@ class TestLatched:
         every=st.integers(1, 40),
     )
     def test_the_fine_loop_never_leaves_the_locked_stretch(self, models, target, disturbances, every):
-        p = LatchParameters()
+        p = LATCH
         actuator, controller = IdealActuator(models.film), make("latched", models)
         command = controller.aim(target, 0.0, *actuator.read())
         fine = 0
@@ -465,13 +486,13 @@ class TestLatched:
 
     def test_the_parameters_keep_the_step_within_the_stretch(self):
         with pytest.raises(ValueError, match="step_back"):
-            LatchParameters(step_back=1.5)
+            replace(LATCH, step_back=1.5)
         with pytest.raises(ValueError, match="creep_least"):
-            LatchParameters(creep_least=0.2)
+            replace(LATCH, creep_least=0.2)
         with pytest.raises(ValueError, match="fine_gain"):
-            LatchParameters(fine_gain=2.0)
+            replace(LATCH, fine_gain=2.0)
         with pytest.raises(ValueError, match="approach"):
-            LatchParameters(approach=-1.0)
+            replace(LATCH, approach=-1.0)
 
     def test_needs_a_reversible_part(self):
         levels = uniform_levels(0.0, 1.0, 4)
@@ -556,3 +577,40 @@ class TestTrace:
         controller = make("open", models)
         controller.aim(900.0, 0.0, 50.0, 300.0)
         assert controller.trace.predicted == models.film.value(controller.state)
+
+
+class TestTuning:
+    """Defaults in proportion to the ranges of a model, and what a rig puts in their place."""
+
+    spans = Spans(63.0, 1900.0)
+
+    @pytest.mark.parametrize(
+        "numbers", [CorrectionParameters, FollowingParameters, IntegralParameters, LatchParameters, Arrival]
+    )
+    def test_other_units_of_the_same_model_change_nothing_but_the_units(self, numbers):
+        """In mK and 1/mm every number with a unit changes by its unit's factor, every other not at all."""
+        here, there = asdict(numbers.scaled(self.spans)), asdict(numbers.scaled(Spans(63e3, 1.9)))
+        factors = {1.0, 1e3, 1e-3, 1e-6, 1e6}
+        for name, value in here.items():
+            pair = (value["tolerance"], there[name]["tolerance"]) if isinstance(value, dict) else (value, there[name])
+            assert any(pair[1] == pytest.approx(factor * pair[0]) for factor in factors), name
+
+    def test_an_output_that_falls_turns_the_integrator(self):
+        assert IntegralParameters.scaled(self.spans, falls=True).gain == -IntegralParameters.scaled(self.spans).gain
+
+    def test_some_numbers_are_replaced_also_within(self):
+        changed = tuned(CORRECTION, {"close_enough": 2, "arrival": {"tolerance": 0.5}})
+        assert changed == replace(CORRECTION, close_enough=2, arrival=replace(CORRECTION.arrival, tolerance=0.5))
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"closenough": 1.0}, "closenough: there is no such number; there are: close_enough"),
+            ({"close_enough": "near"}, "close_enough = 'near': expected a number"),
+            ({"close_enough": -1.0}, "close_enough: expected a positive number"),
+            ({"arrival": 3.0}, "arrival"),
+        ],
+    )
+    def test_nonsense_is_refused(self, options, words):
+        with pytest.raises((ValueError, TypeError), match=words):
+            tuned(CORRECTION, options)
