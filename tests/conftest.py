@@ -1,5 +1,6 @@
 """What the tests of several folders share."""
 
+import json
 import os
 import select
 import threading
@@ -54,5 +55,21 @@ def bench(capsys):
             main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def reproduce(bench, tmp_path):
+    """Run a study with a seed in `tmp_path`, without complaint; return its standard output and its result."""
+
+    def run(study, seed):
+        result = tmp_path / "result.json"
+        code, out, err = bench("reproduce", study, "--seed", seed, "--out", tmp_path, "--json", result)
+        assert code == 0
+        assert err == ""
+        campaign = json.loads(result.read_text())
+        assert campaign["seed"] == seed
+        return out, campaign
 
     return run

@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from heater_protocols import Settle, Stairs, settle, stairs
+from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
 from bench.clock import ScaledClock, VirtualClock
 from bench.control.tracking import Command, Trace
@@ -44,22 +44,6 @@ def define(function):
     function.__annotations__ = {"parameters": Nothing}
     function.__doc__ = "A protocol."
     return protocol(needs=("tec",))(function)
-
-
-class Watcher:
-    """An observer that remembers."""
-
-    def __init__(self):
-        self.ticks, self.steps, self.events = [], [], []
-
-    def telemetry(self, t, step, values):
-        self.ticks.append((t, step, tuple(values)))
-
-    def step(self, record):
-        self.steps.append(record)
-
-    def event(self, event):
-        self.events.append(event)
 
 
 class Bench:
