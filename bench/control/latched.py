@@ -25,84 +25,60 @@ Direction = Literal[-1, 1]
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m).
-
-    Parameters
-    ----------
-    approach : float
-        How far before the target, in output units, the approach by the model ends.
-    approach_done : float
-        The approach is over at this multiple of `approach` before the target.
-    approach_corrections : int
-        Greatest number of corrections of an approach.
-    arrival : Arrival
-        When the actuator has arrived after a move of the approach.
-    creep_least, creep_most : float
-        Slowest and fastest creep, input units per second.
-    creep_gain : float
-        Creep per output unit of the error that is left, input units per second and output unit.
-    creep_offset : float
-        Error at which the creep would be slowest, output units: what stepping back will take away.
-    creep_horizon, creep_fast : float
-        Where the model has the target further ahead than the creep would come, as after a turn, the creep is
-        so fast as to be there in `creep_horizon` s, but not above `creep_fast`, input units per second.
-    creep_until : float
-        Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on.
-    creep_limit : float
-        Longest creep, s.
-    step_back : float
-        Move back from the extreme, input units.
-    nearest, farthest : float
-        Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what
-        the input wanders unseen would move the extreme; farther, hysterons switch back, the slope of the
-        output changes its sign, and the loop would run away.
-    lock_within : float
-        Error after stepping back with which the fine loop can deal, output units.
-    tries : int
-        Greatest number of approaches, each from the other side, before falling back.
-    settle : float
-        Time after stepping back before locking is decided, s.
-    fine_moves : int
-        Number of moves of the fine loop.
-    fine_period : float
-        Time between them, s.
-    fine_gain : float
-        Part of the estimated error that one move takes away, 0 to 2.
-    accept : float
-        Error that may be left after the fine loop, output units; with more the lock has been lost.
-    walk_variance, reading_variance : float
-        Of the estimate of the locked output, for each reading, output units squared: what the input wanders
-        unseen, by the small slope; noise of one reading.
-    end_margin : float
-        Within this distance of the outputs at saturation, in output units, and beyond them, the incremental
-        inverse alone is used.
-    """
+    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m)."""
 
     approach: float
+    """How far before the target, in output units, the approach by the model ends."""
     arrival: Arrival
+    """When the actuator has arrived after a move of the approach."""
     creep_least: float
     creep_most: float
+    """Slowest and fastest creep, input units per second."""
     creep_gain: float
+    """Creep per output unit of the error that is left, input units per second and output unit."""
     creep_offset: float
+    """Error at which the creep would be slowest, output units: what stepping back will take away."""
     creep_fast: float
+    """Fastest creep towards a target that the model has further ahead, input units per second."""
     creep_until: float
+    """Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on."""
     step_back: float
+    """Move back from the extreme, input units."""
     nearest: float
     farthest: float
+    """Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what the input
+    wanders unseen would move the extreme; farther, hysterons switch back, the slope of the output changes its sign,
+    and the loop would run away."""
     lock_within: float
+    """Error after stepping back with which the fine loop can deal, output units."""
     accept: float
+    """Error that may be left after the fine loop, output units; with more the lock has been lost."""
     walk_variance: float
     reading_variance: float
+    """Variances of the estimate of the locked output, for each reading, output units squared: what the input wanders
+    unseen, by the small slope; noise of one reading."""
     end_margin: float
+    """Within this distance of the outputs at saturation, in output units, and beyond them, the incremental inverse
+    alone is used."""
     approach_done: float = 1.8
+    """Multiple of `approach` before the target at which the approach is over."""
     approach_corrections: int = 8
+    """Greatest number of corrections of an approach."""
     creep_horizon: float = 4.0
+    """Time in which the creep reaches a target that the model has further ahead than the creep would come, as after a
+    turn, s; `creep_fast` limits it."""
     creep_limit: float = 60.0
+    """Longest creep, s."""
     tries: int = 10
+    """Greatest number of approaches, each from the other side, before falling back."""
     settle: float = 1.0
+    """Time after stepping back before locking is decided, s."""
     fine_moves: int = 5
+    """Number of moves of the fine loop."""
     fine_period: float = 1.0
+    """Time between moves of the fine loop, s."""
     fine_gain: float = 1.0
+    """Part of the estimated error that one move takes away, 0 to 2."""
 
     def __post_init__(self) -> None:
         check_positive(self)
