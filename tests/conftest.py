@@ -5,6 +5,7 @@ import os
 import select
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -70,6 +71,7 @@ def reproduce(bench, tmp_path):
         assert err == ""
         campaign = json.loads(result.read_text())
         assert campaign["seed"] == seed
+        assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
         return out, campaign
 
     return run

@@ -169,47 +169,35 @@ class Latched(Correcting):
         self._poll = self._parameters.arrival.poll
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._operator = inverse.operator
-        self._extreme: float | None = None
-        self._direction: Direction = 1
-        self._tries = 0
-        self._locked = False
-
-    @property
-    def locked(self) -> bool:
-        """Whether the present target is held by the lock."""
-        return self._locked
-
-    @property
-    def tries(self) -> int:
-        """Number of approaches to the present target."""
-        return self._tries
-
-    @property
-    def extreme(self) -> float | None:
+        self.extreme: float | None = None
         """The input behind which the output is locked, input units; None while it is not."""
-        return self._extreme
+        self._direction: Direction = 1
+        self.tries = 0
+        """Number of approaches to the present target."""
+        self.locked = False
+        """Whether the present target is held by the lock."""
 
     def _observe(self, measured_input: float) -> bool:
         known = super()._observe(measured_input)
-        if known and self._extreme is not None:
+        if known and self.extreme is not None:
             # A plate that runs on takes the extreme with it.
-            self._extreme = max(self._direction * self._extreme, self._direction * measured_input) * self._direction
+            self.extreme = max(self._direction * self.extreme, self._direction * measured_input) * self._direction
         return known
 
     def _run(self, target: float, reading: Sample) -> Script:
         p = self._parameters
-        self._extreme, self._locked, self._tries = None, False, 0
+        self.extreme, self.locked, self.tries = None, False, 0
         low, high = self._saturated
         if low + p.end_margin <= target <= high - p.end_margin:
             self._direction = 1 if target > reading.output else -1
-            while self._tries < p.tries:
-                self._tries += 1
+            while self.tries < p.tries:
+                self.tries += 1
                 reading = yield from self._latch(target, reading)
-                if self._locked:
+                if self.locked:
                     break
-                self._extreme = None
+                self.extreme = None
                 self._direction = 1 if self._direction < 0 else -1
-        if not self._locked:
+        if not self.locked:
             yield from self._correct(target)
         yield from self._hold(self._poll)
 
@@ -244,15 +232,15 @@ class Latched(Correcting):
         if not -p.lock_within <= left(reading) <= p.creep_until:
             return reading
 
-        self._extreme = reading.input
+        self.extreme = reading.input
         return (yield from self._fine_loop(target))
 
     def _fine_loop(self, target: float) -> Move:
         """Step back and move the locked output to the target."""
         p = self._parameters
-        assert self._extreme is not None
+        assert self.extreme is not None
         locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
-        origin = setpoint = self._behind(self._extreme - self._direction * p.step_back)
+        origin = setpoint = self._behind(self.extreme - self._direction * p.step_back)
         slope = reversible_slope(self._operator, origin)
         for move in range(p.fine_moves + 1):
             for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
@@ -265,15 +253,15 @@ class Latched(Correcting):
                 return reading
             if move < p.fine_moves:
                 setpoint = self._behind(setpoint + p.fine_gain * error / slope)
-        self._locked = abs(error) <= p.accept
+        self.locked = abs(error) <= p.accept
         return reading
 
     def _behind(self, setpoint: float) -> float:
         """Return the set-point moved into the stretch behind the extreme where the output is locked."""
-        assert self._extreme is not None
-        distance = self._direction * (self._extreme - setpoint)
+        assert self.extreme is not None
+        distance = self._direction * (self.extreme - setpoint)
         distance = min(max(distance, self._parameters.nearest), self._parameters.farthest)
-        return self._clip(self._extreme - self._direction * distance)
+        return self._clip(self.extreme - self._direction * distance)
 
     def _ahead(self, target: float) -> float | None:
         """Return the input of the model's output `target` in the present direction, None beyond the limits."""

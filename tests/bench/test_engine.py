@@ -823,24 +823,23 @@ class TestInterrupted:
         assert (outcome.status, outcome.reason, outcome.steps) == ("aborted", "ended by SIGTERM", 1)
         b.assert_safe()
 
-    def test_abort_in_the_middle_of_a_hold(self, bench):
+    def ended_at_three_seconds(self, bench):
         class Late(Watcher):
             def telemetry(_, t, *__):
                 if t >= 3.0:
                     self.b.interrupts.abort_reason = "SIGTERM"
 
-        self.b = b = bench(observers=[Late()])
+        self.b = bench(observers=[Late()])
+        return self.b
+
+    def test_abort_in_the_middle_of_a_hold(self, bench):
+        b = self.ended_at_three_seconds(bench)
         outcome = b.run(stairs)
         assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("aborted", 1, 3.0)
         b.assert_safe()
 
     def test_abort_while_settling(self, bench):
-        class Late(Watcher):
-            def telemetry(_, t, *__):
-                if t >= 3.0:
-                    self.b.interrupts.abort_reason = "SIGTERM"
-
-        self.b = b = bench(observers=[Late()])
+        b = self.ended_at_three_seconds(bench)
         assert b.run(settle).status == "aborted"
         b.assert_safe()
 

@@ -112,7 +112,6 @@ def the_saved_model_is_that_of_the_tables(campaign):
 def everything_that_it_says_is_there(campaign):
     assert {Path(path).stem for path in campaign["figures"]} == set(FIGURES)
     assert len(campaign["recordings"]) == 16
-    assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
 
 
 @pytest.mark.slow

@@ -178,7 +178,6 @@ def the_saved_model_simulates(campaign):
 def everything_that_it_says_is_there(campaign):
     assert [Path(path).stem for path in campaign["figures"]] == list(FIGURES)
     assert len(campaign["recordings"]) == sum(RUNS.values())
-    assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
 
 
 @pytest.mark.slow
