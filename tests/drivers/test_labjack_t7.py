@@ -769,10 +769,11 @@ def test_an_output_out_of_its_window_is_named(bench, share):
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings"), [(T7PositionSensor, RATIOMETRIC), (T7Thermistor, {"channels": (2, 3)})]
+    ("kind", "volts", "settings"),
+    [(T7PositionSensor, (2.0, 5.0), RATIOMETRIC), (T7Thermistor, (1.2, 2.5), {"channels": (2, 3)})],
 )
-def test_requests_of_a_sensor_of_two_channels(bench, kind, settings):
-    bench.volts[2], bench.volts[3] = 1.2, 2.5
+def test_requests_of_a_sensor_of_two_channels(bench, kind, volts, settings):
+    bench.volts[2], bench.volts[3] = volts
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
         sensor = kind.connect("sensor", kind.Settings(port=server.address, **settings), bench.clock)
