@@ -1,9 +1,11 @@
 """What the tests of several folders share."""
 
+import json
 import os
 import select
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -54,5 +56,22 @@ def bench(capsys):
             main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def reproduce(bench, tmp_path):
+    """Run a study with a seed in `tmp_path`, without complaint; return its standard output and its result."""
+
+    def run(study, seed):
+        result = tmp_path / "result.json"
+        code, out, err = bench("reproduce", study, "--seed", seed, "--out", tmp_path, "--json", result)
+        assert code == 0
+        assert err == ""
+        campaign = json.loads(result.read_text())
+        assert campaign["seed"] == seed
+        assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
+        return out, campaign
 
     return run

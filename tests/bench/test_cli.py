@@ -557,6 +557,13 @@ def muscle_runs(tmp_path_factory):
     return runs
 
 
+def assert_no_model_of_one_input(bench, model, kind, run, signal):
+    code, _, err = bench("predict", model, run, "--input", signal, "--out", model.with_name("out.csv"))
+    assert code == 3
+    assert err.count("error:") == 1
+    assert f"is of the kind {kind}; expected one of one input" in re.sub(r"\s+", " ", err)
+
+
 class TestIdentifyMuscle:
     KINDS = ("force-voltage", "length-voltage", "length-force")
 
@@ -624,14 +631,9 @@ class TestIdentifyMuscle:
         assert "cannot be written" in err
 
     def test_what_it_writes_is_no_model_of_one_input(self, bench, muscle_runs, tmp_path):
-        self.identify(bench, muscle_runs, "--out", tmp_path / "model.json")
-        code, _, err = bench(
-            "predict", tmp_path / "model.json", muscle_runs["force-voltage"], "--input", "supply_voltage",
-            "--out", tmp_path / "out.csv",
-        )  # fmt: skip
-        assert code == 3
-        assert err.count("error:") == 1
-        assert "is of the kind two-stage; expected one of one input" in re.sub(r"\s+", " ", err)
+        model = tmp_path / "model.json"
+        self.identify(bench, muscle_runs, "--out", model)
+        assert_no_model_of_one_input(bench, model, "two-stage", muscle_runs["force-voltage"], "supply_voltage")
 
 
 class TestReportAndExport:
@@ -796,14 +798,9 @@ class TestIdentifyHybrid:
         assert "cannot be written" in err
 
     def test_what_it_writes_is_no_model_of_one_input(self, bench, hybrid_runs, tmp_path):
-        self.identify(bench, hybrid_runs, "--out", tmp_path / "model.json")
-        code, _, err = bench(
-            "predict", tmp_path / "model.json", hybrid_runs["piezo-loops"], "--input", "piezo_voltage",
-            "--out", tmp_path / "out.csv",
-        )  # fmt: skip
-        assert code == 3
-        assert err.count("error:") == 1
-        assert "is of the kind hybrid; expected one of one input" in re.sub(r"\s+", " ", err)
+        model = tmp_path / "model.json"
+        self.identify(bench, hybrid_runs, "--out", model)
+        assert_no_model_of_one_input(bench, model, "hybrid", hybrid_runs["piezo-loops"], "piezo_voltage")
 
 
 class TestHelpOfTheHybrid:

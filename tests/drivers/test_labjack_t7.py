@@ -61,28 +61,23 @@ class Bench:
         self.server = ModbusTcpServer(self.t7)
         self.devices: list[T7PositionSensor | T7Switch | T7Thermistor | T7HighVoltageSupply] = []
 
-    def sensor(self, **settings) -> T7PositionSensor:
-        made = T7PositionSensor.connect("psd", Settings(port=self.server.address, **settings), self.clock)
+    def _connected(self, kind, name, settings):
+        made = kind.connect(name, kind.Settings(port=self.server.address, **settings), self.clock)
         self.devices.append(made)
         return made
+
+    def sensor(self, **settings) -> T7PositionSensor:
+        return self._connected(T7PositionSensor, "psd", settings)
 
     def switch(self, **settings) -> T7Switch:
-        given = {"line": 5} | settings
-        made = T7Switch.connect("fan", SwitchSettings(port=self.server.address, **given), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7Switch, "fan", {"line": 5} | settings)
 
     def thermistor(self, **settings) -> T7Thermistor:
-        made = T7Thermistor.connect("base", ThermistorSettings(port=self.server.address, **settings), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7Thermistor, "base", settings)
 
     def supply(self, **settings) -> T7HighVoltageSupply:
         """A supply on line 5 whose status output, at AIN2, follows `self.volts`."""
-        given = {"line": 5} | settings
-        made = T7HighVoltageSupply.connect("hv", SupplySettings(port=self.server.address, **given), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7HighVoltageSupply, "hv", {"line": 5} | settings)
 
     def wire(self) -> PiezoAmplifier:
         """Wire an amplifier to TDAC0, to line 5 and to AIN0, 1 and 2."""

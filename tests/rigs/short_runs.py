@@ -1,0 +1,29 @@
+"""Runs of a rig in virtual time, and the messages of a protocol without a rig."""
+
+import io
+
+from rich.console import Console
+
+from bench.protocol import Note, Phase, Reading, find_protocol
+from bench.runs import Run, carry_out
+
+
+def record_run(folder, protocol, rig, settings, overrides=None):
+    """Carry a run out and return what has become of it."""
+    run = Run(
+        protocol=find_protocol(protocol), settings=settings, rig=rig, folder=folder,
+        overrides=overrides or {}, seed=1, clock="virtual", recording=False,
+    )  # fmt: skip
+    return carry_out(run, Console(file=io.StringIO(), width=200))
+
+
+def all_messages(messages, values):
+    """All messages of a protocol whose readings are all the same."""
+    found, reading = [], None
+    while True:
+        try:
+            message = messages.send(reading)
+        except StopIteration:
+            return found
+        found.append(message)
+        reading = None if isinstance(message, Phase | Note) else Reading(len(found), 0.0, True, values)
