@@ -3,6 +3,7 @@
 import json
 import os
 import select
+import subprocess
 import threading
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,18 @@ def _pseudo_terminal(server):
 def pseudo_terminal():
     """Serve an instrument at the path that this context manager gives; afterwards it is gone."""
     return _pseudo_terminal
+
+
+@pytest.fixture(scope="session")
+def finished_process():
+    """Run a command in a folder and an environment to its end; return the completed process."""
+
+    def run(command, folder, environment):
+        return subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240, check=False
+        )
+
+    return run
 
 
 @pytest.fixture

@@ -47,6 +47,17 @@ def write_loop(path, rows=400):
     return inputs, np.array(outputs)
 
 
+def assert_shown(bench, listed, protocol, parameters):
+    code, out, _ = bench("run", protocol, "--help")
+    assert code == 0
+    bench("list", protocol, "--json", listed)
+    shown = {entry["name"]: entry for entry in json.loads(listed.read_text())["parameters"]}
+    for name, (default, unit) in parameters.items():
+        assert name in out
+        assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
+        assert shown[name]["text"]
+
+
 class TestHelp:
     @pytest.mark.parametrize(
         "command",
@@ -100,14 +111,7 @@ class TestHelp:
         ],
     )
     def test_parameters_of_the_muscles_protocols(self, bench, tmp_path, protocol, parameters):
-        code, out, _ = bench("run", protocol, "--help")
-        assert code == 0
-        bench("list", protocol, "--json", tmp_path / "list.json")
-        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
-        for name, (default, unit) in parameters.items():
-            assert name in out
-            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
-            assert shown[name]["text"]
+        assert_shown(bench, tmp_path / "list.json", protocol, parameters)
 
     def test_help_says_what_exit_codes_mean(self, bench):
         _, out, _ = bench("--help")
@@ -833,14 +837,7 @@ class TestHelpOfTheHybrid:
         ],
     )
     def test_of_the_protocols(self, bench, tmp_path, protocol, parameters):
-        code, out, _ = bench("run", protocol, "--help")
-        assert code == 0
-        bench("list", protocol, "--json", tmp_path / "list.json")
-        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
-        for name, (default, unit) in parameters.items():
-            assert name in out
-            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
-            assert shown[name]["text"]
+        assert_shown(bench, tmp_path / "list.json", protocol, parameters)
 
     def test_rigs_and_protocols_are_listed(self, bench):
         code, out, _ = bench("list")

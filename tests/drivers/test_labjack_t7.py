@@ -768,11 +768,14 @@ def test_an_output_out_of_its_window_is_named(bench, share):
             take()
 
 
-def test_requests_of_a_ratiometric_sensor(bench):
-    bench.volts[2], bench.volts[3] = 2.0, 5.0
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(T7PositionSensor, RATIOMETRIC), (T7Thermistor, {"channels": (2, 3)})]
+)
+def test_requests_of_a_sensor_of_two_channels(bench, kind, settings):
+    bench.volts[2], bench.volts[3] = 1.2, 2.5
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
-        sensor = T7PositionSensor.connect("psd", Settings(port=server.address, **RATIOMETRIC), bench.clock)
+        sensor = kind.connect("sensor", kind.Settings(port=server.address, **settings), bench.clock)
         recorded.requests.clear()
         sensor.glance()
         assert recorded.requests == [("read", 4, 4)]
@@ -848,20 +851,6 @@ def test_an_excitation_that_failed_is_named(bench, excitation):
     for take in (sensor.measure, sensor.glance):
         with pytest.raises(DeviceError, match=message):
             take()
-
-
-def test_requests_of_a_thermistor(bench):
-    bench.volts[2], bench.volts[3] = 1.2, 2.5
-    recorded = Recorded(bench.t7)
-    with ModbusTcpServer(recorded) as server:
-        sensor = T7Thermistor.connect("base", ThermistorSettings(port=server.address, channels=(2, 3)), bench.clock)
-        recorded.requests.clear()
-        sensor.glance()
-        assert recorded.requests == [("read", 4, 4)]
-        recorded.requests.clear()
-        sensor.measure()
-        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
-        sensor.close()
 
 
 # A high-voltage supply

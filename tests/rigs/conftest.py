@@ -3,9 +3,11 @@
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("compiled", deadline=None)
 settings.load_profile("compiled")
 # Tests of all rigs import `short_runs`.
 sys.path.insert(0, str(Path(__file__).parent))
+pytest.register_assert_rewrite("short_runs")

@@ -1,10 +1,13 @@
-"""Runs of a rig in virtual time, and the messages of a protocol without a rig."""
+"""Runs of a rig in virtual time, the messages of a protocol without a rig, and rigs that are refused."""
 
 import io
 
+import pytest
 from rich.console import Console
 
+from bench.errors import ConfigurationError
 from bench.protocol import Note, Phase, Reading, find_protocol
+from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 
 
@@ -27,3 +30,12 @@ def all_messages(messages, values):
             return found
         found.append(message)
         reading = None if isinstance(message, Phase | Note) else Reading(len(found), 0.0, True, values)
+
+
+def assert_refused(rig, key, value, words):
+    """A wrong value of the emulation is one message."""
+    with pytest.raises(ConfigurationError) as caught:
+        load_rig(rig, {f"emulation.{key}": value})
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"{rig}.toml: emulation.{key}")
+    assert words in line
