@@ -155,8 +155,6 @@ class RigFile:
         Where it was read from, for messages.
     text : str
         The file as it is, kept with every run.
-    bases : mapping of str to str
-        The rigs that it extends, nearest first: text by path.
     content : mapping
         Everything in it, bases and overrides included.
     """
@@ -164,7 +162,6 @@ class RigFile:
     name: str
     path: str
     text: str
-    bases: Mapping[str, str]
     content: Mapping[str, Any]
     rig: RigTable
     devices: tuple[DeviceEntry, ...]
@@ -225,11 +222,10 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
         If there is no such rig, or the file is wrong: names file, key, value and what is allowed.
     """
     path, text = _read(name)
-    bases: dict[str, str] = {}
-    content = _merged(path, text, bases)
+    content = _merged(path, text, (_identity(name),))
     for key, value in (overrides or {}).items():
         _override(content, key, value, path)
-    return _validate(path, text, bases, content)
+    return _validate(path, text, content)
 
 
 def _read(name: str) -> tuple[str, str]:
@@ -251,8 +247,13 @@ def _read(name: str) -> tuple[str, str]:
     return f"{name}.toml", (resources.files(packaged[name].load()) / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def _merged(path: str, text: str, bases: dict[str, str]) -> dict[str, Any]:
-    """Return the content of a file over those that it extends, which join `bases`."""
+def _identity(name: str) -> str:
+    """Return what tells a rig from all others: the full path of a file, the name of a packaged rig."""
+    return str(Path(name).resolve()) if name.endswith(".toml") else name
+
+
+def _merged(path: str, text: str, extending: tuple[str, ...]) -> dict[str, Any]:
+    """Return the content of a file over those that it extends; `extending` are the rigs on the way to it."""
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -267,11 +268,11 @@ def _merged(path: str, text: str, bases: dict[str, str]) -> dict[str, Any]:
         )
     # A file beside the one that names it; a packaged rig by its name.
     beside = str(Path(path).parent / base) if base.endswith(".toml") else base
-    base_path, base_text = _read(beside)
-    if base_path == path or base_path in bases:
+    identity = _identity(beside)
+    if identity in extending:
         raise ConfigurationError(f"{path}: extends = {base!r}: the rigs extend each other in a circle")
-    bases[base_path] = base_text
-    merged = _merged(base_path, base_text, bases)
+    base_path, base_text = _read(beside)
+    merged = _merged(base_path, base_text, (*extending, identity))
     for key in without:
         *parents, last = str(key).split(".")
         table = _table(merged, parents)
@@ -307,7 +308,7 @@ def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
         table[last] = value
 
 
-def _validate(path: str, text: str, bases: Mapping[str, str], content: Mapping[str, Any]) -> RigFile:
+def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
     try:
         tables = _RigFileContent.model_validate(content)
     except ValidationError as error:
@@ -343,7 +344,6 @@ def _validate(path: str, text: str, bases: Mapping[str, str], content: Mapping[s
         name=Path(path).name.removesuffix(".toml"),
         path=path,
         text=text,
-        bases=bases,
         content=content,
         rig=tables.rig,
         devices=tuple(entries),
