@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from typing import TypeVar
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
 from sim_devices import protocol_emulated
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
+
+T = TypeVar("T")
 
 
 class EmulatedLaboratory:
@@ -58,6 +62,11 @@ class EmulatedLaboratory:
     def close(self) -> None:
         """Switch the instruments off; those of another laboratory stay as they are."""
         self._opened.close()
+
+
+def compile_loops(plant: T, use: Callable[[T], object]) -> None:
+    """Use a copy of a plant once, so that its compiled loops are ready before a driver waits for an answer."""
+    use(copy.deepcopy(plant))
 
 
 class Event:

@@ -1,9 +1,12 @@
 """What the tests of several folders share."""
 
+import json
 import os
 import select
+import subprocess
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -45,6 +48,18 @@ def pseudo_terminal():
     return _pseudo_terminal
 
 
+@pytest.fixture(scope="session")
+def finished_process():
+    """Run a command in a folder and an environment to its end; return the completed process."""
+
+    def run(command, folder, environment):
+        return subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240, check=False
+        )
+
+    return run
+
+
 @pytest.fixture
 def bench(capsys):
     """Run a command in this process; return exit code, standard output and standard error."""
@@ -54,5 +69,22 @@ def bench(capsys):
             main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def reproduce(bench, tmp_path):
+    """Run a study with a seed in `tmp_path`, without complaint; return its standard output and its result."""
+
+    def run(study, seed):
+        result = tmp_path / "result.json"
+        code, out, err = bench("reproduce", study, "--seed", seed, "--out", tmp_path, "--json", result)
+        assert code == 0
+        assert err == ""
+        campaign = json.loads(result.read_text())
+        assert campaign["seed"] == seed
+        assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
+        return out, campaign
 
     return run

@@ -25,84 +25,60 @@ Direction = Literal[-1, 1]
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m).
-
-    Parameters
-    ----------
-    approach : float
-        How far before the target, in output units, the approach by the model ends.
-    approach_done : float
-        The approach is over at this multiple of `approach` before the target.
-    approach_corrections : int
-        Greatest number of corrections of an approach.
-    arrival : Arrival
-        When the actuator has arrived after a move of the approach.
-    creep_least, creep_most : float
-        Slowest and fastest creep, input units per second.
-    creep_gain : float
-        Creep per output unit of the error that is left, input units per second and output unit.
-    creep_offset : float
-        Error at which the creep would be slowest, output units: what stepping back will take away.
-    creep_horizon, creep_fast : float
-        Where the model has the target further ahead than the creep would come, as after a turn, the creep is
-        so fast as to be there in `creep_horizon` s, but not above `creep_fast`, input units per second.
-    creep_until : float
-        Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on.
-    creep_limit : float
-        Longest creep, s.
-    step_back : float
-        Move back from the extreme, input units.
-    nearest, farthest : float
-        Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what
-        the input wanders unseen would move the extreme; farther, hysterons switch back, the slope of the
-        output changes its sign, and the loop would run away.
-    lock_within : float
-        Error after stepping back with which the fine loop can deal, output units.
-    tries : int
-        Greatest number of approaches, each from the other side, before falling back.
-    settle : float
-        Time after stepping back before locking is decided, s.
-    fine_moves : int
-        Number of moves of the fine loop.
-    fine_period : float
-        Time between them, s.
-    fine_gain : float
-        Part of the estimated error that one move takes away, 0 to 2.
-    accept : float
-        Error that may be left after the fine loop, output units; with more the lock has been lost.
-    walk_variance, reading_variance : float
-        Of the estimate of the locked output, for each reading, output units squared: what the input wanders
-        unseen, by the small slope; noise of one reading.
-    end_margin : float
-        Within this distance of the outputs at saturation, in output units, and beyond them, the incremental
-        inverse alone is used.
-    """
+    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m)."""
 
     approach: float
+    """How far before the target, in output units, the approach by the model ends."""
     arrival: Arrival
+    """When the actuator has arrived after a move of the approach."""
     creep_least: float
     creep_most: float
+    """Slowest and fastest creep, input units per second."""
     creep_gain: float
+    """Creep per output unit of the error that is left, input units per second and output unit."""
     creep_offset: float
+    """Error at which the creep would be slowest, output units: what stepping back will take away."""
     creep_fast: float
+    """Fastest creep towards a target that the model has further ahead, input units per second."""
     creep_until: float
+    """Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on."""
     step_back: float
+    """Move back from the extreme, input units."""
     nearest: float
     farthest: float
+    """Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what the input
+    wanders unseen would move the extreme; farther, hysterons switch back, the slope of the output changes its sign,
+    and the loop would run away."""
     lock_within: float
+    """Error after stepping back with which the fine loop can deal, output units."""
     accept: float
+    """Error that may be left after the fine loop, output units; with more the lock has been lost."""
     walk_variance: float
     reading_variance: float
+    """Variances of the estimate of the locked output, for each reading, output units squared: what the input wanders
+    unseen, by the small slope; noise of one reading."""
     end_margin: float
+    """Within this distance of the outputs at saturation, in output units, and beyond them, the incremental inverse
+    alone is used."""
     approach_done: float = 1.8
+    """Multiple of `approach` before the target at which the approach is over."""
     approach_corrections: int = 8
+    """Greatest number of corrections of an approach."""
     creep_horizon: float = 4.0
+    """Time in which the creep reaches a target that the model has further ahead than the creep would come, as after a
+    turn, s; `creep_fast` limits it."""
     creep_limit: float = 60.0
+    """Longest creep, s."""
     tries: int = 10
+    """Greatest number of approaches, each from the other side, before falling back."""
     settle: float = 1.0
+    """Time after stepping back before locking is decided, s."""
     fine_moves: int = 5
+    """Number of moves of the fine loop."""
     fine_period: float = 1.0
+    """Time between moves of the fine loop, s."""
     fine_gain: float = 1.0
+    """Part of the estimated error that one move takes away, 0 to 2."""
 
     def __post_init__(self) -> None:
         check_positive(self)
@@ -193,47 +169,35 @@ class Latched(Correcting):
         self._poll = self._parameters.arrival.poll
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._operator = inverse.operator
-        self._extreme: float | None = None
-        self._direction: Direction = 1
-        self._tries = 0
-        self._locked = False
-
-    @property
-    def locked(self) -> bool:
-        """Whether the present target is held by the lock."""
-        return self._locked
-
-    @property
-    def tries(self) -> int:
-        """Number of approaches to the present target."""
-        return self._tries
-
-    @property
-    def extreme(self) -> float | None:
+        self.extreme: float | None = None
         """The input behind which the output is locked, input units; None while it is not."""
-        return self._extreme
+        self._direction: Direction = 1
+        self.tries = 0
+        """Number of approaches to the present target."""
+        self.locked = False
+        """Whether the present target is held by the lock."""
 
     def _observe(self, measured_input: float) -> bool:
         known = super()._observe(measured_input)
-        if known and self._extreme is not None:
+        if known and self.extreme is not None:
             # A plate that runs on takes the extreme with it.
-            self._extreme = max(self._direction * self._extreme, self._direction * measured_input) * self._direction
+            self.extreme = max(self._direction * self.extreme, self._direction * measured_input) * self._direction
         return known
 
     def _run(self, target: float, reading: Sample) -> Script:
         p = self._parameters
-        self._extreme, self._locked, self._tries = None, False, 0
+        self.extreme, self.locked, self.tries = None, False, 0
         low, high = self._saturated
         if low + p.end_margin <= target <= high - p.end_margin:
             self._direction = 1 if target > reading.output else -1
-            while self._tries < p.tries:
-                self._tries += 1
+            while self.tries < p.tries:
+                self.tries += 1
                 reading = yield from self._latch(target, reading)
-                if self._locked:
+                if self.locked:
                     break
-                self._extreme = None
+                self.extreme = None
                 self._direction = 1 if self._direction < 0 else -1
-        if not self._locked:
+        if not self.locked:
             yield from self._correct(target)
         yield from self._hold(self._poll)
 
@@ -268,15 +232,15 @@ class Latched(Correcting):
         if not -p.lock_within <= left(reading) <= p.creep_until:
             return reading
 
-        self._extreme = reading.input
+        self.extreme = reading.input
         return (yield from self._fine_loop(target))
 
     def _fine_loop(self, target: float) -> Move:
         """Step back and move the locked output to the target."""
         p = self._parameters
-        assert self._extreme is not None
+        assert self.extreme is not None
         locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
-        origin = setpoint = self._behind(self._extreme - self._direction * p.step_back)
+        origin = setpoint = self._behind(self.extreme - self._direction * p.step_back)
         slope = reversible_slope(self._operator, origin)
         for move in range(p.fine_moves + 1):
             for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
@@ -289,15 +253,15 @@ class Latched(Correcting):
                 return reading
             if move < p.fine_moves:
                 setpoint = self._behind(setpoint + p.fine_gain * error / slope)
-        self._locked = abs(error) <= p.accept
+        self.locked = abs(error) <= p.accept
         return reading
 
     def _behind(self, setpoint: float) -> float:
         """Return the set-point moved into the stretch behind the extreme where the output is locked."""
-        assert self._extreme is not None
-        distance = self._direction * (self._extreme - setpoint)
+        assert self.extreme is not None
+        distance = self._direction * (self.extreme - setpoint)
         distance = min(max(distance, self._parameters.nearest), self._parameters.farthest)
-        return self._clip(self._extreme - self._direction * distance)
+        return self._clip(self.extreme - self._direction * distance)
 
     def _ahead(self, target: float) -> float | None:
         """Return the input of the model's output `target` in the present direction, None beyond the limits."""

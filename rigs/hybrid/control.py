@@ -76,42 +76,28 @@ class _Preview:
 
 @dataclass(frozen=True)
 class MidRangingParameters:
-    """Settings of the mid-ranging controllers.
-
-    Parameters
-    ----------
-    period : float
-        Time between two calls, s.
-    every : int
-        Calls per new current.
-    gain : float
-        Heat fed back per missing deflection of the thermal part, W/m.
-    integral_time : float
-        Time constant of the integral in that feedback, s.
-    lead : float
-        Time by which the heat leads the reference, s: the lag of the bending behind the base.
-    window : float
-        Time over which the reference is smoothed for the thermal part, s.
-    maximum_current : float
-        Greatest current of either sign, A.
-    filter_time : float
-        Time constant of the low-pass that estimates the thermal part in place of a Kalman filter, s.
-    integral : float
-        Gain of the piezo part's integral, 1/s, below half the rate of the calls.
-    stroke : float
-        Greatest deflection of either sign that the piezo part is asked for, m.
-    """
+    """Settings of the mid-ranging controllers."""
 
     period: float = 5e-3
+    """Time between two calls, s."""
     every: int = 4
+    """Calls per new current."""
     gain: float = 1.6e4
+    """Heat fed back per missing deflection of the thermal part, W/m."""
     integral_time: float = 40.0
+    """Time constant of the integral in that feedback, s."""
     lead: float = 1.0
+    """Time by which the heat leads the reference, s: the lag of the bending behind the base."""
     window: float = 4.0
+    """Time over which the reference is smoothed for the thermal part, s."""
     maximum_current: float = 0.15
+    """Greatest current of either sign, A."""
     filter_time: float = 0.15
+    """Time constant of the low-pass that estimates the thermal part in place of a Kalman filter, s."""
     integral: float = 25.0
+    """Gain of the piezo part's integral, 1/s, below half the rate of the calls."""
     stroke: float = STROKE
+    """Greatest deflection of either sign that the piezo part is asked for, m."""
 
     def __post_init__(self) -> None:
         check_positive(self)

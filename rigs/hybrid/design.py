@@ -15,19 +15,6 @@ from rigs.hybrid.network import ThermalNetwork, check_fields
 class Geometry:
     """Lengths in metres, table I of Rakotondrabe and Ivan 2010.
 
-    Parameters
-    ----------
-    block_length, block_width, block_thickness : float
-        L_s, a_s, b_s of the cooling block.
-    tec_length, tec_width : float
-        Sides of the thermoelectric cooler; S_p is their product.
-    glue_thickness : float
-        l_c between cooler and block (section III-A).
-    beam_length, beam_width : float
-        L and l of the cantilever.
-    piezo_thickness, copper_thickness : float
-        e_pzt and e_cop.
-
     Raises
     ------
     ValueError
@@ -37,13 +24,18 @@ class Geometry:
     block_length: float = 25e-3
     block_width: float = 38e-3
     block_thickness: float = 20e-3
+    """L_s, a_s, b_s of the cooling block."""
     tec_length: float = 8e-3
     tec_width: float = 5e-3
+    """Sides of the thermoelectric cooler; S_p is their product."""
     glue_thickness: float = 0.1e-3
+    """l_c between cooler and block (section III-A)."""
     beam_length: float = 15e-3
     beam_width: float = 2e-3
+    """L and l of the cantilever."""
     piezo_thickness: float = 0.2e-3
     copper_thickness: float = 0.1e-3
+    """e_pzt and e_cop."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -83,23 +75,6 @@ class Geometry:
 class Materials:
     """Properties of the materials, table II of Rakotondrabe and Ivan 2010.
 
-    Parameters
-    ----------
-    air_transfer : float
-        Heat transfer coefficient to the air, W/(m² K).
-    block_density, block_heat, block_conductivity : float
-        kg/m³, J/(kg K), W/(m K). The table's "alumina" has the numbers of aluminium, which the text names.
-    copper_density, copper_heat, copper_conductivity : float
-        The table prints 7135 kg/m³, the density of zinc; copper's is 8960.
-    copper_expansion, copper_compliance : float
-        1/K and m²/N.
-    piezo_density, piezo_heat, piezo_conductivity : float
-        The table prints 138 W/(m K); PZT-5H conducts about 1.4.
-    piezo_expansion, piezo_compliance, piezo_coefficient : float
-        1/K, m²/N and d31 in m/V. The table's last row, "alpha_cop 3.3e-3", is PZT's 3.3e-6 1/K.
-    glue_conductivity : float
-        W/(m K). The paper takes the block's; a filled epoxy has about 1.
-
     Raises
     ------
     ValueError
@@ -107,21 +82,30 @@ class Materials:
     """
 
     air_transfer: float = 30.0
+    """Heat transfer coefficient to the air, W/(m² K)."""
     block_density: float = 2701.0
     block_heat: float = 902.0
     block_conductivity: float = 222.0
+    """Density (kg/m³), specific heat (J/(kg K)) and conductivity (W/(m K)). The table's "alumina" has
+    the numbers of aluminium, which the text names."""
     copper_density: float = 8960.0
     copper_heat: float = 386.0
     copper_conductivity: float = 381.5
+    """The table prints 7135 kg/m³, the density of zinc; copper's is 8960."""
     copper_expansion: float = 17e-6
     copper_compliance: float = 9.1e-12
+    """Thermal expansion (1/K) and compliance (m²/N)."""
     piezo_density: float = 7500.0
     piezo_heat: float = 420.0
     piezo_conductivity: float = 1.4
+    """The table prints 138 W/(m K); PZT-5H conducts about 1.4."""
     piezo_expansion: float = 3.3e-6
     piezo_compliance: float = 15e-12
     piezo_coefficient: float = -100e-12
+    """Thermal expansion (1/K), compliance (m²/N) and d31 (m/V). The table's last row, "alpha_cop 3.3e-3",
+    is PZT's 3.3e-6 1/K."""
     glue_conductivity: float = 1.0
+    """Conductivity, W/(m K). The paper takes the block's; a filled epoxy has about 1."""
 
     def __post_init__(self) -> None:
         check_fields(self, "copper_expansion", "piezo_expansion", "piezo_coefficient")

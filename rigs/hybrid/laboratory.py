@@ -28,7 +28,7 @@ from sim_devices.instruments.t7_roles import (
     EmulatedPositionSensor,
     EmulatedTemperatureSensor,
 )
-from sim_devices.laboratory import EmulatedLaboratory, Event
+from sim_devices.laboratory import EmulatedLaboratory, Event, compile_loops
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
@@ -97,6 +97,12 @@ class HybridLaboratorySettings(LaboratorySettings):
     fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
 
+def _use(plant: HybridCantilever) -> float:
+    plant.advance(1e-3)
+    plant.apply(1.0)
+    return plant.deflection
+
+
 class HybridLaboratory(EmulatedLaboratory):
     """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP).
 
@@ -121,6 +127,7 @@ class HybridLaboratory(EmulatedLaboratory):
         self.plant = HybridCantilever(
             HybridParameters(ambient_sd=settings.ambient_deviation, resonance_offset=settings.resonance_offset), plant
         )
+        compile_loops(self.plant, _use)
         self.world = World(self.plant, clock)
         self.tec = DirectTEC("tec", self.world, self.plant.peltier, rng=tec)
         self.tec.write_parameter(_CURRENT_LIMIT_PARAMETER, settings.current_limit)

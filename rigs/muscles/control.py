@@ -233,26 +233,17 @@ class ForceTask(Task):
 
 @dataclass(frozen=True)
 class InverseControlParameters:
-    """Parameters of the controllers with a model.
-
-    Parameters
-    ----------
-    time_constant : float
-        Thermal time constant of the wire, s (Zhang and Yip 2017: about 5 s).
-    horizon : float
-        Time within which the closed loop would bring the wire to its new temperature, s. Twice the period
-        makes up for more than half of the way in each, and leaves room for a time constant that is not quite
-        right.
-    period : float
-        Time between two readings, s.
-    duration : float
-        Time for each target, s.
-    """
+    """Parameters of the controllers with a model."""
 
     time_constant: float = 5.0
+    """Thermal time constant of the wire, s (Zhang and Yip 2017: about 5 s)."""
     horizon: float = 2.0
+    """Time within which the closed loop would bring the wire to its new temperature, s. Twice the period makes up for
+    more than half of the way in each, and leaves room for a time constant that is not quite right."""
     period: float = 1.0
+    """Time between two readings, s."""
     duration: float = 20.0
+    """Time for each target, s."""
 
     def __post_init__(self) -> None:
         check_positive(self)

@@ -22,7 +22,7 @@ from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
-from sim_devices.laboratory import EmulatedLaboratory, Event
+from sim_devices.laboratory import EmulatedLaboratory, Event, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -175,6 +175,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
         self.muscle = settings.make_muscle(plant)
+        compile_loops(self.muscle, lambda muscle: muscle.advance(1e-3))
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
         self._cell_is_broken = False

@@ -11,7 +11,7 @@ from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory
+from sim_devices.laboratory import EmulatedLaboratory, compile_loops
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
@@ -60,6 +60,7 @@ class VO2Laboratory(EmulatedLaboratory):
         if not settings.disturbances:
             specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
         self.plant = VO2Cantilever(specimen, plant_stream)
+        compile_loops(self.plant, lambda plant: plant.advance(1e-3))
         self.world = World(self.plant, clock)
         self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
         detector = NormalisedPSD(

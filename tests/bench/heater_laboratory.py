@@ -101,12 +101,21 @@ class _Settings(DriverSettings):
     connect_error: str = Field(default="", description="what `connect` raises")
 
 
+def _connect(cls, name, settings, clock):
+    if settings.connect_error:
+        raise DeviceConnectionError(name, settings.connect_error)
+    if settings.port not in _plates:
+        raise DeviceConnectionError(name, f"nothing answers at {settings.port}")
+    return cls(name, settings, clock)
+
+
 class _Wired:
     """What both instruments share; faults are switched on by plain attributes."""
 
     closed: list[str]
 
-    def _wire(self, settings: Any) -> None:
+    def __init__(self, name: str, settings: Any, clock: Clock) -> None:
+        super().__init__(name, clock)
         self.settings = settings
         self.plate = _plates[settings.port]
         self.calls: list[str] = []
@@ -120,6 +129,8 @@ class _Wired:
         )
         self.close_error: BaseException | None = None
         self.fail_at = math.inf
+
+    connect = classmethod(_connect)
 
     def _fault(self, error: BaseException | None) -> None:
         if error is not None:
@@ -146,25 +157,14 @@ class _Wired:
 CLOSED: list[str] = []
 
 
-def _connect(cls, name, settings, clock):
-    if settings.connect_error:
-        raise DeviceConnectionError(name, settings.connect_error)
-    if settings.port not in _plates:
-        raise DeviceConnectionError(name, f"nothing answers at {settings.port}")
-    return cls(name, settings, clock)
-
-
 class HeaterTEC(_Wired, TECAmplifier):
     class Settings(_Settings):
         temperature_limits: tuple[float, float] = Field(description="allowed set-points, °C")
 
     def __init__(self, name: str, settings: Settings, clock: Clock) -> None:
-        super().__init__(name, clock)
-        self._wire(settings)
+        super().__init__(name, settings, clock)
         self._setpoint = math.nan
         self.sent: list[float] = []
-
-    connect = classmethod(_connect)
 
     @property
     def identity(self) -> Identity:
@@ -227,12 +227,6 @@ class Thermometer(_Wired, TemperatureSensor):
     class Settings(_Settings):
         offset: float = Field(default=0.0, description="added to the reading, K")
 
-    def __init__(self, name: str, settings: Settings, clock: Clock) -> None:
-        super().__init__(name, clock)
-        self._wire(settings)
-
-    connect = classmethod(_connect)
-
     @property
     def identity(self) -> Identity:
         return Identity("Test", "Thermometer", "2", "1.0")
@@ -254,12 +248,6 @@ class Spot(_Wired, PositionSensor):
 
     class Settings(_Settings):
         pass
-
-    def __init__(self, name: str, settings: Settings, clock: Clock) -> None:
-        super().__init__(name, clock)
-        self._wire(settings)
-
-    connect = classmethod(_connect)
 
     @property
     def identity(self) -> Identity:

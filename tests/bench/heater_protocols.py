@@ -54,3 +54,19 @@ def settle(parameters: Settle) -> Messages:
             minimum=parameters.minimum,
         ),
     )
+
+
+class Watcher:
+    """An observer that remembers."""
+
+    def __init__(self):
+        self.ticks, self.steps, self.events = [], [], []
+
+    def telemetry(self, t, step, values):
+        self.ticks.append((t, step, tuple(values)))
+
+    def step(self, record):
+        self.steps.append(record)
+
+    def event(self, event):
+        self.events.append(event)

@@ -80,7 +80,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("old", "new", "expected"),
         [
-            ('"tec"', '"oven"', "roles.drive.device = 'oven' is no device of this rig; allowed: tec"),
+            ('"tec"', '"oven"', "roles.drive.device = 'oven' is not a device of this rig; allowed: tec"),
             ('"tec"', '"probe"', "roles.drive.device = 'probe' takes no set-point; allowed: tec"),
             (
                 '"tec_temperature"',

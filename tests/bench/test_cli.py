@@ -47,6 +47,17 @@ def write_loop(path, rows=400):
     return inputs, np.array(outputs)
 
 
+def assert_shown(bench, listed, protocol, parameters):
+    code, out, _ = bench("run", protocol, "--help")
+    assert code == 0
+    bench("list", protocol, "--json", listed)
+    shown = {entry["name"]: entry for entry in json.loads(listed.read_text())["parameters"]}
+    for name, (default, unit) in parameters.items():
+        assert name in out
+        assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
+        assert shown[name]["text"]
+
+
 class TestHelp:
     @pytest.mark.parametrize(
         "command",
@@ -100,14 +111,7 @@ class TestHelp:
         ],
     )
     def test_parameters_of_the_muscles_protocols(self, bench, tmp_path, protocol, parameters):
-        code, out, _ = bench("run", protocol, "--help")
-        assert code == 0
-        bench("list", protocol, "--json", tmp_path / "list.json")
-        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
-        for name, (default, unit) in parameters.items():
-            assert name in out
-            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
-            assert shown[name]["text"]
+        assert_shown(bench, tmp_path / "list.json", protocol, parameters)
 
     def test_help_says_what_exit_codes_mean(self, bench):
         _, out, _ = bench("--help")
@@ -557,6 +561,13 @@ def muscle_runs(tmp_path_factory):
     return runs
 
 
+def assert_no_model_of_one_input(bench, model, kind, run, signal):
+    code, _, err = bench("predict", model, run, "--input", signal, "--out", model.with_name("out.csv"))
+    assert code == 3
+    assert err.count("error:") == 1
+    assert f"is of the kind {kind}; expected one of one input" in re.sub(r"\s+", " ", err)
+
+
 class TestIdentifyMuscle:
     KINDS = ("force-voltage", "length-voltage", "length-force")
 
@@ -624,14 +635,9 @@ class TestIdentifyMuscle:
         assert "cannot be written" in err
 
     def test_what_it_writes_is_no_model_of_one_input(self, bench, muscle_runs, tmp_path):
-        self.identify(bench, muscle_runs, "--out", tmp_path / "model.json")
-        code, _, err = bench(
-            "predict", tmp_path / "model.json", muscle_runs["force-voltage"], "--input", "supply_voltage",
-            "--out", tmp_path / "out.csv",
-        )  # fmt: skip
-        assert code == 3
-        assert err.count("error:") == 1
-        assert "is of the kind two-stage; expected one of one input" in re.sub(r"\s+", " ", err)
+        model = tmp_path / "model.json"
+        self.identify(bench, muscle_runs, "--out", model)
+        assert_no_model_of_one_input(bench, model, "two-stage", muscle_runs["force-voltage"], "supply_voltage")
 
 
 class TestReportAndExport:
@@ -796,14 +802,9 @@ class TestIdentifyHybrid:
         assert "cannot be written" in err
 
     def test_what_it_writes_is_no_model_of_one_input(self, bench, hybrid_runs, tmp_path):
-        self.identify(bench, hybrid_runs, "--out", tmp_path / "model.json")
-        code, _, err = bench(
-            "predict", tmp_path / "model.json", hybrid_runs["piezo-loops"], "--input", "piezo_voltage",
-            "--out", tmp_path / "out.csv",
-        )  # fmt: skip
-        assert code == 3
-        assert err.count("error:") == 1
-        assert "is of the kind hybrid; expected one of one input" in re.sub(r"\s+", " ", err)
+        model = tmp_path / "model.json"
+        self.identify(bench, hybrid_runs, "--out", model)
+        assert_no_model_of_one_input(bench, model, "hybrid", hybrid_runs["piezo-loops"], "piezo_voltage")
 
 
 class TestHelpOfTheHybrid:
@@ -836,14 +837,7 @@ class TestHelpOfTheHybrid:
         ],
     )
     def test_of_the_protocols(self, bench, tmp_path, protocol, parameters):
-        code, out, _ = bench("run", protocol, "--help")
-        assert code == 0
-        bench("list", protocol, "--json", tmp_path / "list.json")
-        shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
-        for name, (default, unit) in parameters.items():
-            assert name in out
-            assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)
-            assert shown[name]["text"]
+        assert_shown(bench, tmp_path / "list.json", protocol, parameters)
 
     def test_rigs_and_protocols_are_listed(self, bench):
         code, out, _ = bench("list")

@@ -986,24 +986,27 @@ def test_the_control_thread_only_puts_entries_into_the_queue(
     assert len(callers) < len(control_entries)
 
 
-def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
-    folder = keep_journal(tmp_path / "long", list(make_run(4_000, 5)))
+@pytest.mark.parametrize(
+    ("entries", "recorded", "entity", "count"),
+    [
+        (lambda: make_run(4_000, 5), {}, "/signals/current", 20_000),
+        (
+            lambda: make_control_run(60, 200),
+            {"signals": CONTROL_SIGNALS, "controls": "curvature"},
+            "/control/error",
+            12_061,
+        ),
+    ],
+    ids=["steps", "control"],
+)
+def test_a_long_run_is_rebuilt_in_seconds(tmp_path: Path, entries, recorded, entity: str, count: int) -> None:
+    folder = keep_journal(tmp_path / "long", list(entries()), **recorded)
     stopwatch = Stopwatch()
     with Record(folder) as record:
         rebuild(record, folder / "run.rrd")
     # About 1 s; the rest is for a busy machine.
     assert stopwatch.seconds() < PATIENCE
-    assert len(table(read(folder / "run.rrd")["/signals/current"], "scalars")[0]) == 20_000
-
-
-def test_a_long_control_run_is_rebuilt_in_seconds(tmp_path: Path) -> None:
-    folder = keep_journal(tmp_path / "long", list(make_control_run(60, 200)), CONTROL_SIGNALS, "curvature")
-    stopwatch = Stopwatch()
-    with Record(folder) as record:
-        rebuild(record, folder / "run.rrd")
-    # About 0.6 s; the rest is for a busy machine.
-    assert stopwatch.seconds() < PATIENCE
-    assert len(table(read(folder / "run.rrd")["/control/error"], "scalars")[0]) == 12_061
+    assert len(table(read(folder / "run.rrd")[entity], "scalars")[0]) == count
 
 
 def test_a_picture_needs_a_recording(tmp_path: Path) -> None:

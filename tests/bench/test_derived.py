@@ -232,7 +232,7 @@ class TestOnARig:
             ),
             ('unit = "K"', 'unit = "K"\nconstants = { k = "5 K2" }', "derived.half.constants.k = '5 K2'"),
             ('unit = "K"', 'unit = "K"\nkind = "no_such:Class"', "derived.half.kind = 'no_such:Class'"),
-            ('unit = "K"', 'unit = "K"\nkind = "math:sqrt"', "derived.half.kind = 'math:sqrt': is no DerivedSignal"),
+            ('unit = "K"', 'unit = "K"\nkind = "math:sqrt"', "kind = 'math:sqrt': is not a DerivedSignal"),
         ],
     )
     def test_one_message_that_names_file_and_key(self, rig_file, old, new, key):

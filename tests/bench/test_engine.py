@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from heater_protocols import Settle, Stairs, settle, stairs
+from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
 from bench.clock import ScaledClock, VirtualClock
 from bench.control.tracking import Command, Trace
@@ -44,22 +44,6 @@ def define(function):
     function.__annotations__ = {"parameters": Nothing}
     function.__doc__ = "A protocol."
     return protocol(needs=("tec",))(function)
-
-
-class Watcher:
-    """An observer that remembers."""
-
-    def __init__(self):
-        self.ticks, self.steps, self.events = [], [], []
-
-    def telemetry(self, t, step, values):
-        self.ticks.append((t, step, tuple(values)))
-
-    def step(self, record):
-        self.steps.append(record)
-
-    def event(self, event):
-        self.events.append(event)
 
 
 class Bench:
@@ -839,24 +823,23 @@ class TestInterrupted:
         assert (outcome.status, outcome.reason, outcome.steps) == ("aborted", "ended by SIGTERM", 1)
         b.assert_safe()
 
-    def test_abort_in_the_middle_of_a_hold(self, bench):
+    def ended_at_three_seconds(self, bench):
         class Late(Watcher):
             def telemetry(_, t, *__):
                 if t >= 3.0:
                     self.b.interrupts.abort_reason = "SIGTERM"
 
-        self.b = b = bench(observers=[Late()])
+        self.b = bench(observers=[Late()])
+        return self.b
+
+    def test_abort_in_the_middle_of_a_hold(self, bench):
+        b = self.ended_at_three_seconds(bench)
         outcome = b.run(stairs)
         assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("aborted", 1, 3.0)
         b.assert_safe()
 
     def test_abort_while_settling(self, bench):
-        class Late(Watcher):
-            def telemetry(_, t, *__):
-                if t >= 3.0:
-                    self.b.interrupts.abort_reason = "SIGTERM"
-
-        self.b = b = bench(observers=[Late()])
+        b = self.ended_at_three_seconds(bench)
         assert b.run(settle).status == "aborted"
         b.assert_safe()
 

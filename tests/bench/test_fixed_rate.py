@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from heater_protocols import Watcher
 
 from bench.clock import VirtualClock, WallClock
 from bench.control.loops import Playback
@@ -86,20 +87,6 @@ def define(*messages):
             assert not reading.settled.failed
 
     return protocol(needs=(), controls="probe_temperature")(go)
-
-
-class Watcher:
-    def __init__(self):
-        self.ticks, self.steps, self.events = [], [], []
-
-    def telemetry(self, t, step, values):
-        self.ticks.append((t, step, tuple(values)))
-
-    def step(self, record):
-        self.steps.append(record)
-
-    def event(self, event):
-        self.events.append(event)
 
 
 class Bench:

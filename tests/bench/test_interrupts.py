@@ -259,30 +259,28 @@ class TestProcesses:
             assert len(steps) >= 21
             assert run.meta["protocol"] == "stairs"
 
-    def test_at_a_terminal_pause_and_resume(self, start):
-        process = start("stairs", "dwell=0.3", terminal=True)
+    def paused(self, start, *arguments):
+        process = start(*arguments, terminal=True)
         process.until("step 0 at")
         os.write(process.terminal, b"\x03")
         process.until("resumes")
+        return process
+
+    def test_at_a_terminal_pause_and_resume(self, start):
+        process = self.paused(start, "stairs", "dwell=0.3")
         os.write(process.terminal, b"what\nr\n")
         process.until("OUTCOME completed 4 True")
         assert process.end() == 0, process.output
         assert "please answer r" in process.output
 
     def test_at_a_terminal_pause_and_end(self, start):
-        process = start("stairs", "dwell=0.3", "count=500", "increment=0.1", terminal=True)
-        process.until("step 0 at")
-        os.write(process.terminal, b"\x03")
-        process.until("resumes")
+        process = self.paused(start, "stairs", "dwell=0.3", "count=500", "increment=0.1")
         os.write(process.terminal, b"a\n")
         self.assert_aborted(process, "by the operator at a pause")
 
     def test_at_a_terminal_ctrl_c_twice(self, start):
         # The question is left open while the process ends.
-        process = start("stairs", "dwell=0.3", "count=500", "increment=0.1", terminal=True)
-        process.until("step 0 at")
-        os.write(process.terminal, b"\x03")
-        process.until("resumes")
+        process = self.paused(start, "stairs", "dwell=0.3", "count=500", "increment=0.1")
         os.write(process.terminal, b"\x03")
         self.assert_aborted(process, "Ctrl-C, twice")
         assert "Fatal" not in process.output

@@ -61,6 +61,15 @@ def write_table(path, header, rows):
     return path
 
 
+def assert_refused(bench, out, code, words, protocol, *options):
+    found, _, err = bench("run", protocol, *VO2, *options, "--out", out)
+    assert found == code
+    assert "Traceback" not in err
+    for word in words:
+        assert word in re.sub(r"\s+", " ", err)
+    assert not out.exists()
+
+
 class TestTracking:
     def test_users_own_targets_are_reached_and_recorded(self, bench, models, tmp_path):
         targets = [300.0, 1200.0, 700.0, 1500.0]
@@ -126,13 +135,7 @@ class TestTracking:
         write_table(tmp_path / "wrong.csv", ["goal"], [[1.0]])
         places = {**models, **{name: tmp_path / f"{name}.csv" for name in ("gap", "text", "wrong")}}
         options = [part for text in settings for part in ("--set", text.format(**places))]
-        out = tmp_path / "out"
-        found, _, err = bench("run", "tracking", *VO2, *options, "--out", out)
-        assert found == code
-        assert "Traceback" not in err
-        for word in words:
-            assert word in re.sub(r"\s+", " ", err)
-        assert not out.exists()
+        assert_refused(bench, tmp_path / "out", code, words, "tracking", *options)
 
 
 class TestFollowing:
@@ -170,15 +173,8 @@ class TestFollowing:
         write_table(tmp_path / "gap.csv", ["time", "reference"], [[0, 500], [1, ""], [2, 520], [3, 530]])
         places = {name: tmp_path / f"{name}.csv" for name in ("unsorted", "gap")}
         options = [part for text in settings for part in ("--set", text.format(**places))]
-        out = tmp_path / "out"
-        found, _, err = bench(
-            "run", "following", *VO2, "--set", f"model={models['preisach']}", *options, "--out", out
-        )
-        assert found == code
-        assert "Traceback" not in err
-        for word in words:
-            assert word in re.sub(r"\s+", " ", err)
-        assert not out.exists()
+        options += ["--set", f"model={models['preisach']}"]
+        assert_refused(bench, tmp_path / "out", code, words, "following", *options)
 
 
 class TestInvert:

@@ -74,6 +74,15 @@ def random_state(rng, model):
     return model.advance(rng.uniform(0.0, 3.0, count), rng.uniform(0.0, 11.0, count))
 
 
+def random_states(rng, kinds):
+    """Models with their inverses, a new one every 40 times, each in a random state."""
+    for n in range(COUNTS[kinds]):
+        if n % 40 == 0:
+            model = wire(n, *kinds)
+            inverse = TwoStageInverse(model)
+        yield n, model, inverse, random_state(rng, model)
+
+
 def reachable_lengths(model, state, force=None):
     tension = state.force if force is None else force
     low, high = model.first.input_range
@@ -91,11 +100,7 @@ def reachable_forces(model, state, argument):
 def test_random_states_at_a_known_force(kinds):
     rng = np.random.default_rng(1)
     met = 0
-    for n in range(COUNTS[kinds]):
-        if n % 40 == 0:
-            model = wire(n, *kinds)
-            inverse = TwoStageInverse(model)
-        state = random_state(rng, model)
+    for n, model, inverse, state in random_states(rng, kinds):
         force = state.force if n % 3 == 0 else rng.uniform(0.0, 11.0)
         low, high = reachable_lengths(model, state, force)
         target = rng.uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low)
@@ -118,11 +123,7 @@ def test_random_states_at_a_known_force(kinds):
 def test_random_states_between_fixed_ends(kinds):
     rng = np.random.default_rng(2)
     met = 0
-    for n in range(COUNTS[kinds]):
-        if n % 40 == 0:
-            model = wire(n, *kinds)
-            inverse = TwoStageInverse(model)
-        state = random_state(rng, model)
+    for n, model, inverse, state in random_states(rng, kinds):
         length = None if n % 2 else model.step(state, rng.uniform(0.0, 3.0), rng.uniform(0.0, 11.0))[1]
         argument = inverse.voltage_for_force(state, 0.0, length).state.argument
         low, high = reachable_forces(model, state, argument)

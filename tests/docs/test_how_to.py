@@ -6,7 +6,6 @@ line of a `text` block has to occur in what the block before it has printed.
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def environment(tmp_path):
 
 
 @pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
-def test_page(page, tmp_path, environment):
+def test_page(page, tmp_path, environment, finished_process):
     printed = None
     for language, name, text in BLOCK.findall((PAGES / f"{page}.md").read_text()):
         if name:
@@ -46,15 +45,7 @@ def test_page(page, tmp_path, environment):
                 assert line in printed, f"{page}: {line!r} is not in\n{printed}"
         else:
             command = {"sh": ["sh", "-e", "-c"], "python": [sys.executable, "-c"]}[language]
-            done = subprocess.run(
-                [*command, text],
-                cwd=tmp_path,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=240,
-                check=False,
-            )
+            done = finished_process([*command, text], tmp_path, environment)
             printed = done.stdout
             assert done.returncode == 0, f"{page}: {text}\n{printed}{done.stderr}"
 

@@ -61,28 +61,23 @@ class Bench:
         self.server = ModbusTcpServer(self.t7)
         self.devices: list[T7PositionSensor | T7Switch | T7Thermistor | T7HighVoltageSupply] = []
 
-    def sensor(self, **settings) -> T7PositionSensor:
-        made = T7PositionSensor.connect("psd", Settings(port=self.server.address, **settings), self.clock)
+    def _connected(self, kind, name, settings):
+        made = kind.connect(name, kind.Settings(port=self.server.address, **settings), self.clock)
         self.devices.append(made)
         return made
+
+    def sensor(self, **settings) -> T7PositionSensor:
+        return self._connected(T7PositionSensor, "psd", settings)
 
     def switch(self, **settings) -> T7Switch:
-        given = {"line": 5} | settings
-        made = T7Switch.connect("fan", SwitchSettings(port=self.server.address, **given), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7Switch, "fan", {"line": 5} | settings)
 
     def thermistor(self, **settings) -> T7Thermistor:
-        made = T7Thermistor.connect("base", ThermistorSettings(port=self.server.address, **settings), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7Thermistor, "base", settings)
 
     def supply(self, **settings) -> T7HighVoltageSupply:
         """A supply on line 5 whose status output, at AIN2, follows `self.volts`."""
-        given = {"line": 5} | settings
-        made = T7HighVoltageSupply.connect("hv", SupplySettings(port=self.server.address, **given), self.clock)
-        self.devices.append(made)
-        return made
+        return self._connected(T7HighVoltageSupply, "hv", {"line": 5} | settings)
 
     def wire(self) -> PiezoAmplifier:
         """Wire an amplifier to TDAC0, to line 5 and to AIN0, 1 and 2."""
@@ -773,11 +768,14 @@ def test_an_output_out_of_its_window_is_named(bench, share):
             take()
 
 
-def test_requests_of_a_ratiometric_sensor(bench):
-    bench.volts[2], bench.volts[3] = 2.0, 5.0
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(T7PositionSensor, RATIOMETRIC), (T7Thermistor, {"channels": (2, 3)})]
+)
+def test_requests_of_a_sensor_of_two_channels(bench, kind, settings):
+    bench.volts[2], bench.volts[3] = 1.2, 2.5
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
-        sensor = T7PositionSensor.connect("psd", Settings(port=server.address, **RATIOMETRIC), bench.clock)
+        sensor = kind.connect("sensor", kind.Settings(port=server.address, **settings), bench.clock)
         recorded.requests.clear()
         sensor.glance()
         assert recorded.requests == [("read", 4, 4)]
@@ -853,20 +851,6 @@ def test_an_excitation_that_failed_is_named(bench, excitation):
     for take in (sensor.measure, sensor.glance):
         with pytest.raises(DeviceError, match=message):
             take()
-
-
-def test_requests_of_a_thermistor(bench):
-    bench.volts[2], bench.volts[3] = 1.2, 2.5
-    recorded = Recorded(bench.t7)
-    with ModbusTcpServer(recorded) as server:
-        sensor = T7Thermistor.connect("base", ThermistorSettings(port=server.address, channels=(2, 3)), bench.clock)
-        recorded.requests.clear()
-        sensor.glance()
-        assert recorded.requests == [("read", 4, 4)]
-        recorded.requests.clear()
-        sensor.measure()
-        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
-        sensor.close()
 
 
 # A high-voltage supply

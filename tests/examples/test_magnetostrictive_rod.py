@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +14,7 @@ BENCH = ("-m", "bench")
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory):
+def python(tmp_path_factory, finished_process):
     """Install the package in a folder of its own; return a function that runs Python with it."""
     home = tmp_path_factory.mktemp("installed")
     # A copy, as building leaves files beside the source.
@@ -23,15 +22,7 @@ def python(tmp_path_factory):
     environment = {**os.environ, "PYTHONPATH": str(home / "site"), "COLUMNS": "120"}
 
     def run(*arguments, cwd=home, both=False):
-        done = subprocess.run(
-            [sys.executable, *map(str, arguments)],
-            cwd=cwd,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
-        )
+        done = finished_process([sys.executable, *map(str, arguments)], cwd, environment)
         assert done.returncode == 0, done.stdout + done.stderr
         return (done.stdout, done.stderr) if both else done.stdout
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from bench import registry
-from bench.cli import main
 from bench.controllers import ControllerSetup, make_controller
 from bench.errors import DataError
 from bench.hysteresis import Preisach, QuadraticTerm, Reach, operator_from_json, uniform_levels
@@ -57,15 +56,13 @@ def found(true):
 
 
 @pytest.fixture
-def bench(capsys):
+def bench(bench):
     """Run a command in this process; return its standard output."""
 
     def run(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        assert not stopped.value.code, captured.err
-        return captured.out
+        code, out, err = bench(*arguments)
+        assert code == 0, err
+        return out
 
     return run
 

@@ -1,11 +1,9 @@
 """The muscles of the paper's outlook: the protocols and models of the wire on two more rigs."""
 
-import json
 from pathlib import Path
 
 import pytest
 
-from bench.cli import main
 from bench.journal import Record
 from rigs.muscles.identification import MODELS, SAMPLE
 
@@ -15,17 +13,10 @@ SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "len
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.seeds)])
-def test_campaign(tmp_path, capsys, seed):
-    result = tmp_path / "result.json"
-    with pytest.raises(SystemExit) as stopped:
-        main(["reproduce", "muscles", "--seed", str(seed), "--out", str(tmp_path), "--json", str(result)])
-    assert not stopped.value.code
-    out, err = capsys.readouterr()
+def test_campaign(reproduce, seed):
+    out, campaign = reproduce("muscles", seed)
     assert "McKibben muscle" in out
     assert "super-coiled polymer muscle" in out
-    assert err == ""
-    campaign = json.loads(result.read_text())
-    assert campaign["seed"] == seed
     assert campaign["laboratory_seconds"] > 8 * 3600
     for muscle in MUSCLES:
         errors = campaign[muscle]

@@ -62,11 +62,6 @@ class Plate:
 
 
 @pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
 def plate():
     return Plate()
 

@@ -4,7 +4,6 @@ import sys
 import pytest
 import serial
 
-from bench.clock import VirtualClock
 from sim_devices import protocol_emulated
 
 
@@ -21,11 +20,6 @@ class Echo:
         *lines, rest = bytes(self.received).split(b"\n")
         self.received = bytearray(rest)
         return b"".join(line[::-1] + b"\n" for line in lines)
-
-
-@pytest.fixture
-def clock():
-    return VirtualClock()
 
 
 @pytest.fixture

@@ -51,11 +51,6 @@ def make_device(clock=None, load=None, **keys):
 
 
 @pytest.fixture
-def clock():
-    return VirtualClock()
-
-
-@pytest.fixture
 def load():
     return Resistor()
 

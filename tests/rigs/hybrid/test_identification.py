@@ -1,18 +1,15 @@
 """From runs of the hybrid to its model: on samples that are made up, and on short runs recorded here."""
 
-import io
 import math
 import sqlite3
 
 import numpy as np
 import pytest
-from rich.console import Console
+from short_runs import record_run
 
 from bench.errors import DataError
 from bench.hysteresis import PrandtlIshlinskii
 from bench.journal import FILE_NAME, Record, Table
-from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
 from rigs.hybrid.identification import (
     BASE,
     CURRENT,
@@ -41,22 +38,17 @@ SHORT = {
 PARTS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
 
 
-def record_run(folder, protocol, rig="hybrid", overrides=None, **settings):
-    definition = find_protocol(protocol)
-    run = Run(
-        protocol=definition, settings={**SHORT[protocol], **settings}, rig=rig, folder=folder,
-        overrides=overrides or {}, seed=1, clock="virtual", recording=False,
-    )  # fmt: skip
-    return carry_out(run, Console(file=io.StringIO(), width=200))
+def record_short_run(folder, protocol, rig="hybrid", overrides=None, **settings):
+    return record_run(folder, protocol, rig, {**SHORT[protocol], **settings}, overrides)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """The folder of a completed run of each protocol, and `failed` for one that was not completed."""
     folder = tmp_path_factory.mktemp("runs")
-    results = {name: record_run(folder, name) for name in SHORT}
+    results = {name: record_short_run(folder, name) for name in SHORT}
     assert all(result.outcome.status == "completed" for result in results.values())
-    failed = record_run(
+    failed = record_short_run(
         folder, "piezo-loops", overrides={"emulation.fault": "open-thermistor", "emulation.fault_time": "5"}
     )
     assert failed.outcome.status == "failed"
@@ -116,7 +108,7 @@ class TestReading:
             read_loop(runs["current-sine"])
 
     def test_ticks_are_no_samples(self, tmp_path):
-        result = record_run(tmp_path, "current-sine", frequencies="0.01", rate="0.1")
+        result = record_short_run(tmp_path, "current-sine", frequencies="0.01", rate="0.1")
         with Record(result.folder) as record:
             assert len(record.telemetry()) > 50
         samples = read_loop(result.folder)
@@ -124,7 +116,7 @@ class TestReading:
         assert samples.period == pytest.approx(10.0)
 
     def test_two_loops_of_one_label_are_refused(self, tmp_path):
-        result = record_run(tmp_path, "current-sine", frequencies="0.01, 0.01")
+        result = record_short_run(tmp_path, "current-sine", frequencies="0.01, 0.01")
         with pytest.raises(DataError, match=r"has two loops '0.01 Hz'; expected one of each label"):
             read_loops(result.folder)
 
@@ -346,7 +338,7 @@ class TestIdentifying:
         ],
     )
     def test_a_run_that_shows_nothing_is_refused(self, runs, tmp_path, protocol, settings, words):
-        empty = record_run(tmp_path, protocol, **settings).folder
+        empty = record_short_run(tmp_path, protocol, **settings).folder
         with pytest.raises(DataError, match=words):
             identify_hybrid(*(empty if name == protocol else runs[name] for name in PARTS))
 

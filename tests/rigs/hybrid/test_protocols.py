@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from short_runs import all_messages
 
 from bench.clock import VirtualClock
 from bench.engine import check_before_moving
@@ -17,7 +18,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
 from bench.model_file import ModelFile
-from bench.protocol import FixedRate, Phase, Reading, Step, find_protocol, plan
+from bench.protocol import FixedRate, Step, find_protocol, plan
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
@@ -82,14 +83,7 @@ def planned(protocol, rig=WIRED, **settings):
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
     definition, parameters = parsed(protocol, settings)
-    messages, found, reading = definition.start(parameters, slots_of(protocol)), [], None
-    while True:
-        try:
-            message = messages.send(reading)
-        except StopIteration:
-            return found
-        found.append(message)
-        reading = None if isinstance(message, Phase) else Reading(len(found), 0.0, True, {})
+    return all_messages(definition.start(parameters, slots_of(protocol)), {})
 
 
 def loops(protocol, **settings):

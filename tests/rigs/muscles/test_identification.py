@@ -1,19 +1,16 @@
 """From runs of a muscle to models, on short runs of the rig `sma` recorded here."""
 
-import io
 import sqlite3
 
 import numpy as np
 import pytest
-from rich.console import Console
+from short_runs import record_run
 
 from bench.errors import DataError
 from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
 from bench.identification.two_stage import measure_series, predict_series
 from bench.journal import FILE_NAME, Record
 from bench.model_file import load_model
-from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
 from protocols.muscles.force_voltage import scaled_steps
 from rigs.muscles.identification import (
     FORCE,
@@ -41,20 +38,15 @@ SHORT = {
 }
 
 
-def record_run(folder, protocol, rig="sma", overrides=None, **settings):
-    definition = find_protocol(protocol)
-    run = Run(
-        protocol=definition, settings={**SHORT[protocol], **settings}, rig=rig, folder=folder,
-        overrides=overrides or {}, seed=1, clock="virtual", recording=False,
-    )  # fmt: skip
-    return carry_out(run, Console(file=io.StringIO(), width=200))
+def record_short_run(folder, protocol, rig="sma", overrides=None, **settings):
+    return record_run(folder, protocol, rig, {**SHORT[protocol], **settings}, overrides)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """The folder of a completed run of each protocol."""
     folder = tmp_path_factory.mktemp("runs")
-    results = {name: record_run(folder, name, "vo2" if name == "creep" else "sma") for name in SHORT}
+    results = {name: record_short_run(folder, name, "vo2" if name == "creep" else "sma") for name in SHORT}
     assert all(result.outcome.status == "completed" for result in results.values())
     return {name: result.folder for name, result in results.items()}
 
@@ -103,7 +95,7 @@ class TestReading:
         assert found[0].voltages[0] == found[1].voltages[0]
 
     def test_an_incomplete_run_is_refused(self, tmp_path):
-        result = record_run(
+        result = record_short_run(
             tmp_path,
             "length-voltage",
             overrides={"emulation.fault": "missing-heartbeat", "emulation.fault_time": "90"},

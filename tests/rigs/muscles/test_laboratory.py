@@ -6,6 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import serial
+from short_runs import assert_refused
 
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceError
@@ -319,11 +320,7 @@ class TestSettings:
         ],
     )
     def test_what_is_wrong_is_one_message(self, name, key, value, words):
-        with pytest.raises(ConfigurationError) as caught:
-            load_rig(name, {f"emulation.{key}": value})
-        (line,) = str(caught.value).splitlines()
-        assert line.startswith(f"{name}.toml: emulation.{key}")
-        assert words in line
+        assert_refused(name, key, value, words)
 
     @pytest.mark.parametrize(
         ("name", "key"),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from short_runs import all_messages
 
 from bench.cli import main
 from bench.clock import VirtualClock
@@ -13,7 +14,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
 from bench.model_file import ModelFile
-from bench.protocol import Control, Note, Phase, Prompt, Reading, Step, find_protocol, plan
+from bench.protocol import Control, Phase, Prompt, Step, find_protocol, plan
 from bench.results.tracking import target_results
 from bench.rig import Rig
 from bench.rig_file import load_rig
@@ -43,16 +44,7 @@ def bound(protocol, settings):
 def dry(protocol, **settings):
     """All messages of a protocol whose readings are all zero."""
     definition, parameters, slots = bound(protocol, settings)
-    messages = definition.start(parameters, slots)
-    zeros = dict.fromkeys((FORCE, LENGTH), 0.0)
-    found, reading = [], None
-    while True:
-        try:
-            message = messages.send(reading)
-        except StopIteration:
-            return found
-        found.append(message)
-        reading = None if isinstance(message, Phase | Note) else Reading(len(found), 0.0, True, zeros)
+    return all_messages(definition.start(parameters, slots), dict.fromkeys((FORCE, LENGTH), 0.0))
 
 
 def samples_by_phase(messages):
