@@ -1,0 +1,104 @@
+"""The general protocols on every emulated rig: characterize, identify, validate, track, report."""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.journal import Record
+from bench.results.tracking import target_results
+from bench.rig_file import load_rig
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a rig's characterization needs, and the greatest RMS error of tracking, % of the response's range."""
+
+    setpoint: str
+    drive: str
+    response: str
+    increment: float
+    dwell: float
+    plane: tuple[float, float]
+    bound: float
+    unit: str
+    identify: tuple[str, ...] = ("--model", "preisach-signed")
+
+
+NONMONOTONIC = ("--model", "preisach-nonmonotonic", "--option", "reference=20")
+MUSCLE = ("supply_setpoint", "supply_voltage", "wire_end_position")
+# Measured with seed 0: 0.75 (vo2), 4.8 (sma), 0.24 (mckibben), 1.28 (coiled-polymer), 4.2 (hybrid) %; twice that is
+# allowed.
+CASES = {
+    "vo2": Case("tec_setpoint", "tec_temperature", "curvature", 4.0, 8.0, (30, 70), 1.5, "1/m", NONMONOTONIC),
+    "sma": Case(*MUSCLE, 0.2, 5.0, (0.01, 2.99), 9.6, "mm"),
+    "mckibben": Case(*MUSCLE, 0.2, 5.0, (0.01, 2.99), 0.5, "mm"),
+    "coiled-polymer": Case(*MUSCLE, 0.2, 30.0, (0.01, 2.99), 2.6, "mm"),
+    "hybrid": Case("piezo_setpoint", "piezo_voltage", "displacement_position", 5.0, 0.5, (-39, 39), 8.4, "µm"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", CASES)
+def test_from_characterization_to_report(bench, tmp_path, rig):
+    case = CASES[rig]
+    low, high = load_rig(rig).roles["response"].range
+
+    def run(protocol, **parameters):
+        """Run a protocol; return its folder and its readings, once they are found safe, complete and well named."""
+        result = tmp_path / f"{protocol}.json"
+        settings = [part for key, value in parameters.items() for part in ("--set", f"{key}={value}")]
+        code, _, err = bench(
+            *("run", protocol, "--rig", rig, "--clock", "virtual", "--out", tmp_path, "--json", result), *settings
+        )
+        assert code == 0, err
+        outcome = json.loads(result.read_text())
+        assert outcome["status"] == "completed"
+        assert outcome["is_safe"]
+        assert set(outcome["safe_state"].values()) == {"safe"}
+        folder = Path(outcome["folder"])
+        with Record(folder) as record:
+            assert record.meta["rig"] == rig
+            assert {"signal": case.drive, "device": case.setpoint.removesuffix("_setpoint")} == record.meta["slots"][
+                "drive"
+            ]
+            assert record.meta["slots"]["response"]["signal"] == case.response
+            steps = record.steps()
+            assert np.isfinite(steps[case.setpoint][1:]).all()
+            assert np.isfinite(steps[case.response]).all()
+        return folder, steps
+
+    dwell = {"dwell": case.dwell}
+    characterization, steps = run("damped-oscillation", half_cycles=6, increment=case.increment, **dwell)
+    # The drive goes where it is sent, and the response over most of what the rig says of it.
+    assert np.ptp(steps[case.drive]) > 0.95 * np.ptp(steps[case.setpoint][1:])
+    assert np.ptp(steps[case.response]) > 0.7 * (high - low)
+
+    model = tmp_path / "model.json"
+    code, _, err = bench(
+        *("identify", characterization, "--input", case.drive, "--output", case.response, *case.identify),
+        *("--levels", 8, "--plane", *case.plane, "--out", model),
+    )
+    assert code == 0, err
+
+    _, validation = run("random-validation", count=12, **dwell)
+    assert len(validation) >= 12
+
+    tracking, steps = run("tracking", model=model, controller="closed-loop-inverse", count=5)
+    assert {"reference", "predicted", "disturbance"} <= set(steps.columns)
+    with Record(tracking) as record:
+        results = target_results(record, case.response)
+    rms = 100 * results.summary()["rms"] / (high - low)
+    assert len(results.targets) == 5
+    assert rms < case.bound
+
+    code, text, err = bench("report", tracking)
+    assert code == 0, err
+    row = re.search(rf"{case.response}[^\n]*", text).group()
+    assert row.split("│")[3].strip() == case.unit
+    # An error may be so small that the next prefix fits it.
+    units = "µm" if case.unit == "µm" else f"({case.unit}|µm)"
+    assert re.search(rf"error rms [\d.]+ {units}", re.sub(r"\s+", " ", text))
