@@ -114,6 +114,17 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
     return registry.load("controllers", f"{task}.{name}").make(replace(setup, name=name))
 
 
+@dataclass(frozen=True)
+class Settling:
+    """How long the controllers without feedback let the specimen settle at each set-point, s."""
+
+    wait: float = 8.0
+
+
+def _wait(setup: ControllerSetup) -> float:
+    return setup.tuned(lambda _: Settling()).wait
+
+
 def _look_up(setup: ControllerSetup) -> LookUp:
     operator = setup.model.operator
     if not operator.memoryless:
@@ -121,7 +132,7 @@ def _look_up(setup: ControllerSetup) -> LookUp:
             f"controller {setup.name} needs a model without memory, such as a polynomial; this one is "
             f"{setup.model.name}"
         )
-    return LookUp(operator, setup.limits)
+    return LookUp(operator, setup.limits, wait=_wait(setup))
 
 
 def _latched(setup: ControllerSetup) -> Latched:
@@ -142,7 +153,8 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
 
 
 OPEN_LOOP_INVERSE = ControllerSpec(
-    "the inverse of the model, without feedback", lambda s: OpenLoopInverse(s.inverse(), s.state, s.limits)
+    "the inverse of the model, without feedback",
+    lambda s: OpenLoopInverse(s.inverse(), s.state, s.limits, wait=_wait(s)),
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",

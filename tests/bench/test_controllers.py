@@ -1,0 +1,38 @@
+"""Controllers by name: the numbers that a rig puts in place of their defaults."""
+
+import numpy as np
+import pytest
+
+from bench.controllers import ControllerSetup, controller_names, make_controller
+from bench.errors import ConfigurationError
+from bench.hysteresis import Polynomial, Preisach, uniform_levels
+from bench.model_file import ModelFile
+
+PREISACH = ModelFile("preisach", Preisach(uniform_levels(0.0, 3.0, 4), np.ones(10), input_range=(0.0, 3.0)))
+POLYNOMIAL = ModelFile("polynomial", Polynomial([1.0], (0.0, 3.0)))
+
+
+def setup(model=PREISACH, **options):
+    return ControllerSetup(model=model, limits=(0.0, 3.0), options=options)
+
+
+@pytest.mark.parametrize(("name", "model"), [("open-loop-inverse", PREISACH), ("polynomial", POLYNOMIAL)])
+def test_the_time_at_each_target_is_that_of_the_rig(name, model):
+    for options, wait in (({}, 8.0), ({"wait": 40}, 40.0)):
+        assert make_controller("target", name, setup(model, **options)).aim(1.0, 0.0, 0.0, 0.0).wait == wait
+
+
+@pytest.mark.parametrize("task", ["target", "follow"])
+def test_a_number_that_a_controller_does_not_have_is_refused(task):
+    for name in controller_names(task):
+        if name in ("latched", "polynomial"):
+            continue
+        with pytest.raises(ConfigurationError, match=f"controller {name}: colour: there is no such number"):
+            make_controller(task, name, setup(colour=1.0))
+
+
+def test_a_controller_that_does_not_exist_is_refused_with_those_that_do():
+    with pytest.raises(
+        ConfigurationError, match=r"there is no controller 'magic' for the task target; there are: .*latched"
+    ):
+        make_controller("target", "magic", setup())
