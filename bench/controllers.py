@@ -115,14 +115,12 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
 
 
 @dataclass(frozen=True)
-class Settling:
-    """How long the controllers without feedback let the specimen settle at each set-point, s."""
-
-    wait: float = 8.0
+class _Settling:
+    wait: float = 8.0  # s at each set-point, without feedback
 
 
 def _wait(setup: ControllerSetup) -> float:
-    return setup.tuned(lambda _: Settling()).wait
+    return setup.tuned(lambda _: _Settling()).wait
 
 
 def _look_up(setup: ControllerSetup) -> LookUp:

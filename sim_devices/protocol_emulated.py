@@ -93,6 +93,16 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         del self._received[:size]
         return data
 
+    def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
+        """Return what was received up to `expected`, or `size` bytes; what there is after the timeout on the clock.
+
+        pyserial's own reads byte by byte and watches the wall clock, by which nothing emulated may fail.
+        """
+        self._clock_of_open_port()
+        end = self._received.find(expected)
+        found = len(self._received) + 1 if end < 0 else end + len(expected)
+        return self.read(found if size is None else min(found, size))
+
     def write(self, data: bytes, /) -> int:
         """Send bytes; the answer is ready for `read` when this returns."""
         clock = self._clock_of_open_port()

@@ -140,7 +140,7 @@ def test_the_same_step_by_step(tmp_path, seed):
         runs[name] = json.loads((tmp_path / "run.json").read_text())["folder"]
     identified, validated = {}, {}
     for key, model, options in (
-        ("nonmonotonic", "preisach-nonmonotonic", ["--levels", 20]),
+        ("nonmonotonic", "preisach-nonmonotonic", ["--levels", 20, "--plane", 30, 70, "--option", "reference=20"]),
         ("signed", "preisach-signed", ["--levels", 20, "--plane", 21, 84]),
         ("polynomial", "polynomial", ["--degree", 12]),
     ):

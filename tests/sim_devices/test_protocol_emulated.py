@@ -167,6 +167,19 @@ class TestTime:
         assert port.read(10) == b"ba\n"
         assert clock.now() == before + 0.5
 
+    def test_a_line_is_read_whole_however_long_the_machine_takes(self, port, clock, monkeypatch):
+        hours = iter(range(10**9))
+        monkeypatch.setattr("time.monotonic", lambda: 3600.0 * next(hours))
+        port.write(b"abc\ndef\n")
+        before = clock.now()
+        assert port.read_until(b"\n") == b"cba\n"
+        assert port.read_until(b"\n", 2) == b"fe"
+        assert port.read_until() == b"d\n"
+        assert clock.now() == before
+        port.write(b"gh")
+        assert port.read_until() == b""
+        assert clock.now() >= before + 0.5
+
     @pytest.mark.parametrize("timeout", [0, None])
     def test_without_a_timeout(self, port, clock, timeout):
         port.timeout = timeout
