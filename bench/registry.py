@@ -15,6 +15,7 @@ cannot be imported is an error only for those who ask for it.
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -129,3 +130,10 @@ def check_own_packages() -> None:
                 f"{Path(places[0]).resolve()} hides the bench's own package {name!r} ({home / name}); "
                 f"run the bench from another folder, or rename that one"
             )
+
+
+def import_beside(file: Path) -> None:
+    """Let the modules in the folder of a file be imported; they come last and hide no installed module."""
+    folder = str(file.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)

@@ -50,7 +50,6 @@ laboratory; any other port is the real one. Python modules in the folder of the 
 from __future__ import annotations
 
 import importlib
-import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -234,10 +233,7 @@ def _read(name: str) -> tuple[str, str]:
             text = Path(name).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigurationError(f"rig file {name} cannot be read: {error}") from None
-        folder = str(Path(name).resolve().parent)
-        if folder not in sys.path:
-            # Last, so that nothing there hides an installed module.
-            sys.path.append(folder)
+        registry.import_beside(Path(name))
         return name, text
     left_out: list[str] = []
     packaged = packaged_rigs(left_out)

@@ -288,8 +288,9 @@ def invert(
     `too low`; what cannot be met is clamped to the nearest reachable value).
     """
     from bench.model_file import load_model
-    from bench.results.data import header_with_unit, read_columns, write_csv
+    from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, invert_targets
+    from bench.units import header_with_unit
 
     model = load_model(model_path)
     columns = read_columns(file, [column])

@@ -99,10 +99,7 @@ def _protocol_from_file(path: Path, wanted: str) -> ProtocolDefinition:
     spec = importlib.util.spec_from_file_location(f"protocol_file_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ConfigurationError(f"protocol file {path} cannot be loaded as Python")
-    folder = str(path.resolve().parent)
-    if folder not in sys.path:
-        # Last, so that nothing there hides an installed module.
-        sys.path.append(folder)
+    registry.import_beside(path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:

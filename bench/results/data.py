@@ -104,11 +104,6 @@ def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequ
         raise DataError(f"{path} cannot be written: {error}") from None
 
 
-def header_with_unit(name: str, unit: str) -> str:
-    """Return a column header such as `force [N]`; the name alone where there is no unit."""
-    return f"{name} [{unit}]" if unit else name
-
-
 def split_unit(header: str) -> tuple[str, str]:
     """Return name and unit of a column header such as `force [N]`; the unit is empty when there is none."""
     name, bracket, rest = header.strip().rpartition(" [")
