@@ -21,6 +21,7 @@ import struct
 
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState
+from sim_devices.wire import WireServer
 
 LONGEST_LINE = 64
 """Characters after which a line without an end is dropped; the longest real one has 26."""
@@ -46,7 +47,7 @@ _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
 _SEGMENT = 7  # bytes in a segment
 
 
-class CanopenSlcanServer:
+class CanopenSlcanServer(WireServer):
     """The serial side of an slcan adapter with one emulated controller on its bus."""
 
     def __init__(self, device: EmulatedRoboteq) -> None:

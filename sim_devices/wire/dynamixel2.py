@@ -24,6 +24,7 @@ from enum import IntEnum
 from sim_devices.instruments.dynamixel import LOWEST_FIRMWARE_THAT_CLEARS, EmulatedMX28
 from sim_devices.instruments.dynamixel_table import ErrorNumber
 from sim_devices.instruments.emulated import RequestRefusedError
+from sim_devices.wire import WireServer
 
 LONGEST_FRAME = 1024
 """Bytes beyond which what looks like a packet is taken for noise; it is the longest of the maker's software."""
@@ -97,7 +98,7 @@ def frame(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     return packet + struct.pack("<H", crc16(packet))
 
 
-class Dynamixel2Server:
+class Dynamixel2Server(WireServer):
     """The serial side of the servos on one bus.
 
     Parameters

@@ -25,6 +25,7 @@ from binascii import crc_hqx
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import Parameter, ServerError
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.wire import WireServer
 
 LONGEST_FRAME = 512
 """Characters after which a frame without an end is dropped; the longest real one is about half of it."""
@@ -35,7 +36,7 @@ _FRAME = re.compile(rb"#([0-9A-F]{2})([0-9A-F]{4})(.*)([0-9A-F]{4})", re.DOTALL)
 _HEX = re.compile(r"[0-9A-F]*")
 
 
-class MeComServer:
+class MeComServer(WireServer):
     """The serial side of an emulated Meerstetter device.
 
     Answers `?VR`, `VS`, `?VL`, `?VM`, `?IF`, `ES`, `RS` and `CS`; a change of speed is acknowledged and has

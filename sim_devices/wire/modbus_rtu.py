@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import RegisterBank, answer
 
 BROADCAST = 0
@@ -57,7 +58,7 @@ def crc16(data: bytes | bytearray | memoryview) -> bytes:
     return crc.to_bytes(2, "little")
 
 
-class ModbusRtuServer:
+class ModbusRtuServer(WireServer):
     """The serial side of an emulated instrument.
 
     Requests to other addresses have no answer. A broadcast to address 0 is carried out and not answered.
