@@ -16,8 +16,8 @@ from typing import Literal, NamedTuple
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.labjack_t7.connection import share
 from drivers.modbus import RefusedError, exception_text, read_request, swapped
+from drivers.modbus_tcp import share
 
 Kind = Literal["F32", "U32", "U16"]
 Access = Literal["R", "W", "RW"]
@@ -160,7 +160,7 @@ class LabJackT7:
         """Release the connection; it is closed with its last user."""
         if self._connected:
             self._connected = False
-            self._connection.release()
+            self._connection.close()
 
     def read_words(self, address: int, count: int) -> list[int]:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
