@@ -98,7 +98,7 @@ class Template:
     def _parts(self) -> tuple[tuple[str, str | None, str], ...]:
         """Literal text, the name of the placeholder after it, and its format."""
         try:
-            parts = [(text, name, spec or "") for text, name, spec, _ in Formatter().parse(self.text)]
+            parts = [(text, name, spec or "") for text, name, spec, _ in Formatter().parse(self.text.strip())]
         except ValueError as error:
             raise ValueError(f"{error}; a brace of the message itself is doubled: {{{{ or }}}}") from None
         for _, name, _ in parts:
@@ -190,6 +190,13 @@ def _range(value: tuple[float, float]) -> tuple[float, float]:
     if not low < high:
         raise ValueError("expected the lower limit first, and a higher one")
     return value
+
+
+def not_empty(messages: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the messages that reach the safe state; raise `ValueError` if there is none."""
+    if not messages:
+        raise ValueError("is empty; what reaches the safe state has to be said")
+    return messages
 
 
 def _terminator(text: str) -> str:
@@ -321,7 +328,7 @@ class SetpointTable(TargetTable):
                 written = written_number(template, limit / scale) * scale
                 if not math.isclose(written, limit, rel_tol=1e-9, abs_tol=1e-12):
                     raise ValueError(
-                        f"writes the limit {limit:g} as {written:g}; give it more digits, or round the limit"
+                        f"writes the limit {limit:.10g} as {written:.10g}; give it more digits, or round the limit"
                     )
         return text
 
@@ -350,8 +357,8 @@ class OutputTable(_Table):
         default=(),
         description='messages that switch it on, limits first, such as ["CURR 1.0", "OUTP ON"]; the last one counts',
     )
-    off: tuple[Message, ...] = Field(
-        min_length=1, description='messages that reach the safe state, such as ["OUTP OFF"]; the last one counts'
+    off: Annotated[tuple[Message, ...], AfterValidator(not_empty)] = Field(
+        description='messages that reach the safe state, such as ["OUTP OFF"]; the last one counts'
     )
     query: OptionalMessage = Field(default="", description="question for its state, such as OUTP?")
     is_on: Expected = Field(default="1", description="answer when it is on; {any} for any but `is_off`")

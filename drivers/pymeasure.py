@@ -17,7 +17,7 @@
     property = "current"
     unit = "A"
 
-Properties of a channel are written with a point, `ch_1.voltage`. Source: PyMeasure's documentation of its instruments.
+Properties of a channel are written with a point, `ch_1.voltage`. Source: the documentation of PyMeasure 0.16.
 """
 
 from __future__ import annotations
@@ -33,7 +33,16 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from bench.clock import Clock
-from bench.command_table import ANY_TEXT, Expected, Name, QuantityTable, TargetTable, Template, check_arrival
+from bench.command_table import (
+    ANY_TEXT,
+    Expected,
+    Name,
+    QuantityTable,
+    TargetTable,
+    Template,
+    check_arrival,
+    not_empty,
+)
 from bench.devices import DriverSettings, Identity, Limits, Status
 from bench.errors import DeviceConnectionError, DeviceError
 from bench.roles import GeneralActuator, GeneralSensor
@@ -174,7 +183,9 @@ class ActuatorSettings(SensorSettings):
         default=(), description="calls and assignments before the set-point that switches on, limits as a rule"
     )
     on: tuple[Action, ...] = Field(default=(), description="calls and assignments that switch the output on")
-    safe: tuple[Action, ...] = Field(min_length=1, description="calls and assignments that reach the safe state")
+    safe: Annotated[tuple[Action, ...], AfterValidator(not_empty)] = Field(
+        description="calls and assignments that reach the safe state"
+    )
     output: Path | None = Field(
         default=None, description="property that is true while the output is on, such as source_enabled"
     )
@@ -313,8 +324,8 @@ class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
 class Adapter(SensorAdapter, GeneralActuator):
     """A PyMeasure instrument that takes a set-point, and measures its signals.
 
-    `set` sets the property, reads it back, and carries out `on` if the output is off. `safe` carries out everything of
-    the key `safe`; it is confirmed by the property `output` where there is one.
+    `set` sets the property, reads it back, and carries out `on` if the output is off. `safe` carries out all of the
+    key `safe`; it is confirmed by the property `output` where there is one.
     """
 
     Settings: ClassVar[type[SensorSettings]] = ActuatorSettings

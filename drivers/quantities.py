@@ -49,7 +49,7 @@ def arrival_of(
 
 
 def check_read_back(device: str, target: TargetTable, written: float, found: float, reported: str = "") -> None:
-    """Raise `DeviceError` unless a set-point is read back as it was written; `reported` are the instrument's errors."""
+    """Raise `DeviceError` unless a set-point is read back as it was written; `reported` are its errors."""
     if not abs(found - written) <= target.tolerance * (1.0 + 1e-9):
         raise DeviceError(
             device,

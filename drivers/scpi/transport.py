@@ -134,21 +134,20 @@ class VisaTransport:
         self._errors = (pyvisa.errors.Error, OSError)
         self._timed_out = pyvisa.constants.StatusCode.error_timeout
         self._discard_buffer = pyvisa.constants.BufferOperation.discard_read_buffer
+        self._resource: Any = None
         try:
             manager = pyvisa.ResourceManager(settings.visa_library)
-            self._resource: Any = manager.open_resource(
+            self._resource = manager.open_resource(
                 settings.port.removeprefix(VISA),
                 open_timeout=round(1e3 * settings.timeout),
                 timeout=1e3 * settings.timeout,
             )
+            self._configure(pyvisa.constants)
         # Each library fails in a way of its own.
         except Exception as error:
+            if self._resource is not None:
+                self.close()
             raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
-        try:
-            self._configure(pyvisa.constants)
-        except Exception as error:
-            self.close()
-            raise DeviceConnectionError(device, f"cannot configure {settings.port}: {error}") from None
 
     def _configure(self, constants: Any) -> None:  # noqa: ANN401 - a module
         settings, resource = self._settings, self._resource
