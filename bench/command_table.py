@@ -33,7 +33,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from string import Formatter
 from typing import Annotated
 
@@ -152,6 +152,12 @@ class Template:
             return None
         numbers = {name: float(text) for name, text in found.groupdict().items()}
         return numbers if all(abs(number) < _NOT_A_NUMBER for number in numbers.values()) else None
+
+
+@cache
+def template(text: str) -> Template:
+    """Return the template of a text, made once; raises as `Template`."""
+    return Template(text)
 
 
 def _message(text: str) -> str:

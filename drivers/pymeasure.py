@@ -39,9 +39,9 @@ from bench.command_table import (
     Name,
     QuantityTable,
     TargetTable,
-    Template,
     check_arrival,
     not_empty,
+    template,
 )
 from bench.devices import DriverSettings, Identity, Limits, Status
 from bench.errors import DeviceConnectionError, DeviceError
@@ -284,7 +284,7 @@ class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
         if not hasattr(type(self._line.instrument), "id"):
             return self._identity
         answer = str(self._line.get("id")).strip()
-        if Template(settings.identity).match(answer) is None:
+        if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
                 self.name, f"{settings.address} is {answer!r}, expected {settings.identity!r}; check the address"
             )

@@ -18,6 +18,7 @@ from bench.command_table import (
     SetpointTable,
     Template,
     signals_by_query,
+    template,
     written_number,
 )
 from bench.devices import Identity, Limits, Signal, Status
@@ -28,7 +29,7 @@ from drivers.quantities import arrival_of, check_ranges, check_read_back, identi
 from drivers.scpi.line import LineTable, TextLine
 
 _UNKNOWN = Identity("unknown", "unknown", "unknown", "unknown")
-_DONE = Template("1")
+_DONE = template("1")
 
 
 class SensorSettings(LineTable):
@@ -59,8 +60,8 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
         settings = self._settings
         if not settings.identity_query:
             return Identity("unknown", "text instrument", settings.port, "unknown")
-        answer, _ = self._line.ask(settings.identity_query, Template(ANY_TEXT))
-        if Template(settings.identity).match(answer) is None:
+        answer, _ = self._line.ask(settings.identity_query, template(ANY_TEXT))
+        if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
                 self.name,
                 f"{settings.port} is {answer!r}, expected {settings.identity!r}; "
@@ -90,7 +91,7 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
         tables = self._settings.signals
         values = {}
         for query, names in signals_by_query(tables).items():
-            _, numbers = self._line.ask(query, Template(tables[names[0]].reply))
+            _, numbers = self._line.ask(query, template(tables[names[0]].reply))
             for name in names:
                 values[name] = numbers.get(name, numbers.get("value", math.nan)) * tables[name].scale
         check_ranges(self.name, tables, values)
@@ -122,13 +123,13 @@ class SCPIActuator(SCPISensor, GeneralActuator):
         )
         self._settings, self._line = settings, line
         self._table, self._output = table, settings.output
-        self._command = Template(table.command)
+        self._command = template(table.command)
         self._on = False
 
     def _start(self) -> None:
         super()._start()
         if self._table.range_queries is not None:
-            ends = [self._ask_number(query, Template("{value}")) for query in self._table.range_queries]
+            ends = [self._ask_number(query, template("{value}")) for query in self._table.range_queries]
             low, high = min(ends), max(ends)
             if not low <= self._limits.low < self._limits.high <= high:
                 raise ConfigurationError(
@@ -160,7 +161,7 @@ class SCPIActuator(SCPISensor, GeneralActuator):
         confirm = self._confirm_off if self._output.query else partial(self._line.raise_errors, "switching off")
         failures += attempt(confirm)
         if not self._output.query and self._settings.identity_query:
-            failures += attempt(partial(self._line.ask, self._settings.identity_query, Template(ANY_TEXT)))
+            failures += attempt(partial(self._line.ask, self._settings.identity_query, template(ANY_TEXT)))
         if failures:
             raise DeviceError(
                 self.name,
@@ -193,7 +194,7 @@ class SCPIActuator(SCPISensor, GeneralActuator):
         if not table.query:
             return
         written = written_number(self._command, value / table.scale) * table.scale
-        found = self._ask_number(table.query, Template(table.reply))
+        found = self._ask_number(table.query, template(table.reply))
         wrong = abs(found - written) > table.tolerance
         check_read_back(self.name, table, written, found, "; ".join(self._line.errors()) if wrong else "")
 
@@ -210,7 +211,7 @@ class SCPIActuator(SCPISensor, GeneralActuator):
 
     def _reads_on(self) -> bool:
         output = self._output
-        answer, _ = self._line.ask(output.query, Template(ANY_TEXT))
+        answer, _ = self._line.ask(output.query, template(ANY_TEXT))
         if _is(answer, output.is_off):
             return False
         if _is(answer, output.is_on):
@@ -278,8 +279,8 @@ class SCPIVoltageSupply(SCPIActuator, VoltageSupply):
 
 def _is(answer: str, expected: str) -> bool:
     """Return whether an answer is as expected, as text or as a number."""
-    if Template(expected).match(answer) is not None:
+    if template(expected).match(answer) is not None:
         return True
-    number = Template("{value}")
+    number = template("{value}")
     numbers = number.match(answer), number.match(expected)
     return None not in numbers and numbers[0] == numbers[1]

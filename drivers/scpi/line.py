@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.clock import Clock
-from bench.command_table import ANY_TEXT, CommandTable, Template
+from bench.command_table import ANY_TEXT, CommandTable, Template, template
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.scpi.transport import TextLineSettings, open_transport
 from drivers.serial_line import RESENDS
@@ -14,7 +14,7 @@ _MOST_ERRORS = 32
 _MOST_STRAY = 64
 """Late answers that are passed over before the line counts as lost."""
 
-_NO_ERROR = Template("{value}{any}")
+_NO_ERROR = template("{value}{any}")
 
 
 class LineTable(TextLineSettings, CommandTable):
@@ -95,7 +95,7 @@ class TextLine:
         found: list[str] = []
         if not settings.error_query:
             return found
-        form = Template(ANY_TEXT)
+        form = template(ANY_TEXT)
         while len(found) < _MOST_ERRORS:
             answer, _ = self.ask(settings.error_query, form)
             if self._is_no_error(answer):
@@ -111,7 +111,7 @@ class TextLine:
 
     def _is_no_error(self, answer: str) -> bool:
         if self._settings.no_error:
-            return Template(self._settings.no_error).match(answer) is not None
+            return template(self._settings.no_error).match(answer) is not None
         numbers = _NO_ERROR.match(answer)
         return numbers is not None and numbers["value"] == 0.0
 
@@ -128,7 +128,7 @@ class TextLine:
         """Return whether the line is in step again, so that no late answer can come any more."""
         if not any(self._receive() is None for _ in range(_MOST_STRAY)):
             raise DeviceConnectionError(self._device, f"the line {self._settings.port} does not fall silent")
-        form = Template(self._settings.identity)
+        form = template(self._settings.identity)
         # An identity that is not known cannot be told from a late answer.
         if self._settings.identity_query and form.text != ANY_TEXT:
             answer = self._exchange(self._settings.identity_query)

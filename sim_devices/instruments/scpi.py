@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from bench.command_table import VALUE, ActuatorTable, CommandTable, Template, signals_by_query
+from bench.command_table import VALUE, ActuatorTable, CommandTable, signals_by_query, template
 from bench.devices import Identity, Signal
 from sim_devices.instruments.emulated import EmulatedInstrument
 from sim_devices.world import World
@@ -144,7 +144,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
         """Return what a message makes the instrument do, or None if it is unknown."""
         known = self._actions.get(_normal(message))
         if known is None and isinstance(self.table, ActuatorTable):
-            numbers = Template(self.table.setpoint.command).match(message.strip().removeprefix(":"))
+            numbers = template(self.table.setpoint.command).match(message.strip().removeprefix(":"))
             return None if numbers is None else partial(self._set, numbers[VALUE])
         return known
 
@@ -166,11 +166,11 @@ class EmulatedTextInstrument(EmulatedInstrument):
             named += [(message, _nothing) for message in (*output.on, *output.off)]
             named += [(setpoint.query, self._answer_setpoint), (output.query, self._answer_output)]
             for query, limit in zip(setpoint.range_queries or (), setpoint.limits, strict=False):
-                named.append((query, partial(Template("{value}").fill, {VALUE: limit / setpoint.scale})))
+                named.append((query, partial(template("{value}").fill, {VALUE: limit / setpoint.scale})))
         for query, names in signals_by_query(table.signals).items():
             named.append((query, partial(self._answer_signals, names)))
         named += [
-            (table.identity_query, partial(Template(table.identity).fill, {}, "emulated")),
+            (table.identity_query, partial(template(table.identity).fill, {}, "emulated")),
             (table.error_query, self._answer_error),
             (table.completion_query, _complete),
             *((message, _nothing) for message in table.setup),
@@ -179,12 +179,12 @@ class EmulatedTextInstrument(EmulatedInstrument):
             ("*CLS", self.errors.clear),
             ("*RST", self._reset),
         ]
-        return {_normal(Template(message).fill({})): act for message, act in reversed(named) if message}
+        return {_normal(template(message).fill({})): act for message, act in reversed(named) if message}
 
     def _switch(self, message: str, on: bool) -> None:
         table = self.table
         assert isinstance(table, ActuatorTable)
-        numbers = Template(table.setpoint.command).match(message)
+        numbers = template(table.setpoint.command).match(message)
         if numbers is not None:
             self._set(numbers[VALUE])
         if on or table.output.on:
@@ -211,12 +211,12 @@ class EmulatedTextInstrument(EmulatedInstrument):
     def _answer_setpoint(self) -> str:
         table = self.table
         assert isinstance(table, ActuatorTable)
-        return Template(table.setpoint.reply).fill({VALUE: self._level / table.setpoint.scale})
+        return template(table.setpoint.reply).fill({VALUE: self._level / table.setpoint.scale})
 
     def _answer_output(self) -> str:
         table = self.table
         assert isinstance(table, ActuatorTable)
-        return Template(table.output.is_on if self.on else table.output.is_off).fill({}, "1")
+        return template(table.output.is_on if self.on else table.output.is_off).fill({}, "1")
 
     def _act(self) -> None:
         if self._drive is not None:
@@ -228,7 +228,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
 
     def _answer_signals(self, names: list[str]) -> str:
         tables = self.table.signals
-        reply = Template(tables[names[0]].reply)
+        reply = template(tables[names[0]].reply)
         values = {name: self._reading(name) / tables[name].scale for name in names}
         return reply.fill({**values, VALUE: values[names[0]]})
 
@@ -236,7 +236,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
         if self.errors:
             return self.errors.popleft()
         form = self.table.no_error
-        return Template(form).fill({}, '"No error"') if form else NO_ERROR
+        return template(form).fill({}, '"No error"') if form else NO_ERROR
 
 
 def _rounded(value: float, resolution: float) -> float:
