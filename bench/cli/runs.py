@@ -110,7 +110,9 @@ def run(
     clock: Annotated[
         str,
         typer.Option(
-            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast, up to about 100)."
+            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast as the wall "
+            "clock). There a process that cannot keep up slows the laboratory down, and the factor reached is printed and "
+            "recorded; so no emulated watchdog trips because the machine is busy."
         ),
     ] = "wall",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
@@ -167,6 +169,8 @@ def run(
         + (f" ({ratio:.0f} times as fast)" if (ratio := result.time_ratio) >= 2 else ""),
         highlight=False,
     )
+    if outcome.pace is not None and not outcome.pace.is_reached:
+        console.print(f"clock: {outcome.pace}", highlight=False)
     console.print(f"record: {result.folder}", highlight=False, soft_wrap=True)
     write_json(
         json_file,
