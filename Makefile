@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check benchmark clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check benchmark busy clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -40,6 +40,10 @@ check: $(SETUP)
 # Side-by-side speed comparisons; run them on an idle machine.
 benchmark: $(SETUP)
 	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
+
+# 50 virtual runs beside 16 busy processes, compared to the last bit.
+busy: $(SETUP)
+	$(BIN)/python tests/bench/test_busy_machine.py --runs 50 --busy 16
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -17,6 +17,7 @@ from bench.cli.console import (
     parse_assignments,
     print_error,
     print_table,
+    show_compilation,
     warn,
     write_json,
 )
@@ -111,8 +112,8 @@ def run(
         str,
         typer.Option(
             help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast as the wall "
-            "clock). There a process that cannot keep up slows the laboratory down, and the factor reached is printed and "
-            "recorded; so no emulated watchdog trips because the machine is busy."
+            "clock). There a process that cannot keep up slows the laboratory down, so that no emulated watchdog "
+            "trips because the machine is busy; the factor reached is recorded, and printed if it is below 90 % of N."
         ),
     ] = "wall",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
@@ -149,19 +150,18 @@ def run(
     from bench.runs import Run, carry_out
     from bench.safety import SAFE
 
-    result = carry_out(
-        Run(
-            protocol=definition,
-            settings=given,
-            rig=rig,
-            overrides=parse_assignments("--override", overrides or []),
-            seed=seed,
-            clock=clock,
-            folder=out,
-            live=live,
-        ),
-        console,
+    asked = Run(
+        protocol=definition,
+        settings=given,
+        rig=rig,
+        overrides=parse_assignments("--override", overrides or []),
+        seed=seed,
+        clock=clock,
+        folder=out,
+        live=live,
     )
+    with show_compilation():
+        result = carry_out(asked, console)
     outcome, ratio = result.outcome, result.time_ratio
     console.print(
         f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time in "
