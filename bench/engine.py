@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from bench.clock import Pace, PacedClock
-from bench.control.estimators import DriftEstimator, agility_for, preload
+from bench.control.estimators import DriftEstimator, agility_for
 from bench.control.tracking import Command, Trace
 from bench.devices import Actuator, Status
 from bench.errors import (
@@ -564,8 +564,6 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan
     """
     rig.check_needs(definition.name, definition.names)
     rig.check_needs(definition.name, sorted(expected.watched))
-    if expected.watched:
-        preload()
     for device, (low, high) in expected.extremes.items():
         if device not in rig.actuators:
             raise ConfigurationError(
