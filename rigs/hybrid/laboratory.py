@@ -35,7 +35,7 @@ from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.mecom import MeComServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 DISPLACEMENT_INPUT = 0
@@ -151,7 +151,9 @@ class HybridLaboratory(EmulatedLaboratory):
         self.t7.add_follower(
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )
-        super().__init__("hybrid laboratory", {"t7": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        super().__init__(
+            "hybrid laboratory", {"t7": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)}, clock
+        )
         if settings.ambient_step:
             self.world.add(Event(settings.ambient_step_time, self._step_room))
         if settings.fault != "none":

@@ -10,6 +10,7 @@ import pytest
 from bench.clock import VirtualClock
 from bench.devices import Device
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire import WireServer
 
 _numbers = itertools.count()
 
@@ -39,7 +40,7 @@ class Given:
         self.value += self.rate * dt
 
 
-class RecordingServer:
+class RecordingServer(WireServer):
     """A wire server that keeps the requests."""
 
     def __init__(self, server):

@@ -18,6 +18,7 @@ from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
 from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
 from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
@@ -47,7 +48,7 @@ class Resistor:
         pass
 
 
-class LosingServer:
+class LosingServer(WireServer):
     """A wire server that can lose a command."""
 
     def __init__(self, server):
