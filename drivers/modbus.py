@@ -60,6 +60,11 @@ class RefusedError(Exception):
         self.code = code
 
 
+def read_request(address: int, count: int) -> bytes:
+    """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
+    return _READ.pack(READ, address, count)
+
+
 class ModbusClient(ABC):
     """The connection to one Modbus instrument; one request at a time.
 
@@ -69,7 +74,7 @@ class ModbusClient(ABC):
 
     def read(self, address: int, count: int) -> bytes:
         """Return the values of `count` registers from `address` on, two bytes each."""
-        reply = self.request(_READ.pack(READ, address, count), 2 + 2 * count)
+        reply = self.request(read_request(address, count), 2 + 2 * count)
         if reply[1] != 2 * count:
             raise OSError(f"the answer has {reply[1]} bytes of values where {2 * count} were asked for")
         return reply[2:]
@@ -125,11 +130,13 @@ class _PortClient(ModbusClient):
         except OSError:
             return False
 
-    def _receive(self, size: int) -> bytes:
-        data: bytes = self._port.read(size)
-        if len(data) < size:
-            raise TimeoutError(f"{len(data)} bytes where {size} were expected")
-        return data
+    def _receive(self, received: bytes, size: int) -> bytes:
+        """Return what was received up to `size` bytes, after what is missing has been waited for."""
+        if len(received) < size:
+            received += self._port.read(size - len(received))
+            if len(received) < size:
+                raise TimeoutError(f"{len(received)} bytes where {size} were expected")
+        return received
 
 
 class TcpClient(_PortClient):
@@ -152,17 +159,17 @@ class TcpClient(_PortClient):
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
         transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
         self._port.write(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
-        # The shortest reply is a refusal: a function and a code.
-        head = self._receive(_MBAP.size + min(expected, 2))
-        answered, protocol, length, unit = _MBAP.unpack_from(head)
-        function = head[_MBAP.size]
+        # What has come already, as it has in process; the shortest reply is a refusal, a function and a code.
+        reply = self._receive(self._port.read_all(), _MBAP.size + min(expected, 2))
+        answered, protocol, length, unit = _MBAP.unpack_from(reply)
+        function = reply[_MBAP.size]
         if answered != transaction or protocol != 0 or unit != self._unit or function & ~_REFUSED != request[0]:
-            raise OSError(f"the answer {head.hex(' ')} belongs to another request")
+            raise OSError(f"the answer {reply.hex(' ')} belongs to another request")
         if function & _REFUSED:
-            raise RefusedError(self._receive(1)[0] if expected < 2 else head[-1])
+            raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
         if length != expected + 1:
             raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
-        return head[_MBAP.size :] + self._receive(expected - 2) if expected > 2 else head[_MBAP.size :]
+        return self._receive(reply, _MBAP.size + expected)[_MBAP.size :]
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -254,9 +261,14 @@ class RtuClient(_PortClient):
         if port.in_waiting:
             port.reset_input_buffer()
         port.write(_framed(self._unit, request))
-        reply: bytes = port.read(SHORTEST_REPLY)
-        if len(reply) == SHORTEST_REPLY and (missing := reply_length(reply) - SHORTEST_REPLY) > 0:
-            reply += port.read(missing)
+        reply: bytes = port.read_all()
+        if len(reply) < SHORTEST_REPLY:
+            reply += port.read(SHORTEST_REPLY - len(reply))
+        if len(reply) >= SHORTEST_REPLY:
+            length = reply_length(reply)
+            if len(reply) < length:
+                reply += port.read(length - len(reply))
+            reply = reply[:length]
         if len(reply) < SHORTEST_REPLY or reply[0] != self._unit or crc16(reply[:-2]) != reply[-2:]:
             raise NoReplyError(f"{len(reply)} bytes that are no good reply")
         if reply[1] == request[0] | _REFUSED:

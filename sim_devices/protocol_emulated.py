@@ -131,6 +131,15 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         del received[:size]
         return data
 
+    def read_all(self) -> bytes:
+        """Return what was received; nothing is waited for."""
+        if not self.is_open or not self._socket.taken:
+            self._check()
+        self._hear()
+        data = bytes(self._received)
+        self._received.clear()
+        return data
+
     def _wait_for(self, size: int) -> None:
         """Let time pass until so many bytes are there, at most the timeout."""
         self._hear()
@@ -166,7 +175,8 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
         Raises `serial.SerialException` if an instrument on TCP ends the connection over them.
         """
-        self._check()
+        if not self.is_open or not self._socket.taken:
+            self._check()
         sent = bytes(data)
         if self._line is None:
             try:

@@ -44,7 +44,7 @@ T7SettingsT = TypeVar("T7SettingsT", bound=T7ConnectionSettings)
 class T7Device(LineDevice[T7SettingsT, LabJackT7]):
     """A device on a LabJack T7.
 
-    Several may share one instrument, and share the connection to it then (`drivers.labjack_t7.connection`); they are
+    Several may share one instrument, and share the connection to it then (`drivers.modbus_tcp`); they are
     set up one after the other. A connection that breaks ends for all of them: each has to connect again.
     `connect` raises `DeviceConnectionError` also if the words or bytes of a value arrive in swapped order.
     """

@@ -109,6 +109,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         kind, number = settings.analog_output.split("dac")
         self._register = (TDAC if kind else DAC).of(int(number))
         self._encode = struct.Struct(f">{self._register.form}").pack
+        self._offset, self._gain = settings.offset_volts, settings.gain
         self._enabled = False
         self._looked = -math.inf
         self._sent = Status.completed(name, clock)
@@ -150,7 +151,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
 
     def _send(self, volts: float) -> None:
         # As `write` does, but many thousand times a second.
-        self._line.write_span(self._register.address, self._encode(self._settings.sent(volts)))
+        self._line.write_span(self._register.address, self._encode(self._offset + volts / self._gain))
 
     def _switch_on(self) -> None:
         self._setpoint = 0.0

@@ -139,7 +139,15 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def glance(self) -> dict[str, float]:
         """Measure every signal by one conversion of each input; raises what `measure` does."""
-        return self._values(*self._convert())
+        if len(self._conversions) > 1:
+            return self._values(*self._convert())
+        # As above, but many thousand times a second.
+        voltages = self._line.read_span(self._conversions[0])
+        limit = self._limit
+        for volts in voltages:
+            if not -limit < volts < limit:
+                raise self._invalid(voltages)
+        return self._values(*voltages)
 
     @abstractmethod
     def _values(self, *volts: float) -> dict[str, float]: ...

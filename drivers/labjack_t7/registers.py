@@ -16,8 +16,8 @@ from typing import Literal, NamedTuple
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.labjack_t7.connection import share
-from drivers.modbus import RefusedError, exception_text, swapped
+from drivers.modbus import RefusedError, exception_text, read_request, swapped
+from drivers.modbus_tcp import share
 
 Kind = Literal["F32", "U32", "U16"]
 Access = Literal["R", "W", "RW"]
@@ -52,8 +52,12 @@ class Span(NamedTuple):
     """Neighbouring registers of one type, to be read at once again and again."""
 
     address: int
-    words: int
-    values: struct.Struct
+    request: bytes
+    """Asks for them."""
+    size: int
+    """Bytes of the reply."""
+    reply: struct.Struct
+    """Form of the reply: the number of bytes of the values, and the values."""
 
     @classmethod
     def of(cls, register: Register, count: int = 1) -> Span:
@@ -63,8 +67,8 @@ class Span(NamedTuple):
         """
         if "R" not in register.access:
             raise ValueError(f"{register.name} can only be written")
-        values = struct.Struct(f">{count}{register.form}")
-        return cls(register.address, values.size // 2, values)
+        reply = struct.Struct(f">xB{count}{register.form}")
+        return cls(register.address, read_request(register.address, reply.size // 2 - 1), reply.size, reply)
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -156,28 +160,29 @@ class LabJackT7:
         """Release the connection; it is closed with its last user."""
         if self._connected:
             self._connected = False
-            self._connection.release()
+            self._connection.close()
 
     def read_words(self, address: int, count: int) -> list[int]:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
-        return list(struct.unpack(f">{count}H", self._read(address, count)))
+        return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
 
-    def _read(self, address: int, count: int) -> bytes:
+    def read_span(self, span: Span) -> list[float]:
+        """Get the values of neighbouring registers of one type."""
         if self._connection.ended or not self._connected:
             raise self._closed()
         try:
             with self._lock:
-                return self._client.read(address, count)
+                reply = self._client.request(span.request, span.size)
+            size, *values = span.reply.unpack(reply)
+            if size != span.size - 2:
+                raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
-            raise self._failure(error, f"reading register {address}") from error
-
-    def read_span(self, span: Span) -> tuple[float, ...]:
-        """Get the values of neighbouring registers of one type."""
-        return span.values.unpack(self._read(span.address, span.words))
+            raise self._failure(error, f"reading register {span.address}") from error
+        return values
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""
-        return list(self.read_span(Span.of(register, count)))
+        return self.read_span(Span.of(register, count))
 
     def read_integer(self, register: Register) -> int:
         """Get the value of a UINT32 or UINT16 register."""

@@ -257,11 +257,23 @@ class EmulatedT7(RegisterInstrument):
         return self._service
 
     def _begin(self) -> None:
-        self.world.lock.acquire()
+        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
+        world, dog = self.world, self._watchdog
+        world.lock.acquire()
         try:
-            self._attend()
+            world.advance()
+            if not dog.enabled:
+                return
+            if not dog.strict:
+                self._due = world.time + dog.timeout
+                self._expired_at = None
+            elif self._expired_at is not None:
+                # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
+                periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
+                self._due = self._expired_at + periods * dog.timeout
+                self._expired_at = None
         except BaseException:
-            self.world.lock.release()
+            world.lock.release()
             raise
 
     def _end(self, error: BaseException | None) -> None:
@@ -298,20 +310,6 @@ class EmulatedT7(RegisterInstrument):
         self._expired_at = self._due
         self._due = math.inf
         self._lead()
-
-    def _attend(self) -> None:
-        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
-        self.world.advance()
-        dog = self._watchdog
-        if not dog.enabled:
-            return
-        if not dog.strict:
-            self._feed()
-        elif self._expired_at is not None:
-            # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
-            periods = math.floor((self.world.time - self._expired_at) / dog.timeout) + 1
-            self._due = self._expired_at + periods * dog.timeout
-            self._expired_at = None
 
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout

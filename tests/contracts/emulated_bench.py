@@ -11,6 +11,7 @@ from bench.clock import VirtualClock
 from bench.devices import Device
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 
 _numbers = itertools.count()
 
@@ -58,6 +59,13 @@ def serial_port(stack, server, clock):
     recording = RecordingServer(server)
     stack.callback(unregister, name)
     return register(name, recording, clock), recording.requests
+
+
+def tcp_port(stack, bank, clock):
+    """Put a bank of registers at a port of its own until the stack is closed, and return the port."""
+    port = register(f"contract-{next(_numbers)}", ModbusTcpInstrument(bank), clock)
+    stack.callback(unregister, port)
+    return port
 
 
 class OnABench:

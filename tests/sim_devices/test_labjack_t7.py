@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
 from bench.clock import VirtualClock
-from bench.errors import DeviceError
-from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, TDAC_STEP, EmulatedT7
-from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply, EmulatedPositionSensor, EmulatedSwitch
+from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, EmulatedT7
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
@@ -709,60 +707,6 @@ def test_monitors_of_the_amplifier_have_noise_and_an_error_of_scale():
     assert 20.0 * np.mean(monitored) == pytest.approx(20.0, abs=0.2)
     assert hv.voltage == pytest.approx(20.0, abs=0.1)
     assert abs(hv.voltage - 20.0) > 1e-4
-
-
-@pytest.mark.parametrize(
-    ("output", "register", "offset", "step"),
-    [("tdac5", 30010, 0.0, TDAC_STEP), ("dac1", 1002, 2.5, DAC_STEP)],
-)
-def test_emulated_high_voltage_supply_sends_to_its_output(output, register, offset, step):
-    hv, load, world = amplifier(offset_volts=offset)
-    t7 = EmulatedT7(world, {0: hv.voltage_monitor, 1: hv.current_monitor, 2: hv.status}, rng=Quiet())
-    read = (lambda: t7.tdac_volts(5)) if output == "tdac5" else (lambda: t7.dac_volts(1))
-    t7.add_follower(lambda: hv.drive(read(), t7.dio_level(7, pulled_down=True)))
-    supply = EmulatedHighVoltageSupply("hv", t7, line=7, analog_output=output, offset_volts=offset)
-    assert not hv.on
-    supply.set(12.34)
-    wait(world, 0.01)
-    assert load.volts == pytest.approx(12.34, abs=20.0 * step / 2 + 1e-6)
-    assert load.volts / (20.0 * step) == pytest.approx(round(load.volts / (20.0 * step)), abs=1e-6)
-
-
-def test_emulated_high_voltage_supply_passes_a_refusal_on():
-    hv, _, world = amplifier()
-    t7 = EmulatedT7(world, {2: hv.status}, rng=Quiet())
-    supply = EmulatedHighVoltageSupply("hv", t7, line=7)
-    t7.write_value(9000, 0)
-    with pytest.raises(DeviceError, match="hv: the instrument refuses"):
-        supply.measure()
-
-
-def test_emulated_switch_keeps_what_else_is_under_the_watchdog(t7):
-    arm(t7)
-    switch = EmulatedSwitch("fan", t7, line=5, watchdog=60)
-    switch.set(1.0)
-    t7.write_value(1000, 4.0)
-    t7.write_value(2000, 1)
-    t7.write_value(2001, 1)
-    assert t7.read_value(61604) == 2
-    t7.world.clock.sleep(2.0)
-    t7.world.advance()
-    assert t7.dac_volts(0) == pytest.approx(0.5, abs=DAC_STEP / 2)
-    assert not t7.dio_level(0)
-    assert not t7.dio_level(5)
-    assert t7.dio_level(1)
-
-
-def test_emulated_sensor_refuses_a_wrong_number_of_channels(t7):
-    with pytest.raises(ValueError, match="currents needs 2, got 1"):
-        EmulatedPositionSensor("tip", t7, readout="currents", channels=(0,))
-
-
-def test_emulated_sensor_passes_a_refusal_on(t7):
-    sensor = EmulatedPositionSensor("tip", t7)
-    t7.write_value(9000, 0)
-    with pytest.raises(DeviceError, match="tip: the instrument refuses"):
-        sensor.measure()
 
 
 # The wire

@@ -1,6 +1,6 @@
-"""The connection to a LabJack T7, which all devices of a process on one instrument share.
+"""Connections over Modbus TCP, which all devices of a process on one instrument share.
 
-A T7 accepts two connections on port 502 (T-series datasheet, 6.0 Ethernet), and a rig has more devices on it.
+A LabJack T7 accepts two connections on port 502 (T-series datasheet, 6.0 Ethernet), and a rig has more devices on it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Connection:
         """Whether requests can be sent."""
         return self.client.is_open
 
-    def release(self) -> None:
+    def close(self) -> None:
         """End the use by one device; the last one closes the connection."""
         with _registry:
             self._users -= 1
