@@ -332,8 +332,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
 
-        The line hands over what was sent meanwhile only when the host speaks, as nothing arrives on it
-        unasked; a host that was silent for an hour finds no hour of heartbeats.
+        A host that did not look at its line for an hour finds no hour of heartbeats there.
         """
         now = self._clock.now()
         due = [NodeState.BOOT_UP] if self._boot_up_due else []
@@ -345,6 +344,16 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self._heartbeat_since += count * period
             due += [self._state] * min(count, _LONGEST_HEARTBEAT_BACKLOG)
         return due if self.plugged_in else []
+
+    def next_heartbeat(self) -> float:
+        """Return when the next heartbeat or boot-up message is due, s; infinity if none is."""
+        if not self.plugged_in:
+            return math.inf
+        if self._boot_up_due:
+            return self._heartbeat_since
+        return (
+            self._heartbeat_since + 1e-3 * self._heartbeat_milliseconds if self._heartbeat_milliseconds else math.inf
+        )
 
     # Faults.
 

@@ -16,6 +16,7 @@ block downloads are refused; a remote frame is not answered.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 
@@ -72,8 +73,18 @@ class CanopenSlcanServer(WireServer):
             self._received = b"" if self._overrun else rest
             return sent
 
+    def unsolicited(self) -> bytes:
+        """Return the heartbeats and the boot-up message since the last call, which pass while the channel is open."""
+        with self._device.world.lock:
+            return self._heartbeats()
+
+    def next_unsolicited(self) -> float:
+        """Return when the next heartbeat or boot-up message is due, s; infinity while none passes."""
+        with self._device.world.lock:
+            return self._device.next_heartbeat() if self._on_the_bus() else math.inf
+
     def _heartbeats(self) -> bytes:
-        """Return the heartbeats since the last request of the host."""
+        """Return the heartbeats since they were last asked for."""
         states = self._device.heartbeats()
         if not self._on_the_bus():
             return b""

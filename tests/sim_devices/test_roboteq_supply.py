@@ -414,6 +414,33 @@ class TestAdapter:
         clock.sleep(1.0)
         assert server.receive(b"O\r") == b"\r"
 
+    def test_heartbeats_come_on_an_idle_line(self, server, device, clock):
+        assert server.unsolicited() == b""
+        for due in (0.1, 0.2, 0.3):
+            assert server.next_unsolicited() == pytest.approx(due)
+            clock.sleep_until(server.next_unsolicited())
+            assert server.unsolicited() == b"t701105\r"
+            assert server.unsolicited() == b""
+        clock.sleep(0.05)
+        device.power_cycle()
+        assert server.next_unsolicited() == clock.now()
+        assert server.unsolicited() == b"t701100\r"
+        assert server.next_unsolicited() == pytest.approx(0.45)
+
+    def test_no_heartbeat_is_due_while_none_passes(self, server, device, clock):
+        device.write_object(0x1017, 0)
+        assert server.next_unsolicited() == math.inf
+        device.write_object(0x1017, 50)
+        server.receive(b"C\r")
+        assert server.next_unsolicited() == math.inf
+        server.receive(b"O\r")
+        device.unplug()
+        assert server.next_unsolicited() == math.inf
+        clock.sleep(1.0)
+        assert server.unsolicited() == b""
+        device.plug_in()
+        assert server.next_unsolicited() == pytest.approx(clock.now() + 0.05)
+
     def test_network_management(self, server, device, clock):
         query = b"t6018400D210200000000\r"
         assert server.receive(b"t00020201\r") == b"z\r"
