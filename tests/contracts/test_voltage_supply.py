@@ -15,7 +15,8 @@ from bench.errors import DeviceConnectionError, DeviceError
 from drivers.labjack_t7 import T7HighVoltageSupply
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
-from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
+from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.instruments.roboteq_objects import ChannelFlag, Fault
 from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
