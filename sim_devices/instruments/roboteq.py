@@ -303,7 +303,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def process_data(self, *, synchronous: bool) -> list[tuple[int, bytes]]:
         """Take identifier and data of the TPDOs that a SYNC asks for, or that are due by their send rates."""
         pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
-        if self._state is not NodeState.OPERATIONAL or not self.plugged_in:
+        if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
             return []
         return [(identifier, b"".join(map(self._encoded, objects))) for identifier, objects in pdos]
 

@@ -82,9 +82,11 @@ class ProcessDataObjects:
         """Return to the configuration as delivered."""
         self._transmit = [_pdo(True, number, self._node, 0x2106, 0x180) for number in range(PDOS)]
         self._receive = [_pdo(False, number, self._node, 0x2005, 0x200) for number in range(PDOS)]
+        self._scheduled = []
         for pdo, interval in zip(self._transmit, self._intervals, strict=True):
-            pdo.interval = interval
-            pdo.due = now + interval if interval else math.inf
+            if interval:
+                pdo.interval, pdo.due = interval, now + interval
+                self._scheduled.append(pdo)
 
     def read(self, index: int, sub: int) -> int:
         """Return an object of the configuration, which must be in the dictionary."""
@@ -119,7 +121,7 @@ class ProcessDataObjects:
     def take_due(self, now: float) -> list[tuple[int, list[tuple[int, int]]]]:
         """Return identifier and objects of each TPDO that is due by its interval, once each."""
         due = []
-        for pdo in self._transmit:
+        for pdo in self._scheduled:
             if pdo.due <= now:
                 pdo.due += pdo.interval * (math.floor((now - pdo.due) / pdo.interval + 1e-6) + 1)
                 if pdo.exists and pdo.kind >= _FIRST_BY_TIME:
@@ -128,7 +130,9 @@ class ProcessDataObjects:
 
     def next_due(self) -> float:
         """Return when the next TPDO is due by its interval, s; infinity if none is."""
-        return min((pdo.due for pdo in self._transmit if pdo.exists and pdo.kind >= _FIRST_BY_TIME), default=math.inf)
+        return min(
+            (pdo.due for pdo in self._scheduled if pdo.exists and pdo.kind >= _FIRST_BY_TIME), default=math.inf
+        )
 
     def take_synchronous(self) -> list[tuple[int, list[tuple[int, int]]]]:
         """Count a SYNC; return identifier and objects of each TPDO that it asks for."""

@@ -49,6 +49,7 @@ _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7})
 _NMT, _SYNC = 0x000, 0x080
 _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
 _SEGMENT = 7  # bytes in a segment
+_FRAMES = frozenset((b"t", b"T", b"r", b"R"))
 
 
 class CanopenSlcanServer(WireServer):
@@ -106,8 +107,16 @@ class CanopenSlcanServer(WireServer):
         return self._open and self._bitrate == self._device.bitrate
 
     def _obey(self, line: bytes) -> bytes:
-        if line[:1] in b"tTrR" and line:
-            return self._pass_on(line)
+        kind = line[:1]
+        if kind in _FRAMES:
+            frame = _frame(line)
+            if frame is None or not self._open or self._listening:
+                return _REFUSED
+            identifier, data = frame
+            sent = b"z\r" if kind in b"tr" else b"Z\r"
+            if data is not None and self._device.plugged_in and self._on_the_bus():
+                sent += self._answer(identifier, data)
+            return sent
         if line == b"":
             return _OK
         if line in (b"O", b"L"):
@@ -128,17 +137,6 @@ class CanopenSlcanServer(WireServer):
         if line == b"Z0" and not self._open:
             return _OK
         return _REFUSED
-
-    def _pass_on(self, line: bytes) -> bytes:
-        """Put the frame of a line on the bus; return what the adapter sends."""
-        frame = _frame(line)
-        if frame is None or not self._open or self._listening:
-            return _REFUSED
-        identifier, data = frame
-        sent = b"z\r" if line[0] in b"tr" else b"Z\r"
-        if data is not None and self._device.plugged_in and self._on_the_bus():
-            sent += self._answer(identifier, data)
-        return sent
 
     def _answer(self, identifier: int, data: bytes) -> bytes:
         """Have the node look at a frame; return the lines of its answer."""
@@ -164,6 +162,8 @@ class SdoServer:
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
+        self._numbers: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
+        """Index, subindex, form, and beginning of the answer, by the first four bytes of a query for a number."""
         self._multiplexer = bytes(3)
         self._text: bytes | None = None
         self._incoming: bytes | None = None
@@ -173,8 +173,8 @@ class SdoServer:
         """Return the eight bytes that answer eight bytes; none answer an abort."""
         command = request[0]
         specifier = command >> 5
-        if specifier in (1, 2, 4, 5, 6, 7):
-            # Whatever was under way has ended.
+        if specifier not in (0, 3):
+            # What was under way has ended.
             self._text = self._incoming = None
             if specifier == 4:
                 return b""
@@ -185,7 +185,7 @@ class SdoServer:
             if specifier == 1:
                 return self._download(command, request[4:])
             if specifier == 2:
-                return self._upload(command)
+                return self._upload(request)
             if specifier == 3:
                 return self._upload_segment(command)
             raise RequestRefusedError(AbortCode.COMMAND)
@@ -235,17 +235,22 @@ class SdoServer:
         value: int = form.unpack(data)[0]
         self._device.write_object(index, value, sub)
 
-    def _upload(self, command: int) -> bytes:
+    def _upload(self, request: bytes) -> bytes:
+        known = self._numbers.get(request[:4])
+        if known is not None:
+            index, sub, form, head = known
+            return (head + form.pack(self._device.read_object(index, sub))).ljust(8, b"\0")
         index, sub = self._object()
         value = self._device.read_object(index, sub)
         if isinstance(value, str):
             self._text, self._toggle = value.encode("ascii", "replace"), 0
             return b"\x41" + self._multiplexer + struct.pack("<I", len(self._text))
-        data = FORMATS[self._device.entry(index, sub).kind].pack(value)
-        unused = (4 - len(data)) << 2
+        form = FORMATS[self._device.entry(index, sub).kind]
         # The maker's form of the query says the size, and has the bits e and s clear in the answer.
-        head = 0x40 if command & 0x0C else 0x43
-        return bytes((head | unused,)) + self._multiplexer + data.ljust(4, b"\0")
+        command = (0x40 if request[0] & 0x0C else 0x43) | (4 - form.size) << 2
+        head = bytes((command,)) + self._multiplexer
+        self._numbers[request[:4]] = index, sub, form, head
+        return (head + form.pack(value)).ljust(8, b"\0")
 
     def _upload_segment(self, command: int) -> bytes:
         if self._text is None:
