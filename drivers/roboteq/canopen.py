@@ -63,6 +63,10 @@ ABORT_CODES: Mapping[int, str] = {
 """Why the device ends a transfer (CiA 301, SDO abort codes)."""
 
 
+ABSENT = (0x0602_0000, 0x0609_0011)
+"""Codes that say that an object or its subindex does not exist."""
+
+
 class NodeSettings(SerialSettings):
     """Rig-file settings of the line to a CANopen node."""
 

@@ -36,7 +36,7 @@ from bench.devices import Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.roles import VoltageSupply
 from drivers.device import RecoverableDevice, attempt
-from drivers.roboteq.canopen import AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
+from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
 
 DEVICE_TYPE = 0x000F0191
 """Object 0x1000 of a controller: device profile 401 (electronic data sheet)."""
@@ -133,8 +133,9 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     its outputs by itself. Only commands feed the watchdog, from CAN as well; queries do not. So `measure` and
     `glance` send the command again; while a voltage is held, ask for readings more often than the watchdog is long.
     After a longer gap the next command resumes the previous power, on all channels. So the first one is 0, to every
-    channel, and a command that had to be sent again is not sent as late as that. The reading that comes too late
-    raises `DeviceError`, as the voltage was not held. The set-point is 0 after the output was dropped.
+    channel if one had a voltage, and a command that had to be sent again is not sent as late as that. The reading
+    that comes too late raises `DeviceError`, as the voltage was not held. The set-point is 0 after the output was
+    dropped.
 
     The current is the one that the controller reports, with its resolution of 0.1 A; of what it is the mean within
     a PWM period is not documented.
@@ -182,7 +183,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             battery = self._read_battery()
             command = self._command_for(value, battery)
             if self._was_silent() or not self._send(command):
-                self._stop_all()
+                self._zero()
                 if not self._send(command):
                     self._drop()
                     raise DeviceError(
@@ -219,8 +220,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         with self._lock:
             self._order += 1
             channel = self._settings.channel
-            channels = self._channels if self._was_silent() else (channel,)
-            zeros = [partial(self._write, _COMMAND, 0, number) for number in channels]
+            zeros = [partial(self._write, _COMMAND, 0, number) for number in self._resumable()]
             failures = attempt(*zeros, partial(self._write, _STOP, channel))
             self._setpoint, self._command = 0.0, 0
             if not failures and self._is_off():
@@ -247,7 +247,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         with self._lock:
             self._order += 1
             # Whether the release brings the last command back is not documented.
-            self._stop_all()
+            self._zero()
             self._write(_RELEASE, 1)
             self._drop()
             self._check()
@@ -258,10 +258,14 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             super().close()
 
     def _identify(self) -> Identity:
-        device_type = self._read(_DEVICE_TYPE)
         name = self._read_text(_DEVICE_NAME)
         # That the name begins or ends with the maker's own, as in the data sheet, is an assumption.
-        if "roboteq" not in name.lower() if name else device_type != DEVICE_TYPE:
+        known = "roboteq" in name.lower()
+        if not known:
+            # Without a name the type decides.
+            device_type = self._read(_DEVICE_TYPE)
+            known = not name and device_type == DEVICE_TYPE
+        if not known:
             vendor = ""
             with suppress(DeviceError):
                 vendor = f", vendor 0x{self._read(_IDENTITY, 1):08X}"
@@ -286,19 +290,22 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
     def _configure(self) -> None:
         settings = self._settings
-        others = []
-        for channel in range(1, _MOST_CHANNELS + 1):
+        now = self._clock.now()
+        self._channels = ()
+        # The channel of this driver first; which others there are shows in the same way.
+        for channel in sorted(range(1, _MOST_CHANNELS + 1), key=lambda number: number != settings.channel):
             try:
-                self._line.read(_POWER, channel)
+                self._line.write(_COMMAND, 0, channel)
             except AbortedError as error:
+                if error.code not in ABSENT:
+                    raise self._refused(_COMMAND, 0, channel, error) from None
                 if channel == settings.channel:
                     raise ConfigurationError(
                         f"{self.name}: channel: the controller does not have channel {channel} ({error})"
                     ) from None
             else:
-                others += [channel] if channel != settings.channel else []
-        self._channels = (settings.channel, *others)
-        self._stop_all()
+                self._channels += (channel,)
+        self._commanded_at, self._command = now, 0
         self._line.take_restart()
         # Three heartbeats in the time allowed, so that one that is lost does not matter.
         allowed = int(1e3 * settings.heartbeat / 3.0)
@@ -359,14 +366,21 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """Command 0, which ends the present set-point."""
         self._order += 1
         self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
-        self._stop_all()
+        self._zero()
 
-    def _stop_all(self) -> None:
-        """Command 0 on every channel, back to back: the first command after a silence may resume all of them."""
+    def _zero(self) -> None:
+        """Command 0 on every channel that this command may resume, back to back."""
         now = self._clock.now()
-        for channel in self._channels:
+        for channel in self._resumable():
             self._write(_COMMAND, 0, channel)
         self._commanded_at, self._command = now, 0
+
+    def _resumable(self) -> tuple[int, ...]:
+        """Return the channels that the next command may resume, that of this driver first.
+
+        All of them after a silence, unless the last command was 0: so were those to the other channels.
+        """
+        return self._channels if self._command and self._was_silent() else self._channels[:1]
 
     def _arrived(self, order: int) -> bool:
         with self._lock:
@@ -451,4 +465,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         try:
             self._line.write(item, value, sub, before=before)
         except AbortedError as error:
-            raise DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}") from None
+            raise self._refused(item, value, sub, error) from None
+
+    def _refused(self, item: Entry, value: int, sub: int, error: AbortedError) -> DeviceError:
+        return DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}")

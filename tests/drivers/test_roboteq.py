@@ -93,6 +93,8 @@ class Script:
             value, size = self.objects[key]
             raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
             return bytes((0x43 | (4 - size) << 2,)) + data[1:4] + raw.ljust(4, b"\0")
+        if key[0] == 0x2000 and (0x2102, key[1]) not in self.objects:
+            return b"\x80" + data[1:4] + (0x06090011).to_bytes(4, "little")
         if key[0] == 0x2000 and self.follow:
             self.objects[0x2102, key[1]] = (int.from_bytes(data[4:], "little", signed=True), 2)
         if key[0] == 0x1017:
@@ -148,10 +150,9 @@ def test_bytes_of_connecting(script, connect):
     connect()
     sent = [data.hex(" ").upper() for _, data in script.received]
     assert {identifier for identifier, _ in script.received} == {0x601}
-    assert sent[0] == "40 00 10 00 00 00 00 00"
-    assert sent[1:3] == ["40 08 10 00 00 00 00 00", "60 00 00 00 00 00 00 00"]
+    assert sent[:2] == ["40 08 10 00 00 00 00 00", "60 00 00 00 00 00 00 00"]
     assert "23 00 20 01 00 00 00 00" in sent
-    assert script.orders() == [(0x2000, 1, 0)]
+    assert script.orders() == [(0x2000, 1, 0), (0x2000, 2, 0), (0x2000, 3, 0)]
 
 
 def test_bytes_of_a_set_point_and_a_measurement(script, supply):
@@ -191,7 +192,7 @@ def test_node_and_channel(script, connect):
 def test_channel_that_is_not_there(script, connect):
     with pytest.raises(ConfigurationError, match=r"supply: channel: the controller does not have channel 3"):
         connect(channel=3)
-    assert script.orders() == []
+    assert script.orders() == [(0x2000, 3, 0)]
 
 
 def test_identity(script, supply):
@@ -244,11 +245,11 @@ def test_controller_without_a_name_is_known_by_its_type(script, connect):
 
 
 def test_lost_segment_is_asked_for_again_with_the_whole_text(script, connect):
-    script.instead = [None, None, b"z\r"]
+    script.instead = [None, b"z\r"]
     assert connect().identity.model == "motor controller"
-    assert [data[0] for _, data in script.received[:6]] == [0x40, 0x40, 0x60, 0x80, 0x40, 0x60]
+    assert [data[0] for _, data in script.received[:5]] == [0x40, 0x60, 0x80, 0x40, 0x60]
     # The client ends the transfer (CiA 301): timed out.
-    assert script.received[3][1] == bytes.fromhex("8008100000000405")
+    assert script.received[2][1] == bytes.fromhex("8008100000000405")
 
 
 def test_answer_that_comes_after_the_abort_is_not_taken_for_the_next(script, connect):
@@ -264,14 +265,14 @@ def test_answer_that_comes_after_the_abort_is_not_taken_for_the_next(script, con
         return (waiting.pop() if waiting else b"") + sent
 
     script.obey = obey
-    script.instead = [None, None, b"z\r"]
+    script.instead = [None, b"z\r"]
     script.texts[0x1008] = b"Roboteq SDC2160"
     assert connect().identity.model == "SDC2160"
     assert waiting == []
 
 
 def test_wrong_toggle_bit(script, connect):
-    script.instead = [None, None, line(0x581, bytes.fromhex("11526F0000000000"))]
+    script.instead = [None, line(0x581, bytes.fromhex("11526F0000000000"))]
     with pytest.raises(DeviceError, match="answered 11 52"):
         connect()
 
@@ -695,7 +696,7 @@ def test_heartbeat_that_becomes_stale(script, connect, clock):
         supply.measure()
     with pytest.raises(DeviceConnectionError, match="no heartbeat"):
         supply.set(6.0)
-    assert script.orders()[-1] == (0x2000, 1, 0)
+    assert script.orders() == [(0x2000, channel, 0) for channel in (1, 2, 3)]
     script.before = line(0x702, b"\x05") + line(0x701, b"\x05\x05") + line(0x700, b"\x05")
     with pytest.raises(DeviceConnectionError, match="no heartbeat"):
         supply.measure()
@@ -839,7 +840,8 @@ def test_emergency_stop_of_before_is_refused_and_recovered(script, connect):
     script.answer = answer
     script.received.clear()
     supply = connect(RoboteqSupply.recover)
-    assert script.orders() == [(0x2000, 1, 0), (0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
+    zeros = [(0x2000, channel, 0) for channel in (1, 2, 3)]
+    assert script.orders() == [*zeros, (0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
     assert math.isnan(supply.setpoint)
 
 

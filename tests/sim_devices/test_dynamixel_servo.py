@@ -565,7 +565,10 @@ def test_feedback_block_is_one_read():
     assert servo.read_bytes(133, 2) == b"\x08\x00"
 
 
-@pytest.mark.parametrize(("address", "length"), [(14, 1), (130, 30), (147, 1), (168, 2), (65535, 4), (126, 65535)])
+@pytest.mark.parametrize(
+    ("address", "length"),
+    [(14, 1), (130, 30), (147, 1), (167, 2), (252, 1), (577, 2), (660, 3), (65535, 4), (126, 65535)],
+)
 def test_reading_what_is_not_defined(address, length):
     (servo,) = make_servos({})
     with pytest.raises(RequestRefusedError) as caught:
@@ -982,7 +985,7 @@ def test_expired_watchdog_takes_no_goals_until_it_is_cleared():
     assert servo.read_item(132) == 3000
 
 
-def test_any_packet_for_it_feeds_the_watchdog():
+def test_any_packet_on_the_bus_feeds_the_watchdog():
     servos = make_servos({"bus_id": 1}, {"bus_id": 2})
     server = Dynamixel2Server(servos)
     for servo in servos:
@@ -993,7 +996,13 @@ def test_any_packet_for_it_feeds_the_watchdog():
         clock.sleep(0.15)
         server.receive(frame(1, instruction, bytes.fromhex("84000400") if instruction == 2 else b""))
     servos[0].world.advance()
-    assert [servo._values[98] for servo in servos] == [10, -1]
+    # Those for the other servo as well (e-Manual, Bus Watchdog: all instruction packets); a damaged one does not.
+    assert [servo._values[98] for servo in servos] == [10, 10]
+    clock.sleep(0.15)
+    server.receive(frame(1, 1)[:-1] + b"\x00")
+    clock.sleep(0.1)
+    servos[0].world.advance()
+    assert [servo._values[98] for servo in servos] == [-1, -1]
 
 
 def test_watchdog_is_idle_without_torque():
