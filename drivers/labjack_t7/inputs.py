@@ -4,7 +4,7 @@ Sources: LabJack T-series datasheet 14.1.7 for averaging in the instrument, 14.3
 datasheet gives the highest scan rate of each resolution index in appendix A-1: the instrument refuses a burst at a
 higher rate, and the error says so.
 
-Assumption: one request that spans the averages of two inputs carries out both bursts, one after the other.
+Assumption: one request for the averages of several inputs carries out their bursts one after the other.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
+from bench.clock import Clock
 from bench.errors import DeviceError
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
@@ -32,7 +33,9 @@ from drivers.labjack_t7.registers import (
     AIN_SETTLING_US,
     STREAM_RESOLUTION_INDEX,
     STREAM_SETTLING_US,
+    LabJackT7,
     Register,
+    Span,
 )
 
 CHANNELS = 14
@@ -53,9 +56,7 @@ Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
 class T7InputSettings(T7ConnectionSettings):
     """How analog inputs are read; every sensor on a T7 extends it."""
 
-    channels: tuple[Channel, ...] = Field(
-        default=(0,), description="analog inputs, 0 to 13; neighbours in ascending order are read at once"
-    )
+    channels: tuple[Channel, ...] = Field(default=(0,), description="analog inputs, 0 to 13")
     range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
     resolution_index: int = Field(
         default=4, ge=0, le=8, description="resolution index, 0 (instrument's default) to 8 (least noise, slowest)"
@@ -91,14 +92,6 @@ class T7InputSettings(T7ConnectionSettings):
         return self
 
 
-class _Voltage(NamedTuple):
-    """One input over a burst, in V."""
-
-    mean: float
-    maximum: float
-    minimum: float
-
-
 InputSettingsT = TypeVar("InputSettingsT", bound=T7InputSettings)
 
 
@@ -106,13 +99,22 @@ class T7InputDevice(T7Device[InputSettingsT]):
     """A device on a LabJack T7 that is read by analog inputs.
 
     `measure` has the instrument average a burst of `samples` conversions of each input, `glance` takes one
-    conversion: three requests and one, with inputs that are neighbours in ascending order, otherwise as many for
-    each input. Both raise `DeviceError` if a conversion is not valid or over the range, as clipped conversions would
-    shift the mean.
+    conversion; each is one request. Both raise `DeviceError` if a conversion is not valid or over the range, as
+    clipped conversions would shift the mean.
 
     The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one instrument:
     give sensors on the same one the same `resolution_index` and `settling_us`.
     """
+
+    def __init__(self, name: str, settings: InputSettingsT, clock: Clock, line: LabJackT7) -> None:
+        super().__init__(name, settings, clock, line)
+        self._limit = RAIL * settings.range
+        self._conversions = _spans(AIN, settings.channels)
+        self._averages = [
+            span
+            for register in (AIN_EF_READ_AVERAGE, AIN_EF_READ_MAXIMUM, AIN_EF_READ_MINIMUM)
+            for span in _spans(register, settings.channels)
+        ]
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
@@ -136,45 +138,71 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def glance(self) -> dict[str, float]:
         """Measure every signal by one conversion of each input; raises what `measure` does."""
-        return self._values(*self._convert())
+        if len(self._conversions) > 1:
+            return self._values(*self._convert())
+        # As above, but many thousand times a second.
+        voltages = self._line.read_span(self._conversions[0])
+        limit = self._limit
+        for volts in voltages:
+            if not -limit < volts < limit:
+                raise self._invalid(voltages)
+        return self._values(*voltages)
 
     @abstractmethod
     def _values(self, *volts: float) -> dict[str, float]: ...
 
-    def _average(self) -> list[float]:
+    def _average(self) -> Sequence[float]:
         """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
         if self._settings.samples == 1:
             return self._convert()
-        means = self._read(AIN_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
-        maxima = self._read(AIN_EF_READ_MAXIMUM)
-        minima = self._read(AIN_EF_READ_MINIMUM)
-        return self._checked([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
+        # The averages come first: reading one starts the burst and waits for its end.
+        values = self._joined(self._averages)
+        count = len(self._settings.channels)
+        means, maxima, minima = (values[start : start + count] for start in range(0, 3 * count, count))
+        self._check(maxima)
+        self._check(minima)
+        return self._check(means)
 
-    def _convert(self) -> list[float]:
+    def _convert(self) -> Sequence[float]:
         """Get one conversion of each input in V."""
-        return self._checked([_Voltage(volts, volts, volts) for volts in self._read(AIN)])
+        return self._check(self._read(self._conversions))
 
-    def _read(self, register: Register) -> list[float]:
-        """Get the value of a register for every input, in one request where they are neighbours."""
-        channels = self._settings.channels
-        if channels == tuple(range(channels[0], channels[0] + len(channels))):
-            return self._line.read(register.of(channels[0]), len(channels))
-        return [self._line.read(register.of(channel))[0] for channel in channels]
+    def _read(self, spans: Sequence[Span]) -> Sequence[float]:
+        if len(spans) == 1:
+            return self._line.read_span(spans[0])
+        return self._joined(spans)
 
-    def _checked(self, voltages: Sequence[_Voltage]) -> list[float]:
-        for channel, voltage in zip(self._settings.channels, voltages, strict=True):
-            if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
-                raise DeviceError(
+    def _joined(self, spans: Sequence[Span]) -> list[float]:
+        return [value for values in self._line.read_spans(spans) for value in values]
+
+    def _check(self, voltages: Sequence[float]) -> Sequence[float]:
+        """Return one voltage for each input; raise `DeviceError` for one that is not valid or over the range."""
+        limit = self._limit
+        for volts in voltages:
+            if not -limit < volts < limit:
+                raise self._invalid(voltages)
+        return voltages
+
+    def _invalid(self, voltages: Sequence[float]) -> DeviceError:
+        limit = self._settings.range
+        for channel, volts in zip(self._settings.channels, voltages, strict=True):
+            if not math.isfinite(volts) or volts == _MISSED_SAMPLE:
+                return DeviceError(
                     self.name,
                     f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
                 )
-            limit = self._settings.range
-            extreme = max(voltage, key=abs)
-            if abs(extreme) >= RAIL * limit:
-                larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
-                raise DeviceError(
-                    self.name,
-                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
-                    "what is measured back into it",
-                )
-        return [voltage.mean for voltage in voltages]
+            if abs(volts) >= self._limit:
+                break
+        larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
+        return DeviceError(
+            self.name,
+            f"AIN{channel} reads {volts:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
+            "what is measured back into it",
+        )
+
+
+def _spans(register: Register, channels: Sequence[int]) -> tuple[Span, ...]:
+    """Return what to read for every input: one span where they are neighbours."""
+    if tuple(channels) == tuple(range(channels[0], channels[0] + len(channels))):
+        return (Span.of(register.of(channels[0]), len(channels)),)
+    return tuple(Span.of(register.of(channel)) for channel in channels)

@@ -15,7 +15,7 @@ from sim_devices.laboratory import EmulatedLaboratory, compile_loops
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 
@@ -67,4 +67,4 @@ class VO2Laboratory(EmulatedLaboratory):
             lambda: self.plant.tip_deflection, settings.volts_per_metre, settings.psd_noise, rng=psd_stream
         )
         self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
-        super().__init__("VO2 laboratory", {"psd": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        super().__init__("VO2 laboratory", {"psd": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)}, clock)

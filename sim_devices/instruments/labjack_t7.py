@@ -11,8 +11,9 @@ Assumptions, where these say nothing:
   or a read of a register that can only be written, gives exception 2; a write of half a 32-bit value gives
   exception 3; changing a watchdog setting while the watchdog is enabled gives exception 4.
 - A refusal whose detail is not known leaves 0 in LAST_ERR_DETAIL.
-- Detail 2371 belongs to the settling time, as the known 2370, 2373 and 2375 stand in the order of the error
-  table with it in between.
+- What is written to AIN#_EF_READ_B and C, which the map has as writable, stays there until the next burst.
+- A register of the watchdog counts as written to the flash memory with every write, also of the value that it has.
+- A power cycle drops the connections; DAC and LJTick-DAC outputs are at 0 V after it.
 - A burst longer than the 0.18 s that the datasheet allows is refused with exception 4.
 - DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
   offset. The register of a DAC reads back what was written.
@@ -26,16 +27,18 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
+from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.devices import Identity
 from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
 
@@ -139,6 +142,43 @@ class _Watchdog:
     dac1: float = 0.0
 
 
+class _Service:
+    """The time in which an instrument serves a request, to be entered again and again."""
+
+    def __init__(self, begin: Callable[[], None], end: Callable[[BaseException | None], None]) -> None:
+        self._begin = begin
+        self._end = end
+
+    def __enter__(self) -> None:
+        self._begin()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end(error)
+
+
+class _Scale(NamedTuple):
+    """What a reading of the converter is made of, V."""
+
+    noise: float
+    step: float
+    lowest: float
+    highest: float
+
+
+def _scale(volts: float, index: int) -> _Scale:
+    rail = RAIL * volts
+    code = 2 * rail / CODES
+    conversions = CONVERSIONS[index - 1]
+    step = code / conversions
+    return _Scale(code / math.sqrt(conversions), step, -rail, rail - step)
+
+
+_SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in range(1, len(CONVERSIONS) + 1)}
+"""By range and resolution index."""
+
+
 class EmulatedT7(RegisterInstrument):
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
@@ -149,6 +189,11 @@ class EmulatedT7(RegisterInstrument):
     ----------
     inputs : mapping of int to callable
         Voltage in V at an analog input by its number, 0 to 13; an input that is not named is grounded.
+
+    Attributes
+    ----------
+    flash_writes : int
+        How often a register of the flash memory was written, since the instrument was made.
 
     Raises
     ------
@@ -172,7 +217,20 @@ class EmulatedT7(RegisterInstrument):
         self.serial_number = serial_number
         self.firmware = firmware
         self._sources = dict(inputs)
-        self._rng = rng
+        self._normals = normals(rng)
+        self._service = _Service(self._begin, self._end)
+        self._touched = False
+        self._watchdog = _Watchdog()
+        self._expired_at: float | None = None
+        self._followers: list[Callable[[], None]] = []
+        self._restart_followers: list[Callable[[], None]] = []
+        self.flash_writes = 0
+        self._start()
+        self._set_map_up(self._register_map())
+        world.add(self)
+
+    def _start(self) -> None:
+        """Set everything up that is not kept in the flash memory."""
         self._inputs = [_Input() for _ in range(CHANNELS)]
         self._stream_index = 0
         self._stream_settling = 0.0
@@ -182,12 +240,25 @@ class EmulatedT7(RegisterInstrument):
         self._dio_direction = 0
         self._dio_inhibit = 0
         self._last_error = 0
-        self._watchdog = _Watchdog()
-        self._due = math.inf
-        self._expired_at: float | None = None
-        self._followers: list[Callable[[], None]] = []
-        self._set_map_up(self._register_map())
-        world.add(self)
+        self._expired_at = None
+        self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
+
+    def power_cycle(self) -> None:
+        """Switch the instrument off and on: what is in its RAM is lost, what is in its flash memory stays.
+
+        All digital lines are inputs then, which are pulled high (datasheet 24.0); the watchdog runs again if it is
+        enabled (23.0); the connections are lost.
+        """
+        with self.world.at_present():
+            self._start()
+            self._set_map_up(self._register_map())
+            for follow in self._restart_followers:
+                follow()
+            self._lead()
+
+    def on_restart(self, follow: Callable[[], None]) -> None:
+        """Call `follow()` at each power cycle."""
+        self._restart_followers.append(follow)
 
     @property
     def identity(self) -> Identity:
@@ -214,7 +285,7 @@ class EmulatedT7(RegisterInstrument):
         return bool(levels >> number & 1)
 
     def add_follower(self, follow: Callable[[], None]) -> None:
-        """Call `follow()` now, after every request and when the watchdog acts.
+        """Call `follow()` now, after every request that touches an output, and when the watchdog acts.
 
         A load at the outputs reads them then; the world stands at that instant.
         """
@@ -229,19 +300,40 @@ class EmulatedT7(RegisterInstrument):
 
     # The requests.
 
-    @contextmanager
-    def _request(self) -> Iterator[None]:
-        with self.world.lock:
-            self._attend()
-            try:
-                yield
-            except RegisterError as refusal:
-                self._last_error = refusal.detail if isinstance(refusal, _DetailedError) else 0
-                raise
-            finally:
+    def _request(self) -> AbstractContextManager[None]:
+        return self._service
+
+    def _begin(self) -> None:
+        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
+        world, dog = self.world, self._watchdog
+        world.lock.acquire()
+        try:
+            world.advance()
+            if not dog.enabled:
+                return
+            if not dog.strict:
+                self._due = world.time + dog.timeout
+                self._expired_at = None
+            elif self._expired_at is not None:
+                # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
+                periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
+                self._due = self._expired_at + periods * dog.timeout
+                self._expired_at = None
+        except BaseException:
+            world.lock.release()
+            raise
+
+    def _end(self, error: BaseException | None) -> None:
+        try:
+            if isinstance(error, RegisterError):
+                self._last_error = error.detail if isinstance(error, _DetailedError) else 0
+            if self._touched:
                 self._lead()
+        finally:
+            self.world.lock.release()
 
     def _lead(self) -> None:
+        self._touched = False
         for follow in self._followers:
             follow()
 
@@ -266,20 +358,6 @@ class EmulatedT7(RegisterInstrument):
         self._due = math.inf
         self._lead()
 
-    def _attend(self) -> None:
-        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
-        self.world.advance()
-        dog = self._watchdog
-        if not dog.enabled:
-            return
-        if not dog.strict:
-            self._feed()
-        elif self._expired_at is not None:
-            # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
-            periods = math.floor((self.world.time - self._expired_at) / dog.timeout) + 1
-            self._due = self._expired_at + periods * dog.timeout
-            self._expired_at = None
-
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout
         self._expired_at = None
@@ -289,6 +367,7 @@ class EmulatedT7(RegisterInstrument):
             raise RegisterError(DEVICE_FAILURE, "WATCHDOG_ENABLE: allowed are 0 and 1")
         if value and not self._watchdog.timeout:
             raise RegisterError(DEVICE_FAILURE, "WATCHDOG_ENABLE: WATCHDOG_TIMEOUT_S is 0")
+        self.flash_writes += 1
         self._watchdog.enabled = int(value)
         if value:
             self._feed()
@@ -321,10 +400,11 @@ class EmulatedT7(RegisterInstrument):
 
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
-        # Nothing that a follower looks at changes, and nothing is refused.
-        with self.world.lock:
-            self._attend()
-            return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
+        with self._request():
+            return self._reading(channel)
+
+    def _reading(self, channel: int) -> float:
+        return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -352,12 +432,9 @@ class EmulatedT7(RegisterInstrument):
         volts = self._terminal(channel)
         if settings.negative != SINGLE_ENDED:
             volts -= self._terminal(settings.negative)
-        rail = RAIL * settings.range
-        code = 2 * rail / CODES
-        conversions = CONVERSIONS[index - 1]
-        volts += code / math.sqrt(conversions) * self._rng.standard_normal()
-        step = code / conversions
-        return float(min(max(round(volts / step) * step, -rail), rail - step))
+        noise, step, lowest, highest = _SCALES[settings.range, index]
+        volts += noise * next(self._normals)
+        return min(max(round(volts / step) * step, lowest), highest)
 
     def _terminal(self, channel: int) -> float:
         source = self._sources.get(channel)
@@ -403,6 +480,12 @@ class EmulatedT7(RegisterInstrument):
             raise RegisterError(DEVICE_FAILURE, f"AIN{channel}_EF_INDEX: {value:g} is not emulated")
         self._inputs[channel].feature = int(value)
 
+    def _set_maximum(self, channel: int, value: float) -> None:
+        self._inputs[channel].burst = self._inputs[channel].burst._replace(maximum=value)
+
+    def _set_minimum(self, channel: int, value: float) -> None:
+        self._inputs[channel].burst = self._inputs[channel].burst._replace(minimum=value)
+
     def _set_samples(self, channel: int, value: float) -> None:
         if not 1 <= value <= _MOST_SAMPLES:
             raise RegisterError(DEVICE_FAILURE, f"AIN{channel}_EF_CONFIG_A: 1 to {_MOST_SAMPLES} samples")
@@ -416,17 +499,21 @@ class EmulatedT7(RegisterInstrument):
     # The outputs, and the digital lines.
 
     def _set_dac(self, number: int, value: float) -> None:
+        self._touched = True
         self._dacs[number] = min(max(value, 0.0), _DAC_TOP)
 
     def _set_tdac(self, number: int, value: float) -> None:
+        self._touched = True
         self._tdacs[number] = min(max(value, -_TDAC_TOP), _TDAC_TOP)
 
     def _read_dio(self, number: int) -> float:
+        self._touched = True
         self._dio_direction &= ~(1 << number)
         return self.dio_level(number)
 
     def _set_dio(self, number: int, value: float) -> None:
         # Writing a line also makes it an output, as ljm_constants.json says of FIO0.
+        self._touched = True
         bit = 1 << number
         self._dio_direction |= bit
         self._dio_state = self._dio_state | bit if value else self._dio_state & ~bit
@@ -435,6 +522,7 @@ class EmulatedT7(RegisterInstrument):
         return self._dio_state & self._dio_direction | ~self._dio_direction & ALL_DIO
 
     def _set_dio_bank(self, attribute: str, value: float) -> None:
+        self._touched = True
         affected = ALL_DIO if attribute == "_dio_inhibit" else ~self._dio_inhibit & ALL_DIO
         setattr(self, attribute, getattr(self, attribute) & ~affected | int(value) & affected)
 
@@ -444,7 +532,7 @@ class EmulatedT7(RegisterInstrument):
         """Return the emulated rows of `ljm_constants.json`."""
         inputs, dog = self._inputs, self._dog
         return (
-            Register("AIN#", 0, "F32", self.convert, None, CHANNELS),
+            Register("AIN#", 0, "F32", self._reading, None, CHANNELS),
             Register("DAC#", 1000, "F32", self._dacs.__getitem__, self._set_dac, len(self._dacs)),
             Register("DIO#", 2000, "U16", self._read_dio, self._set_dio, _DIOS),
             Register("DIO_STATE", 2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state")),
@@ -453,8 +541,8 @@ class EmulatedT7(RegisterInstrument):
             Register("STREAM_SETTLING_US", 4008, "F32", lambda: self._stream_settling, self._set_stream_settling),
             Register("STREAM_RESOLUTION_INDEX", 4010, "U32", lambda: self._stream_index, self._set_stream_resolution),
             Register("AIN#_EF_READ_A", 7000, "F32", lambda n: self.burst(n).average, None, CHANNELS),
-            Register("AIN#_EF_READ_B", 7300, "F32", lambda n: inputs[n].burst.maximum, None, CHANNELS),
-            Register("AIN#_EF_READ_C", 7600, "F32", lambda n: inputs[n].burst.minimum, None, CHANNELS),
+            Register("AIN#_EF_READ_B", 7300, "F32", lambda n: inputs[n].burst.maximum, self._set_maximum, CHANNELS),
+            Register("AIN#_EF_READ_C", 7600, "F32", lambda n: inputs[n].burst.minimum, self._set_minimum, CHANNELS),
             Register("AIN#_EF_INDEX", 9000, "U32", lambda n: inputs[n].feature, self._set_feature, CHANNELS),
             Register("AIN#_EF_CONFIG_A", 9300, "U32", lambda n: inputs[n].samples, self._set_samples, CHANNELS),
             Register("AIN#_EF_CONFIG_D", 10200, "F32", lambda n: inputs[n].scan_rate, self._set_scan_rate, CHANNELS),
@@ -492,6 +580,7 @@ class EmulatedT7(RegisterInstrument):
         def write(value: float) -> None:
             if self._watchdog.enabled:
                 raise RegisterError(DEVICE_FAILURE, "the watchdog must be disabled before its settings change")
+            self.flash_writes += 1
             setattr(self._watchdog, attribute, value)
 
         return partial(getattr, self._watchdog, attribute), write

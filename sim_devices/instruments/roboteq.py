@@ -161,6 +161,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._heartbeat_milliseconds = 100
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = False
+        self._quiet_until = -math.inf
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
         self._readings: dict[int, Callable[[int], int]] = {
@@ -238,6 +239,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self.world.advance()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
+            self._quiet_until = -math.inf
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
@@ -251,6 +253,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
         with self.world.at_present():
+            self._quiet_until = -math.inf
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -259,6 +262,11 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
                 self._state = NodeState.PRE_OPERATIONAL
             elif command in (129, 130):
                 self._restart(power=command == 129)
+
+    @property
+    def quiet(self) -> bool:
+        """Whether it has nothing to say by itself at the clock's present time."""
+        return self._clock.now() < self._quiet_until
 
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
@@ -311,6 +319,13 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
         return self._pdos.next_due() if self._state is NodeState.OPERATIONAL and self.plugged_in else math.inf
 
+    def next_message(self) -> float:
+        """Return when it next says something by itself, s; until then it is quiet, unless it is disturbed."""
+        instant = min(self.next_heartbeat(), self.next_process_data())
+        # A sum of periods may be short of the instant by its rounding.
+        self._quiet_until = instant - 1e-6
+        return instant
+
     def _encoded(self, key: tuple[int, int]) -> bytes:
         return FORMATS[DICTIONARY[key].kind].pack(self.read_object(*key))
 
@@ -352,6 +367,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         with self.world.at_present():
             self.heartbeats()
             self.plugged_in = True
+            self._quiet_until = -math.inf
 
     def _corrupted(self, answer: bytes) -> bytes:
         """Cut the adapter's line in its middle."""
@@ -463,6 +479,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self._watchdog_due = math.inf
             self._apply()
         self._pdos.reset(self.world.time)
+        self._quiet_until = -math.inf
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = True
         self._heartbeat_since = self.world.time

@@ -83,6 +83,8 @@ class CanopenSlcanServer(WireServer):
 
     def unsolicited(self) -> bytes:
         """Return heartbeats, boot-up message and TPDOs since the last call, which pass while the channel is open."""
+        if self._device.quiet:
+            return b""
         with self._device.world.lock:
             return self._sent_by_itself()
 
@@ -92,12 +94,15 @@ class CanopenSlcanServer(WireServer):
         with device.world.lock:
             if not self._on_the_bus():
                 return math.inf
-            return min(device.next_heartbeat(), device.next_process_data())
+            return device.next_message()
 
     def _sent_by_itself(self) -> bytes:
         device = self._device
+        if device.quiet:
+            return b""
         states = device.heartbeats()
         frames = device.process_data(synchronous=False)
+        device.next_message()
         if not (states or frames) or not self._on_the_bus():
             return b""
         sent = b"".join(_line(_HEARTBEAT + device.node, bytes((state,))) for state in states)

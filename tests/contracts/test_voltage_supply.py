@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from emulated_bench import Bench, OnABench, serial_port
+from emulated_bench import Bench, OnABench, serial_port, tcp_port
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,10 +20,9 @@ from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import ChannelFlag, Fault
-from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 WATCHDOG = 1
@@ -51,7 +50,7 @@ class Resistor:
         pass
 
 
-class LosingServer:
+class LosingServer(WireServer):
     """A wire server that can lose a command."""
 
     def __init__(self, server):
@@ -120,7 +119,7 @@ def falls_to_zero(volts):
 
 
 PWM = ["emulated average", "emulated rms", "driver average", "driver rms"]
-LINEAR = ["T7 emulated dc", "T7 driver dc"]
+LINEAR = ["T7 driver dc"]
 
 
 @pytest.fixture(params=[*PWM, *LINEAR])
@@ -135,7 +134,7 @@ def output(kind):
 
 @pytest.fixture
 def bench(kind, output, stack):
-    return high_voltage("driver" in kind, stack) if kind in LINEAR else switching("driver" in kind, output, stack)
+    return high_voltage(stack) if kind in LINEAR else switching("driver" in kind, output, stack)
 
 
 def switching(driver, output, stack):
@@ -168,7 +167,7 @@ def switching(driver, output, stack):
     )  # fmt: skip
 
 
-def high_voltage(driver, stack):
+def high_voltage(stack):
     """A T7 and the amplifier behind it; its load draws a current only while the voltage changes."""
     clock, load = VirtualClock(), Resistor()
     world = load.world = World(load, clock)
@@ -189,12 +188,8 @@ def high_voltage(driver, stack):
         settling=0.01,
     )
     said = {"line": 5, "gain": GAIN, "watchdog": WATCHDOG}
-    if driver:
-        server = stack.enter_context(ModbusTcpServer(t7))
-        settings = T7HighVoltageSupply.Settings(port=server.address, **said)
-        device = T7HighVoltageSupply.connect("supply", settings, clock)
-    else:
-        device = EmulatedHighVoltageSupply("supply", t7, **said)
+    settings = T7HighVoltageSupply.Settings(port=tcp_port(stack, t7, clock), **said)
+    device = T7HighVoltageSupply.connect("supply", settings, clock)
     stack.callback(device.close)
     return SupplyBench(
         clock=clock, device=device, instrument=t7, plant=load, facts=facts, requests=t7.requests, amplifier=amplifier

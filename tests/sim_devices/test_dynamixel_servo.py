@@ -142,7 +142,7 @@ def test_packets_of_the_maker(pair, sent, replied):
 @pytest.mark.parametrize(
     ("sent", "replied"),
     [
-        # Recorded from an XL330 (ScrapMeta/microduck-diy): id; an address that does not exist; a ping with a wrong CRC.
+        # Recorded from an XL330 (ScrapMeta/microduck-diy): its id; an address that does not exist; a wrong CRC.
         ("01 07 00 02 07 00 01 00 22 B7", ["01 05 00 55 00 01 56 A1"]),
         ("01 07 00 02 FF FF 01 00 05 5B", ["01 04 00 55 07 B0 8C"]),
         ("01 03 00 01 3A 6C", []),
