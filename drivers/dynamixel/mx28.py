@@ -221,6 +221,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
+        self._names = [signal.name for signal in self.signals]
         self._goal = 0
         self._armed = False
         self._expired = False
@@ -257,7 +258,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         direction = self._settings.direction
         velocity_in_unit = direction * velocity * _VELOCITY_UNIT * self._settings.per_radian
         values = (self._position(position), velocity_in_unit, direction * load * 1e-3)
-        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+        return dict(zip(self._names, values, strict=True))
 
     def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
         """Take the present position as the goal and hold it; does nothing while the torque is off."""

@@ -62,10 +62,7 @@ class SlcanAdapter(slcanBus):
         for _ in range(_MOST_READS):
             if lines:
                 return lines.popleft()
-            waiting = self._port.in_waiting
-            if not (waiting or wait):
-                return None
-            received = self._port.read(waiting or 1)
+            received = self._port.read_all() or (self._port.read(1) if wait else b"")
             if not received:
                 return None
             self._take(received)

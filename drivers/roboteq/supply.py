@@ -149,6 +149,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         super().__init__(name, settings, clock, line)
         self._lock = threading.RLock()
         self._limits = Limits(*settings.voltage_limits, "V")
+        self._voltage_name, self._current_name = (signal.name for signal in self.signals)
         self._channels: tuple[int, ...] = (settings.channel,)
         self._command = 0
         self._battery = math.nan
@@ -212,8 +213,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             current = self._read(_AMPS, self._settings.channel) / 10
             self._check()
             self._keep(power, battery)
-            voltage_signal, current_signal = self.signals
-            return {voltage_signal.name: self._voltage(power, battery), current_signal.name: current}
+            return {self._voltage_name: self._voltage(power, battery), self._current_name: current}
 
     def safe(self) -> None:
         """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
