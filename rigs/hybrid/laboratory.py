@@ -120,6 +120,7 @@ class HybridLaboratory(EmulatedLaboratory):
     """
 
     Settings = HybridLaboratorySettings
+    world: World
 
     def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
         # One stream a source of noise: reading one instrument must not change the noise of another.
