@@ -81,7 +81,7 @@ def read_endpoints(path: Path) -> Endpoints:
 
 
 class ControlClient:
-    """A connection to the control socket of `bench emulate`; docs/reference/control-socket.md has the requests.
+    """A connection to the control socket of `bench emulate`; docs/reference/emulate.md has the requests.
 
     Parameters
     ----------
