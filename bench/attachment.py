@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -231,7 +232,12 @@ class AttachedClock(Clock):
         return self._time_alone()
 
     def sleep(self, seconds: float) -> None:
-        """Wait until the server's time is so much later, s; ends early when `interrupted`."""
+        """Wait until the server's time is so much later, s; ends early when `interrupted`.
+
+        Raises `ValueError` if `seconds` is not finite.
+        """
+        if not math.isfinite(seconds):
+            raise ValueError(f"seconds: expected a finite number, got {seconds}")
         end = self.now() + seconds
         while (now := self._last) < end and not self.interrupted():
             until = min(end, now + _LONGEST_NAP * self.factor)

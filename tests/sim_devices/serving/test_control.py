@@ -195,6 +195,10 @@ def test_control_clients_do_not_disturb_each_other(vo2):
         late.sendall(b'{"do": "wait", "until": 1e9}\n{"do": "time"}\n')
         assert b"too long" in endless.recv(1000)
         assert vo2.control.time() > 0
+        late.settimeout(2.0)
+        # One that waits is not read without bound.
+        with pytest.raises(TimeoutError):
+            late.sendall(3_000_000 * b'{"do": "time"}\n')
         late.settimeout(0.3)
         with pytest.raises(TimeoutError):
             late.recv(1)
