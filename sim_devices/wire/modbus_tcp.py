@@ -19,6 +19,7 @@ import struct
 import threading
 from collections.abc import Callable
 from types import TracebackType
+from typing import Protocol, runtime_checkable
 
 from sim_devices.wire.modbus import FEEDBACK, RegisterBank, answer, feedback
 
@@ -29,6 +30,14 @@ _FUNCTIONS = {FEEDBACK: feedback}
 
 class FramingError(Exception):
     """The bytes are no Modbus TCP, and where the next frame begins cannot be known."""
+
+
+@runtime_checkable
+class Restartable(Protocol):
+    """An instrument that tells when it restarts."""
+
+    def on_restart(self, follow: Callable[[], None]) -> None:
+        """Call `follow()` at each restart."""
 
 
 class ModbusTcpInstrument:
@@ -47,6 +56,8 @@ class ModbusTcpInstrument:
         self.bank = bank
         self._most = connections
         self._open: list[ModbusTcpStream] = []
+        if isinstance(bank, Restartable):
+            bank.on_restart(self.end_connections)
 
     def connect(self) -> ModbusTcpStream:
         """Open a connection.
@@ -58,6 +69,11 @@ class ModbusTcpInstrument:
         stream = ModbusTcpStream(self.bank, self._open.remove)
         self._open.append(stream)
         return stream
+
+    def end_connections(self) -> None:
+        """End all connections, as a power cycle of the instrument does."""
+        for stream in tuple(self._open):
+            stream.close()
 
 
 class ModbusTcpStream:
@@ -230,6 +246,6 @@ class ModbusTcpServer:
             data = client.recv(4096)
             if data:
                 client.sendall(stream.receive(data))
-        except (OSError, FramingError):
+        except (OSError, FramingError):  # of the client, or of the instrument's end
             return False
         return bool(data)
