@@ -25,6 +25,7 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.grid import PlantParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.magnet import RatiometricSensor
@@ -59,6 +60,10 @@ FaultName = Literal[
 
 class MusclePlant(Protocol):
     """What frame and instruments need of a muscle."""
+
+    @property
+    def parameters(self) -> PlantParameters:
+        """Its numbers."""
 
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds."""
@@ -154,6 +159,11 @@ class Frame:
         self.muscle.advance(dt)
 
 
+def _use(muscle: MusclePlant) -> tuple[float, float]:
+    muscle.advance(muscle.parameters.step)
+    return muscle.position, muscle.force
+
+
 class MuscleLaboratory(EmulatedLaboratory):
     """A laboratory with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
@@ -177,7 +187,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
         self.muscle = settings.make_muscle(plant)
-        compile_loops(self.muscle, lambda muscle: muscle.advance(1e-3))
+        compile_loops(self.muscle, _use)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
         self._cell_is_broken = self._load_is_forgotten = False
@@ -196,6 +206,7 @@ class MuscleLaboratory(EmulatedLaboratory):
             self._sensed_force,
             rng=cell,
             weight_limits=(-5.0, 50.0),
+            zero_tracking=0,
             noise=settings.force_noise,
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
