@@ -116,6 +116,13 @@ def run(
             "trips because the machine is busy; the factor reached is recorded, and printed if it is below 90 % of N."
         ),
     ] = "wall",
+    attach: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Endpoints file of `bench emulate --json`: use the instruments served there, on their clock.",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
@@ -144,6 +151,8 @@ def run(
         return
     if rig is None:
         raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
+    if attach is not None and (clock != "wall" or seed):
+        raise ConfigurationError("--attach: clock and seed are the server's; leave --clock and --seed out")
     definition = find_protocol(protocol)
     given = parse_assignments("--set", settings or [])
 
@@ -159,6 +168,7 @@ def run(
         clock=clock,
         folder=out,
         live=live,
+        attach=attach,
     )
     with show_compilation():
         result = carry_out(asked, console)

@@ -62,6 +62,8 @@ class MeComServer(WireServer):
     has no speed of its own.
     """
 
+    protocol = "MeCom"
+
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
         self._received = b""

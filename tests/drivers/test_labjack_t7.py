@@ -26,9 +26,9 @@ from drivers.labjack_t7.registers import (
     LabJackT7,
 )
 from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
