@@ -393,7 +393,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
                 if row.volatile and number >= 50000:
                     self._values[number] = stored(row, row.default)
         if self._values[6310] > 0.0:
-            self._restart_due = self.world.time + self._values[6310]
+            # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
+            self._restart_due = self.world.time + max(self._values[6310], RESET_DELAY)
         self._apply()
 
     def _restart(self) -> None:
