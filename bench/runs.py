@@ -18,6 +18,7 @@ from typing import Any
 
 from rich.console import Console
 
+from bench.attachment import AttachedClock, attach
 from bench.binding import Slots
 from bench.clock import Stopwatch, make_clock, wall_time
 from bench.devices import Signal
@@ -59,6 +60,8 @@ class Run:
         Whether to serve the live view on the loopback interface.
     recording : bool
         Whether to write the .rrd beside the journal while the run goes on.
+    attach : Path, optional
+        Endpoints file of `bench emulate`: the emulated laboratory is served there, on its own clock and seed.
     """
 
     protocol: ProtocolDefinition
@@ -70,6 +73,7 @@ class Run:
     clock: str = "wall"
     live: bool = False
     recording: bool = True
+    attach: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,12 @@ def carry_out(run: Run, console: Console) -> RunResult:
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
     clock = make_clock(run.clock)
+    if run.attach is not None:
+        if not rig_file.emulated:
+            raise ConfigurationError(f"rig {rig_file.name} has no emulated laboratory that could be served elsewhere")
+        attachment = attach(run.attach, rig_file.name)
+        clock = attachment.clock
+        rig_file = replace(rig_file, laboratory=lambda *_: attachment)
     if run.clock != "wall" and any(not _is_emulated(entry.settings) for entry in rig_file.devices):
         raise ConfigurationError(f"rig {rig_file.name} has real devices, which know only the wall clock")
     parameters = run.protocol.parse(
@@ -184,7 +194,7 @@ def _metadata(
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
-        "clock": run.clock,
+        "clock": f"attached x{rig.clock.factor:g}" if isinstance(rig.clock, AttachedClock) else run.clock,
         "epoch": rig.clock.epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in rig.devices.items()},
         "calibration": {

@@ -6,6 +6,8 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TypeVar
 
 from bench.clock import Clock
@@ -13,8 +15,47 @@ from bench.errors import ConfigurationError
 from sim_devices import protocol_emulated
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.world import World
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TrueValue:
+    """One quantity of a plant or of an output, without noise and without the errors of an instrument.
+
+    Attributes
+    ----------
+    value : float
+        Its value at the clock's present time; 1 and 0 of a switch.
+    unit : str
+        Its unit; empty of a switch or a share.
+    is_output : bool
+        Whether an instrument sets it, so that each change of it is logged.
+    """
+
+    value: float
+    unit: str = ""
+    is_output: bool = False
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that can go wrong at any time.
+
+    Attributes
+    ----------
+    summary : str
+        What happens, in one line.
+    inject : callable
+        Make it happen; takes `values` by name.
+    values : mapping of str to float
+        What can be chosen, with its defaults, in the units that the summary says.
+    """
+
+    summary: str
+    inject: Callable[..., None]
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 class EmulatedLaboratory:
@@ -26,7 +67,20 @@ class EmulatedLaboratory:
         Its name in messages.
     servers : mapping of str to server
         The instruments by the name of their port: serial ones, and those on TCP.
+
+    Attributes
+    ----------
+    world : World or None
+        The time of plant and instruments; None if there is no plant.
+    instruments : mapping of str to object
+        The emulated instruments behind the servers, by the same names; one that has `power_cycle` can be restarted.
+    faults : mapping of str to Fault
+        What can go wrong, by name.
     """
+
+    world: World | None = None
+    instruments: Mapping[str, object] = MappingProxyType({})
+    faults: Mapping[str, Fault] = MappingProxyType({})
 
     def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpServer], clock: Clock) -> None:
         self._title = title
@@ -51,6 +105,33 @@ class EmulatedLaboratory:
                     opened.callback(protocol_emulated.unregister, name)
             self._opened = opened.pop_all()
         return ports
+
+    @property
+    def servers(self) -> Mapping[str, WireServer | ModbusTcpServer]:
+        """The instruments by the name of their port."""
+        return self._servers
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the state of the plant and of the outputs as they are, by name; the world stands at the present."""
+        return {}
+
+    def inject(self, fault: str, values: Mapping[str, float] | None = None) -> None:
+        """Make a fault happen.
+
+        Raises ConfigurationError if there is no such fault, or it does not take these values.
+        """
+        if fault not in self.faults:
+            known = ", ".join(self.faults) or "none"
+            raise ConfigurationError(f"the {self._title} has no fault {fault!r}; it has: {known}")
+        known_values = self.faults[fault].values
+        for name in values or {}:
+            if name not in known_values:
+                raise ConfigurationError(
+                    f"fault {fault} takes no value {name!r}; it takes: {', '.join(known_values) or 'none'}"
+                )
+        if self.world is not None:
+            self.world.advance()
+        self.faults[fault].inject(**{**known_values, **(values or {})})
 
     def operate(self, task: str, value: float) -> None:  # noqa: ARG002
         """Refuse a task.

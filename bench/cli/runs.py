@@ -113,6 +113,13 @@ def run(
             help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast, up to about 100)."
         ),
     ] = "wall",
+    attach: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Endpoints file of `bench emulate --json`: use the instruments served there, on their clock.",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
@@ -141,6 +148,8 @@ def run(
         return
     if rig is None:
         raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
+    if attach is not None and (clock != "wall" or seed):
+        raise ConfigurationError("--attach: clock and seed are the server's; leave --clock and --seed out")
     definition = find_protocol(protocol)
     given = parse_assignments("--set", settings or [])
 
@@ -157,6 +166,7 @@ def run(
             clock=clock,
             folder=out,
             live=live,
+            attach=attach,
         ),
         console,
     )

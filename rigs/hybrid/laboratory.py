@@ -11,6 +11,7 @@ themselves, without a wire, for loops of many kHz on the virtual clock.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -28,7 +29,7 @@ from sim_devices.instruments.t7_roles import (
     EmulatedPositionSensor,
     EmulatedTemperatureSensor,
 )
-from sim_devices.laboratory import EmulatedLaboratory, Event, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
@@ -119,6 +120,7 @@ class HybridLaboratory(EmulatedLaboratory):
     """
 
     Settings = HybridLaboratorySettings
+    world: World
 
     def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
         # One stream a source of noise: reading one instrument must not change the noise of another.
@@ -152,10 +154,27 @@ class HybridLaboratory(EmulatedLaboratory):
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )
         super().__init__("hybrid laboratory", {"t7": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        self.instruments = {"t7": self.t7, "tec": self.tec}
+        self.faults = {
+            "open-thermistor": Fault(
+                "a wire of the thermistor at the base breaks", partial(setattr, self.base, "open", True)
+            ),
+            "shorted-thermistor": Fault(
+                "the wires of the thermistor at the tip touch", partial(setattr, self.tip, "shorted", True)
+            ),
+            "out-of-range": Fault(
+                "the displacement sensor sees the tip so much further (metres)", self._go_beyond, {"metres": 1e-3}
+            ),
+            "tec-over-current": Fault("the TEC controller trips: error 100", partial(self.tec.trip, _OVER_CURRENT)),
+            "tec-over-temperature": Fault(
+                "the TEC controller trips: error 138", partial(self.tec.trip, _OBJECT_TOO_HOT)
+            ),
+            "amplifier-trips": Fault("the amplifier switches itself off, if it is on", self.amplifier.trip),
+        }
         if settings.ambient_step:
             self.world.add(Event(settings.ambient_step_time, self._step_room))
         if settings.fault != "none":
-            self.world.add(Event(settings.fault_time, self._go_wrong))
+            self.world.add(Event(settings.fault_time, partial(self.inject, settings.fault)))
 
     def open(self) -> Mapping[str, str]:
         """Switch the instruments on; return the port of each by name.
@@ -197,23 +216,28 @@ class HybridLaboratory(EmulatedLaboratory):
         )
         return {name: name for name in _direct}
 
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the state of cantilever, controller and amplifier."""
+        plant = self.plant
+        return {
+            "base_temperature": TrueValue(plant.base_temperature, "°C"),
+            "tip_temperature": TrueValue(plant.tip_temperature, "°C"),
+            "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
+            "ambient_temperature": TrueValue(plant.ambient_temperature, "°C"),
+            "deflection": TrueValue(plant.deflection, "m"),
+            "tec_current": TrueValue(plant.current, "A"),
+            "tec_voltage": TrueValue(plant.tec_voltage, "V"),
+            "tec_output": TrueValue(self.tec.output_enabled, is_output=True),
+            "piezo_voltage": TrueValue(plant.piezo_voltage, "V"),
+            "amplifier_command": TrueValue(self.t7.tdac_volts(0), "V", is_output=True),
+            "amplifier_enable": TrueValue(self.t7.dio_level(ENABLE_LINE, pulled_down=True), is_output=True),
+        }
+
     def _step_room(self) -> None:
         self.plant.step_ambient(self._settings.ambient_step)
 
-    def _go_wrong(self) -> None:
-        fault = self._settings.fault
-        if fault == "open-thermistor":
-            self.base.open = True
-        elif fault == "shorted-thermistor":
-            self.tip.shorted = True
-        elif fault == "out-of-range":
-            self._beyond = 1e-3
-        elif fault == "tec-over-current":
-            self.tec.trip(_OVER_CURRENT)
-        elif fault == "tec-over-temperature":
-            self.tec.trip(_OBJECT_TOO_HOT)
-        elif fault == "amplifier-trips":
-            self.amplifier.trip()
+    def _go_beyond(self, metres: float) -> None:
+        self._beyond = metres
 
 
 class DirectSettings(DriverSettings):

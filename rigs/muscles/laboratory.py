@@ -8,6 +8,7 @@ muscle, a fan blows at it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -22,7 +23,7 @@ from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
-from sim_devices.laboratory import EmulatedLaboratory, Event, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
@@ -185,6 +186,7 @@ class MuscleLaboratory(EmulatedLaboratory):
     """
 
     Settings: ClassVar[type[MuscleLaboratorySettings]]
+    world: World
 
     def __init__(self, settings: MuscleLaboratorySettings, clock: Clock, seed: int) -> None:
         if not isinstance(settings, self.Settings):
@@ -196,7 +198,8 @@ class MuscleLaboratory(EmulatedLaboratory):
         compile_loops(self.muscle, lambda muscle: muscle.advance(1e-3))
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
-        self._cell_is_broken = False
+        self._cell_is_broken = self._load_is_forgotten = False
+        self._load_factor = 1.0
         self.supply = EmulatedRoboteq(
             "supply",
             self.world,
@@ -218,8 +221,10 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
         self.frame.t7 = self.t7
+        self.instruments = {"t7": self.t7, "supply": self.supply, "load_cell": self.load_cell, "stage": self.servo}
+        self.faults = self._faults()
         if settings.fault != "none":
-            self.world.add(Event(settings.fault_time, self._go_wrong))
+            self.world.add(Event(settings.fault_time, partial(self.inject, settings.fault)))
         super().__init__(
             "muscle laboratory",
             {
@@ -238,31 +243,65 @@ class MuscleLaboratory(EmulatedLaboratory):
         """
         if task not in (LOAD, STAGE):
             raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
-        with self.world.lock:
-            self.world.advance()
-            fault = self._settings.fault if self._clock.now() >= self._settings.fault_time else "none"
+        with self.world.at_present():
             if task == STAGE:
                 self.frame.fasten()
-            elif fault != "forgotten-load":
-                load = 2.0 * value if fault == "heavy-load" else value
+            elif not self._load_is_forgotten:
+                load = self._load_factor * value
                 try:
                     self.frame.hang(load)
                 except ValueError as error:
                     raise ConfigurationError(f"a load of {load:g} N cannot be hung on the muscle: {error}") from None
 
-    def _go_wrong(self) -> None:
-        """Make the fault of the settings happen, if it is one of an instant."""
-        fault = self._settings.fault
-        if fault == "silent-supply":
-            self.supply.unplug()
-        elif fault == "missing-heartbeat":
-            self.supply.write_object(_HEARTBEAT_TIME, 0)
-        elif fault == "unplugged-sensor":
-            self.magnet.supply_volts = 0.0
-        elif fault == "servo-overload":
-            self.servo.trip(HardwareError.OVERLOAD)
-        elif fault == "broken-load-cell":
-            self._cell_is_broken = True
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the state of muscle, supply, stage and fan."""
+        return {
+            **self.muscle_truth(),
+            "force": TrueValue(self.muscle.force, "N"),
+            "position": TrueValue(self.muscle.position, "m"),
+            "supply_voltage": TrueValue(self.supply.voltage, "V", is_output=True),
+            "supply_current": TrueValue(self.muscle.current, "A"),
+            "stage_angle": TrueValue(self.servo.position, "rad"),
+            "stage_torque": TrueValue(self.servo.torque_enabled, is_output=True),
+            "fan": TrueValue(self.t7.dio_level(FAN_LINE), is_output=True),
+        }
+
+    def muscle_truth(self) -> dict[str, TrueValue]:
+        """Return what only muscles of this kind have: the temperature of one that is heated."""
+        if not isinstance(self.muscle, SMAWire | CoiledPolymerMuscle):
+            return {}
+        return {"muscle_temperature": TrueValue(self.muscle.temperature, "°C")}
+
+    def _faults(self) -> dict[str, Fault]:
+        return {
+            "silent-supply": Fault("nothing reaches the supply, and nothing comes from it", self.supply.unplug),
+            "missing-heartbeat": Fault(
+                "the supply sends no heartbeat any more", partial(self.supply.write_object, _HEARTBEAT_TIME, 0)
+            ),
+            "low-battery": Fault(
+                "the voltage behind the supply changes (volts)",
+                lambda volts: setattr(self.supply, "battery_voltage", volts),
+                {"volts": 4.5},
+            ),
+            "unplugged-sensor": Fault(
+                "the position sensor loses its supply", partial(setattr, self.magnet, "supply_volts", 0.0)
+            ),
+            "servo-overload": Fault("the servo trips and lets go", partial(self.servo.trip, HardwareError.OVERLOAD)),
+            "broken-load-cell": Fault(
+                "a wire of the load cell breaks", partial(setattr, self, "_cell_is_broken", True)
+            ),
+            "frozen-load-cell": Fault(
+                "the converter of the load cell stands still", partial(setattr, self.load_cell, "frozen", True)
+            ),
+            "forgotten-load": Fault(
+                "the operator hangs nothing from now on", partial(setattr, self, "_load_is_forgotten", True)
+            ),
+            "heavy-load": Fault(
+                "the operator hangs a multiple of the load from now on (factor)",
+                lambda factor: setattr(self, "_load_factor", factor),
+                {"factor": 2.0},
+            ),
+        }
 
     def _sensed_force(self) -> float:
         return _BROKEN_CELL if self._cell_is_broken else self.muscle.force

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -11,12 +12,14 @@ from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile_loops
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
+
+_OVER_CURRENT, _OBJECT_TOO_HOT = 100, 138
 
 
 class VO2LaboratorySettings(LaboratorySettings):
@@ -63,8 +66,41 @@ class VO2Laboratory(EmulatedLaboratory):
         compile_loops(self.plant, lambda plant: plant.advance(1e-3))
         self.world = World(self.plant, clock)
         self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
+        self._misalignment = 0.0
         detector = NormalisedPSD(
-            lambda: self.plant.tip_deflection, settings.volts_per_metre, settings.psd_noise, rng=psd_stream
+            lambda: self.plant.tip_deflection + self._misalignment,
+            settings.volts_per_metre,
+            settings.psd_noise,
+            rng=psd_stream,
         )
         self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
         super().__init__("VO2 laboratory", {"psd": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        self.instruments = {"psd": self.t7, "tec": self.tec}
+        self.faults = {
+            "tec-over-current": Fault("the TEC controller trips: error 100", partial(self.tec.trip, _OVER_CURRENT)),
+            "tec-over-temperature": Fault(
+                "the TEC controller trips: error 138", partial(self.tec.trip, _OBJECT_TOO_HOT)
+            ),
+            "displaced-spot": Fault(
+                "the laser spot stands where it would with so much more deflection (metres)",
+                self._displace,
+                {"metres": 20e-6},
+            ),
+        }
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the state of film, plate and controller."""
+        plant = self.plant
+        return {
+            "plate_temperature": TrueValue(plant.plate_temperature, "°C"),
+            "film_temperature": TrueValue(plant.film_temperature, "°C"),
+            "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
+            "curvature": TrueValue(plant.curvature, "1/m"),
+            "tip_deflection": TrueValue(plant.tip_deflection, "m"),
+            "tec_current": TrueValue(plant.current, "A"),
+            "tec_voltage": TrueValue(plant.voltage, "V"),
+            "tec_output": TrueValue(self.tec.output_enabled, is_output=True),
+        }
+
+    def _displace(self, metres: float) -> None:
+        self._misalignment = metres

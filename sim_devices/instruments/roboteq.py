@@ -329,6 +329,13 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             elif command in (129, 130):
                 self._restart(power=command == 129)
 
+    def next_heartbeat(self) -> float:
+        """Return the laboratory time (s) of the next heartbeat; infinity if none is sent."""
+        if self._boot_up_due:
+            return self._clock.now()
+        period = 1e-3 * self._heartbeat_milliseconds
+        return self._heartbeat_since + period if period > 0.0 else math.inf
+
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
 

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 
 class WireServer(ABC):
-    """The serial side of an emulated instrument."""
+    """The serial side of an emulated instrument.
+
+    Attributes
+    ----------
+    protocol : str
+        Name of what is spoken on the line, for people.
+    """
+
+    protocol: ClassVar[str] = "serial"
 
     @abstractmethod
     def receive(self, data: bytes) -> bytes:

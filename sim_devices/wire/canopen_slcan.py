@@ -16,6 +16,7 @@ block downloads are refused; a remote frame is not answered.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 
@@ -50,6 +51,8 @@ _SEGMENT = 7  # bytes in a segment
 class CanopenSlcanServer(WireServer):
     """The serial side of an slcan adapter with one emulated controller on its bus."""
 
+    protocol = "CANopen over slcan"
+
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
         self._node = SdoServer(device)
@@ -71,6 +74,15 @@ class CanopenSlcanServer(WireServer):
             self._overrun = self._overrun or len(rest) > LONGEST_LINE
             self._received = b"" if self._overrun else rest
             return sent
+
+    def unsolicited(self) -> bytes:
+        """Return the heartbeats since they were last sent."""
+        with self._device.world.at_present():
+            return self._heartbeats()
+
+    def next_unsolicited(self) -> float:
+        """Return the laboratory time (s) of the next heartbeat that the host sees; infinity if it sees none."""
+        return self._device.next_heartbeat() if self._on_the_bus() and self._device.plugged_in else math.inf
 
     def _heartbeats(self) -> bytes:
         """Return the heartbeats since the last request of the host."""

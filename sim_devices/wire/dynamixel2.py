@@ -112,6 +112,8 @@ class Dynamixel2Server(WireServer):
         If there is none, two have one id, or they live in different worlds.
     """
 
+    protocol = "Dynamixel 2.0"
+
     def __init__(self, servos: Iterable[EmulatedMX28]) -> None:
         self._servos = tuple(servos)
         if not self._servos:

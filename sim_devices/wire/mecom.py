@@ -43,6 +43,8 @@ class MeComServer(WireServer):
     no effect, as an emulated line has no speed of its own.
     """
 
+    protocol = "MeCom"
+
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
         self._received = b""

@@ -74,6 +74,8 @@ class ModbusRtuServer(WireServer):
         If the address is not allowed.
     """
 
+    protocol = "Modbus RTU"
+
     def __init__(self, bank: RegisterBank, address: int = 1) -> None:
         if not 1 <= address <= 247:
             raise ValueError(f"address: allowed are 1 to 247, got {address}")

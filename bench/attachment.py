@@ -1,0 +1,314 @@
+"""A laboratory that another process serves by `bench emulate`: its endpoints file, control socket and clock."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bench.clock import Clock, ScaledClock
+from bench.configuration_errors import problems
+from bench.errors import ConfigurationError, DeviceConnectionError
+
+_NAME = "the served laboratory"
+_TIMEOUT = 30.0
+"""Wall-clock time (s) for an answer of the control socket; a server under load is slow."""
+_LONGEST_NAP = 0.2
+"""Wall-clock time (s) that a sleep waits at once, so that an interruption is noticed soon."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class Endpoint(_Table):
+    """Where an instrument is served."""
+
+    port: str = Field(description="address for the client: /dev/pts/3, socket://HOST:PORT or tcp://HOST:PORT")
+    protocol: str = Field(description="what is spoken there")
+    devices: tuple[str, ...] = Field(description="devices of the rig file on it")
+
+
+class ServedRig(_Table):
+    """The instruments of one rig."""
+
+    rig: str = Field(description="name of the rig")
+    instruments: dict[str, Endpoint] = Field(description="endpoint by the name of the instrument")
+
+
+class Endpoints(_Table):
+    """What `bench emulate --json` writes; one rig stands at the top, several under `rigs`."""
+
+    factor: float = Field(gt=0, description="laboratory seconds per wall-clock second")
+    control: str = Field(description="address of the control socket: tcp://HOST:PORT or unix:PATH")
+    server: str = Field(description="by which server and file recognise each other")
+    rig: str | None = None
+    instruments: dict[str, Endpoint] | None = None
+    rigs: tuple[ServedRig, ...] = ()
+
+    @property
+    def served(self) -> dict[str, ServedRig]:
+        """The rigs by name."""
+        if self.rig is not None and self.instruments is not None:
+            return {self.rig: ServedRig(rig=self.rig, instruments=self.instruments)}
+        return {each.rig: each for each in self.rigs}
+
+
+def read_endpoints(path: Path) -> Endpoints:
+    """Read an endpoints file.
+
+    Raises ConfigurationError if it cannot be read, or is not one.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigurationError(f"{path} is not an endpoints file of `bench emulate --json`: {error}") from None
+    try:
+        return Endpoints.model_validate(content)
+    except ValidationError as error:
+        first = next(problems(error, Endpoints))
+        raise ConfigurationError(f"{path} is not an endpoints file of `bench emulate --json`: {first}") from None
+
+
+class ControlClient:
+    """A connection to the control socket of `bench emulate`; docs/reference/control-socket.md has the requests.
+
+    Parameters
+    ----------
+    address : str
+        `tcp://HOST:PORT` or `unix:PATH`.
+    rig : str, optional
+        Which rig is meant, where several are served.
+
+    Raises
+    ------
+    DeviceConnectionError
+        If nothing answers there.
+    """
+
+    def __init__(self, address: str, rig: str | None = None) -> None:
+        self._address = address
+        self._rig = {} if rig is None else {"rig": rig}
+        scheme, _, rest = address.partition(":")
+        try:
+            if scheme == "unix":
+                self._socket = socket.socket(socket.AF_UNIX)
+                self._socket.settimeout(_TIMEOUT)
+                self._socket.connect(rest)
+            else:
+                host, _, port = rest.removeprefix("//").rpartition(":")
+                self._socket = socket.create_connection((host.strip("[]"), int(port)), timeout=_TIMEOUT)
+                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except (OSError, ValueError) as error:
+            raise DeviceConnectionError(_NAME, f"nothing answers at {address}: {error}") from None
+        self._answers = self._socket.makefile("rb")
+
+    def request(self, do: str, **keys: Any) -> dict[str, Any]:  # noqa: ANN401 - anything that JSON can hold
+        """Send a request and return its answer.
+
+        Raises
+        ------
+        ConfigurationError
+            If the server refuses it.
+        DeviceConnectionError
+            If the server is gone.
+        """
+        try:
+            self._socket.sendall(json.dumps({"do": do, **keys}).encode() + b"\n")
+            line = self._answers.readline()
+            answer: dict[str, Any] = json.loads(line)
+        except (OSError, ValueError) as error:
+            raise DeviceConnectionError(_NAME, f"no longer answers at {self._address}: {error}") from None
+        if "error" in answer:
+            raise ConfigurationError(f"{_NAME}: {answer['error']}")
+        return answer
+
+    def time(self) -> float:
+        """Return the laboratory time, s."""
+        return float(self.request("time", **self._rig)["time"])
+
+    def state(self) -> dict[str, float | None]:
+        """Return the true state of plant and outputs by name; `request("state")` has the units as well."""
+        return {name: each["value"] for name, each in self.request("state", **self._rig)["values"].items()}
+
+    def advance(self, seconds: float) -> None:
+        """Let laboratory time pass at once, s; only on a clock xN."""
+        self.request("advance", seconds=seconds, **self._rig)
+
+    def wait(self, until: float) -> float:
+        """Wait until a laboratory time (s) has come; return the time then."""
+        return float(self.request("wait", until=until, **self._rig)["time"])
+
+    def fault(self, name: str, **values: float) -> None:
+        """Make a fault happen; `values` are what can be chosen of it."""
+        self.request("fault", fault=name, values=values, **self._rig)
+
+    def operate(self, task: str, value: float) -> None:
+        """Do by hand what a protocol's prompt asks for."""
+        self.request("operate", task=task, value=value, **self._rig)
+
+    def power_cycle(self, instrument: str) -> None:
+        """Switch an instrument off and on again."""
+        self.request("power-cycle", instrument=instrument, **self._rig)
+
+    def unplug(self, instrument: str) -> None:
+        """Pull the cable of an instrument: what is sent either way is lost."""
+        self.request("unplug", instrument=instrument, **self._rig)
+
+    def cut(self, instrument: str) -> None:
+        """Cut the line of an instrument in the middle of its next answer."""
+        self.request("cut", instrument=instrument, **self._rig)
+
+    def hang(self, instrument: str) -> None:
+        """Let an instrument answer nothing until `plug_in`, and late then."""
+        self.request("hang", instrument=instrument, **self._rig)
+
+    def plug_in(self, instrument: str) -> None:
+        """Undo `unplug`, `cut` and `hang`."""
+        self.request("plug-in", instrument=instrument, **self._rig)
+
+    def corrupt(self, instrument: str) -> None:
+        """Damage the next answer of an instrument."""
+        self.request("corrupt", instrument=instrument, **self._rig)
+
+    def drop(self, instrument: str) -> None:
+        """Lose the next answer of an instrument."""
+        self.request("drop", instrument=instrument, **self._rig)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._answers.close()
+        self._socket.close()
+
+
+class AttachedClock(Clock):
+    """The clock of a served laboratory, read and waited on by its control socket.
+
+    A sleep ends when the laboratory has come so far: a server that is slowed down by a busy machine slows its client
+    down as well. If the server is gone, time passes on as fast as it did, so that a run can still be ended.
+
+    Parameters
+    ----------
+    control : ControlClient
+        A connection of its own.
+    """
+
+    def __init__(self, control: ControlClient, rig: str) -> None:
+        super().__init__()
+        self._control = control
+        answer = control.request("time", rig=rig)
+        self.epoch = datetime.fromisoformat(answer["epoch"])
+        self.factor = float(answer["factor"])
+        self._last = float(answer["time"])
+        self._alone: tuple[float, ScaledClock] | None = None
+
+    def now(self) -> float:
+        """Return the laboratory time of the server, s."""
+        if self._alone is None:
+            try:
+                self._last = self._control.time()
+                return self._last
+            except DeviceConnectionError:
+                self._go_on_alone()
+        return self._time_alone()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait until the server's time is so much later, s; ends early when `interrupted`."""
+        end = self.now() + seconds
+        while (now := self._last) < end and not self.interrupted():
+            until = min(end, now + _LONGEST_NAP * self.factor)
+            if self._alone is None:
+                try:
+                    self._last = self._control.wait(until)
+                    continue
+                except DeviceConnectionError:
+                    self._go_on_alone()
+            self._alone_clock().sleep(until - now)
+            self._last = self._time_alone()
+
+    def _go_on_alone(self) -> None:
+        self._alone = (self._last, ScaledClock(self.factor))
+
+    def _alone_clock(self) -> ScaledClock:
+        assert self._alone is not None
+        return self._alone[1]
+
+    def _time_alone(self) -> float:
+        assert self._alone is not None
+        begin, clock = self._alone
+        return begin + clock.now()
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A rig file's way to a served laboratory; a `bench.rig_file.Laboratory`.
+
+    Attributes
+    ----------
+    clock : AttachedClock
+        The clock of the laboratory.
+    """
+
+    clock: AttachedClock
+    _control: ControlClient
+    _ports: Mapping[str, str]
+    _opened: ExitStack
+
+    def open(self) -> Mapping[str, str]:
+        """Return the port of each instrument by name."""
+        return self._ports
+
+    def operate(self, task: str, value: float) -> None:
+        """Do by hand what a protocol's prompt asks for.
+
+        Raises ConfigurationError if the laboratory cannot.
+        """
+        self._control.operate(task, value)
+
+    def close(self) -> None:
+        """Leave the laboratory; it goes on."""
+        self._opened.close()
+
+
+def attach(path: Path, rig: str) -> Attachment:
+    """Connect to the laboratory of a rig that is served.
+
+    Parameters
+    ----------
+    path : Path
+        Endpoints file of `bench emulate --json`.
+    rig : str
+        Name of the rig.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file is not one, serves other rigs, or its server is gone.
+    """
+    endpoints = read_endpoints(path)
+    if rig not in endpoints.served:
+        raise ConfigurationError(f"{path} serves {', '.join(endpoints.served) or 'no rig'}, not {rig}")
+    with ExitStack() as opened:
+        try:
+            controls = [ControlClient(endpoints.control, rig) for _ in range(2)]
+            for control in controls:
+                opened.callback(control.close)
+            server = controls[0].request("time", rig=rig)["server"]
+            clock = AttachedClock(controls[1], rig)
+        except (DeviceConnectionError, KeyError):
+            server = None
+        if server != endpoints.server:
+            raise ConfigurationError(
+                f"{path} is out of date: its server does not answer at {endpoints.control}; start bench emulate again"
+            )
+        ports = {name: endpoint.port for name, endpoint in endpoints.served[rig].instruments.items()}
+        return Attachment(clock, controls[0], ports, opened.pop_all())

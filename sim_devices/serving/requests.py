@@ -1,0 +1,177 @@
+"""What the control socket takes: each request is a line of JSON, and is parsed strictly.
+
+A request names itself under `do`; `docs/reference/control-socket.md` describes each.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bench.configuration_errors import problems
+from bench.errors import ConfigurationError
+
+_LONGEST_SKIP = 86_400.0
+_RIG = Field(default=None, description="which rig is meant, where several are served")
+_INSTRUMENT = Field(description="name of an instrument")
+
+
+class Request(BaseModel):
+    """Base of the requests; the docstring of each says what it does."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    name: ClassVar[str]
+
+
+class RigRequest(Request):
+    """Base of what is asked of one rig."""
+
+    rig: str | None = _RIG
+
+
+class LineRequest(RigRequest):
+    """Base of what happens to the line of an instrument."""
+
+    instrument: str = _INSTRUMENT
+
+
+class Help(Request):
+    """Say which requests there are, and the instruments and faults of each rig."""
+
+    name = "help"
+
+
+class State(RigRequest):
+    """Return the true state of plant and outputs."""
+
+    name = "state"
+
+
+class Time(RigRequest):
+    """Return laboratory time, clock, and the factor that it has reached."""
+
+    name = "time"
+
+
+class Wait(RigRequest):
+    """Answer when the laboratory time has come."""
+
+    name = "wait"
+    until: float = Field(description="laboratory time, s")
+
+
+class Advance(RigRequest):
+    """Let laboratory time pass at once, on a clock xN; the clients are not served meanwhile."""
+
+    name = "advance"
+    seconds: float = Field(ge=0.0, le=_LONGEST_SKIP, description="laboratory time that passes, s")
+
+
+class InjectFault(RigRequest):
+    """Make a fault happen, now."""
+
+    name = "fault"
+    fault: str = Field(description="name of a fault of the laboratory")
+    values: dict[str, float] = Field(default_factory=dict, description="what can be chosen of it, by name")
+
+
+class Operate(RigRequest):
+    """Do by hand what a protocol's prompt asks for, such as to hang a load on a muscle."""
+
+    name = "operate"
+    task: str = Field(description="task of the operator")
+    value: float = Field(description="its value, in the unit of the task")
+
+
+class PowerCycle(LineRequest):
+    """Switch an instrument off and on again."""
+
+    name = "power-cycle"
+
+
+class Unplug(LineRequest):
+    """Pull the cable: what is sent either way is lost, and the instrument keeps working."""
+
+    name = "unplug"
+
+
+class Cut(LineRequest):
+    """Cut the line in the middle of the next answer; TCP connections are reset, and new ones closed at once."""
+
+    name = "cut"
+
+
+class Hang(LineRequest):
+    """Serve nothing; what is asked meanwhile is answered late, when the line is plugged in again."""
+
+    name = "hang"
+
+
+class PlugIn(LineRequest):
+    """Undo unplug, cut and hang."""
+
+    name = "plug-in"
+
+
+class Corrupt(LineRequest):
+    """Damage the next answer; the instrument has acted all the same."""
+
+    name = "corrupt"
+
+
+class Drop(LineRequest):
+    """Lose the next answer; the instrument has acted all the same."""
+
+    name = "drop"
+
+
+class EndWithConnection(Request):
+    """Stop the server when this connection closes, so that it does not outlive the process that started it."""
+
+    name = "end-with-connection"
+
+
+class Stop(Request):
+    """Stop the server."""
+
+    name = "stop"
+
+
+REQUESTS: dict[str, type[Request]] = {
+    each.name: each
+    for each in (
+        Help, State, Time, Wait, Advance, InjectFault, Operate, PowerCycle, Unplug, Cut, Hang, PlugIn, Corrupt, Drop,
+        EndWithConnection, Stop,
+    )
+}  # fmt: skip
+
+
+def parse_request(line: bytes) -> Request:
+    """Return the request in a line.
+
+    Raises ConfigurationError if it is none: names what is wrong and what is allowed.
+    """
+    try:
+        content: Any = json.loads(line)
+    except ValueError as error:
+        raise ConfigurationError(f'not a line of JSON: {error}; expected such as {{"do": "help"}}') from None
+    if not isinstance(content, dict) or not isinstance(content.get("do"), str):
+        raise ConfigurationError(f'expected an object with a request, such as {{"do": "help"}}; {_known()}')
+    name = content.pop("do")
+    if name not in REQUESTS:
+        raise ConfigurationError(f"there is no request {name!r}; {_known()}")
+    try:
+        return REQUESTS[name].model_validate(content)
+    except ValidationError as error:
+        raise ConfigurationError(
+            "; ".join(f"{name}: {problem}" for problem in problems(error, REQUESTS[name]))
+        ) from None
+    except RecursionError:
+        raise ConfigurationError(f"{name}: nested too deeply") from None
+
+
+def _known() -> str:
+    return f"there are: {', '.join(REQUESTS)}"

@@ -1,0 +1,202 @@
+"""One served laboratory: its clock, its plant and the lines of its instruments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from bench.errors import ConfigurationError
+from bench.rig_file import RigFile
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue
+from sim_devices.serving.clock import LONGEST_STEP, ServedClock
+from sim_devices.serving.endpoints import HAS_PSEUDO_TERMINALS, Listener, PseudoTerminal
+from sim_devices.serving.instruments import ModbusTcpInstrument
+from sim_devices.serving.lines import Cable, Line, Watched
+from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import ModbusTcpServer
+
+_SCHEME = "emulated://"
+
+
+@dataclass(frozen=True)
+class Serving:
+    """How instruments are served.
+
+    Attributes
+    ----------
+    host : str
+        Address of this machine on which TCP ports listen.
+    tcp : bool
+        Whether serial instruments are on TCP ports as well, as raw bytes; always so where there are no
+        pseudo-terminals.
+    ports : mapping of str to int
+        TCP ports by `RIG.NAME` of an instrument; the system chooses the others.
+    baud_time : bool
+        Whether bytes on serial lines take the time of the line's speed.
+    """
+
+    host: str
+    tcp: bool
+    ports: Mapping[str, int]
+    baud_time: bool
+
+
+class ServedLaboratory:
+    """The laboratory of a rig and the lines that lead to its instruments.
+
+    Parameters
+    ----------
+    file : RigFile
+        The rig.
+    laboratory : EmulatedLaboratory
+        Its laboratory, on `clock`; nothing of it is open.
+    clock : ServedClock
+        Its clock.
+
+    Raises
+    ------
+    ConfigurationError
+        If a port is taken.
+    """
+
+    def __init__(self, file: RigFile, laboratory: EmulatedLaboratory, clock: ServedClock, serving: Serving) -> None:
+        self.name = file.name
+        self.laboratory = laboratory
+        self.clock = clock
+        self._devices = {
+            name: [entry.name for entry in file.devices if getattr(entry.settings, "port", "") == _SCHEME + name]
+            for name in laboratory.servers
+        }
+        speeds = {
+            getattr(entry.settings, "port", ""): float(speed)
+            for entry in file.devices
+            if (speed := getattr(entry.settings, "baudrate", None)) is not None
+        }
+        self.lines: dict[str, Line] = {}
+        self._protocols: dict[str, str] = {}
+        with ExitStack() as opened:
+            for name, server in laboratory.servers.items():
+                speed = speeds.get(_SCHEME + name, math.inf) if serving.baud_time else math.inf
+                self.lines[name] = self._open(name, server, speed, serving)
+                opened.callback(self.lines[name].close)
+            self._opened = opened.pop_all()
+
+    def warm_up(self) -> None:
+        """Let 0.1 s pass, so that everything compiled is loaded before the first client waits for an answer."""
+        self.skip(LONGEST_STEP)
+        self.truth()
+
+    def close(self) -> None:
+        """Close every line."""
+        self._opened.close()
+
+    def endpoints(self) -> dict[str, dict[str, Any]]:
+        """Return where each instrument is, by name: `port`, `protocol` and the `devices` of the rig on it."""
+        return {
+            name: {"port": line.address, "protocol": self._protocols[name], "devices": self._devices[name]}
+            for name, line in self.lines.items()
+        }
+
+    def serve(self, ready: Collection[Watched]) -> None:
+        """Bring clock and plant on, and serve each line once; never waits."""
+        self.clock.follow()
+        self._advance()
+        for line in self.lines.values():
+            line.serve(ready)
+
+    def skip(self, seconds: float) -> None:
+        """Let laboratory time pass without the wall clock, in steps, s."""
+        end = self.clock.paced + seconds
+        while (left := end - self.clock.paced) > LONGEST_STEP:
+            self.clock.skip(LONGEST_STEP)
+            self._advance()
+        self.clock.skip(max(left, 0.0))
+        self._advance()
+
+    def seconds_until_due(self) -> float:
+        """Return the wall-clock time (s) until something has to be done, or the clock should follow."""
+        due = min((line.next_due() for line in self.lines.values()), default=math.inf)
+        return max(min(due - self.clock.paced, 0.5 * LONGEST_STEP), 0.0) / self.clock.factor
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the true state at the clock's present time."""
+        self._advance()
+        return self.laboratory.truth()
+
+    def line(self, instrument: str) -> Line:
+        """Return the line of an instrument.
+
+        Raises ConfigurationError if there is no such instrument.
+        """
+        if instrument not in self.lines:
+            raise ConfigurationError(
+                f"rig {self.name} has no instrument {instrument!r}; it has: {', '.join(self.lines)}"
+            )
+        return self.lines[instrument]
+
+    def power_cycle(self, instrument: str) -> None:
+        """Switch an instrument off and on again.
+
+        Raises ConfigurationError if there is no such instrument, or it cannot be restarted.
+        """
+        line = self.line(instrument)
+        restart = getattr(self.laboratory.instruments.get(instrument), "power_cycle", None)
+        if restart is None:
+            able = [name for name, each in self.laboratory.instruments.items() if hasattr(each, "power_cycle")]
+            raise ConfigurationError(f"{instrument} cannot be restarted; these can: {', '.join(able) or 'none'}")
+        self._advance()
+        restart()
+        line.restart()
+
+    def corrupt_next_answer(self, instrument: str) -> None:
+        """Damage the next answer of an instrument, in the way of its protocol if it knows one."""
+        damage = getattr(self.laboratory.instruments.get(instrument), "corrupt_next_answer", None)
+        (damage or self.line(instrument).corrupt_next_answer)()
+
+    def drop_next_answer(self, instrument: str) -> None:
+        """Lose the next answer of an instrument; of an adapter only what comes from behind it."""
+        lose = getattr(self.laboratory.instruments.get(instrument), "drop_next_answer", None)
+        (lose or self.line(instrument).drop_next_answer)()
+
+    def mend(self, instrument: str) -> None:
+        """Make the line of an instrument whole."""
+        self.line(instrument).mend()
+
+    def break_off(self, instrument: str, cable: Cable) -> None:
+        """Bring the line of an instrument into another state."""
+        self.line(instrument).break_off(cable)
+
+    def _advance(self) -> None:
+        if self.laboratory.world is not None:
+            self.laboratory.world.advance()
+
+    def _open(self, name: str, server: WireServer | ModbusTcpServer, speed: float, serving: Serving) -> Line:
+        port = serving.ports.get(f"{self.name}.{name}")
+        reached = ModbusTcpInstrument(server._bank) if isinstance(server, ModbusTcpServer) else server
+        self._protocols[name] = reached.protocol if isinstance(reached, WireServer) else "Modbus TCP"
+        on_tcp = not isinstance(reached, WireServer) or serving.tcp or not HAS_PSEUDO_TERMINALS or port is not None
+        try:
+            end = Listener((serving.host, port or 0)) if on_tcp else PseudoTerminal()
+        except OSError as error:
+            where = f"port {port} of {serving.host}" if port else serving.host if on_tcp else "a pseudo-terminal"
+            raise ConfigurationError(f"{self.name}: {name} cannot be served at {where}: {error.strerror}") from None
+        return Line(name, reached, end, self.clock, speed)
+
+
+def one_of(laboratories: Sequence[ServedLaboratory], rig: str | None) -> ServedLaboratory:
+    """Return the laboratory of a rig, or the only one.
+
+    Raises ConfigurationError if there is no such rig, or none is named and there are several.
+    """
+    known = ", ".join(each.name for each in laboratories)
+    if rig is None:
+        if len(laboratories) > 1:
+            raise ConfigurationError(f"rig is missing; there are: {known}")
+        return laboratories[0]
+    for each in laboratories:
+        if each.name == rig:
+            return each
+    raise ConfigurationError(f"rig {rig!r} is not served; there are: {known}")

@@ -1,0 +1,59 @@
+"""The log of true values: a line of JSON each period of laboratory time, and at each change of an output."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bench.errors import ConfigurationError
+from sim_devices.serving.control import values_to_json
+from sim_devices.serving.served import ServedLaboratory
+
+
+class StateLog:
+    """Appends `{"rig": …, "time": …, "timestamp": …, "values": {NAME: {"value": …, "unit": …}}}` to a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is made, or continued.
+    period : float
+        Laboratory time between two lines of a rig, s; positive.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be opened.
+    """
+
+    def __init__(self, path: Path, period: float) -> None:
+        self._period = period
+        self._due: dict[str, float] = {}
+        self._outputs: dict[str, dict[str, float]] = {}
+        try:
+            # Line by line, so that who reads along sees each at once.
+            self._file = path.open("a", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise ConfigurationError(f"--state {path} cannot be opened: {error.strerror}") from None
+
+    def look_at(self, served: ServedLaboratory) -> None:
+        """Write a line if the period is over, or an output has changed since the last look."""
+        now, truth = served.clock.now(), served.truth()
+        outputs = {name: each.value for name, each in truth.items() if each.is_output}
+        due = self._due.get(served.name, now)
+        if now < due and outputs == self._outputs.get(served.name):
+            return
+        self._outputs[served.name] = outputs
+        if now >= due:
+            self._due[served.name] = max(due + self._period, now)
+        line = {
+            "rig": served.name,
+            "time": now,
+            "timestamp": served.clock.timestamp(),
+            "values": values_to_json(truth),
+        }
+        self._file.write(json.dumps(line, ensure_ascii=False) + "\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
