@@ -72,7 +72,6 @@ class Target:
     """One instrument of a laboratory, and how to talk to it."""
 
     laboratory: Callable[[Any, VirtualClock, int], Any]
-    attribute: str
     dialect: Any
     check_state: Callable[[Any], None]
     prepare: Callable[[Any, random.Random], None] = lambda *_: None
@@ -149,14 +148,14 @@ def make(laboratory):
 T7, SMA = ModbusTcp(T7_ADDRESSES, T7_ACTING), make(SMALaboratory)
 # By the rig and the port of the instrument in its laboratory.
 TARGETS = {
-    "vo2/tec": Target(make(VO2Laboratory), "tec", MeCom(), check_tec),
-    "vo2/psd": Target(make(VO2Laboratory), "t7", T7, check_t7),
-    "hybrid/tec": Target(make(HybridLaboratory), "tec", MeCom(), check_tec),
-    "hybrid/t7": Target(make(HybridLaboratory), "t7", T7, check_t7),
-    "sma/t7": Target(SMA, "t7", T7, check_t7, change_load),
-    "sma/supply": Target(SMA, "supply", SlcanCanopen(), check_supply, change_load),
-    "sma/load_cell": Target(SMA, "load_cell", ModbusRtu(DAD_ADDRESSES, DAD_ACTING), check_cell, change_load),
-    "sma/stage": Target(SMA, "servo", Dynamixel(), check_servo, change_load),
+    "vo2/tec": Target(make(VO2Laboratory), MeCom(), check_tec),
+    "vo2/psd": Target(make(VO2Laboratory), T7, check_t7),
+    "hybrid/tec": Target(make(HybridLaboratory), MeCom(), check_tec),
+    "hybrid/t7": Target(make(HybridLaboratory), T7, check_t7),
+    "sma/t7": Target(SMA, T7, check_t7, change_load),
+    "sma/supply": Target(SMA, SlcanCanopen(), check_supply, change_load),
+    "sma/load_cell": Target(SMA, ModbusRtu(DAD_ADDRESSES, DAD_ACTING), check_cell, change_load),
+    "sma/stage": Target(SMA, Dynamixel(), check_servo, change_load),
 }
 
 
@@ -248,7 +247,8 @@ def fuzz(name, frames, seed, advanced=lambda _: None):
     rng, outcome = random.Random(f"{name} {seed}"), Outcome()
     clock = VirtualClock()
     laboratory = target.laboratory(clock, seed)
-    instrument, port = getattr(laboratory, target.attribute), name.partition("/")[2]
+    port = name.partition("/")[2]
+    instrument = laboratory.instruments[port]
     server, of_server = connect(laboratory, port)
     recent = []
 
@@ -302,10 +302,10 @@ def fuzz(name, frames, seed, advanced=lambda _: None):
 
 def connect(laboratory, port):
     """Return what takes the bytes of a client, and the server if the line is a serial one."""
-    server = laboratory._servers[port]
+    server = laboratory.servers[port]
     if isinstance(server, WireServer):
         return server, server
-    return ModbusTcpStream(laboratory.t7), None
+    return ModbusTcpStream(laboratory.instruments[port]), None
 
 
 def main():

@@ -32,7 +32,7 @@ def test_the_same_seed_gives_the_same_bytes(name):
     ("rig", "laboratory"), [("vo2", make(VO2Laboratory)), ("hybrid", make(HybridLaboratory)), ("sma", SMA)]
 )
 def test_every_port_of_a_laboratory_is_fuzzed(rig, laboratory):
-    ports = laboratory(VirtualClock(), 0)._servers
+    ports = laboratory(VirtualClock(), 0).servers
     assert {f"{rig}/{port}" for port in ports} == {name for name in TARGETS if name.startswith(f"{rig}/")}
 
 
