@@ -21,7 +21,8 @@ class Served:
         self.process = process
         rigs = endpoints.get("rigs", [endpoints])
         self._ports = {rig["rig"]: {name: each["port"] for name, each in rig["instruments"].items()} for rig in rigs}
-        self._control = socket.create_connection(address(endpoints["control"]), timeout=PATIENCE)
+        self.control_address = address(endpoints["control"])
+        self._control = socket.create_connection(self.control_address, timeout=PATIENCE)
         self._answers = self._control.makefile("rb")
 
     def port(self, rig, instrument):

@@ -35,6 +35,9 @@ def word_32(rng):
 class Dialect(ABC):
     """One protocol."""
 
+    trials = 1
+    """How often a probe is sent."""
+
     @abstractmethod
     def request(self, rng):
         """Return a request that is whole and makes sense more often than not."""
@@ -209,6 +212,9 @@ class ModbusTcp(_Modbus):
 
 class ModbusRtu(_Modbus):
     """MODBUS over Serial Line V1.02."""
+
+    # Without the pauses of a line, a frame that lacks its last byte may be completed by the first one of the next.
+    trials = 2
 
     @staticmethod
     def _crc(frame):
