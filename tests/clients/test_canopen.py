@@ -11,13 +11,13 @@ NODE = 1
 
 
 @pytest.fixture
-def connect(served):
+def connect(sma):
     """Open the adapter once more; closed at the end of the test."""
     opened = []
 
     def connect():
         network = canopen.Network()
-        network.connect(interface="slcan", channel=served.port("sma", "supply"), bitrate=125_000, sleep_after_open=0)
+        network.connect(interface="slcan", channel=sma.port("supply"), bitrate=125_000, sleep_after_open=0)
         opened.append(network)
         node = network.add_node(NODE, canopen.ObjectDictionary())
         node.sdo.RESPONSE_TIMEOUT = PATIENCE
@@ -54,29 +54,29 @@ def test_heartbeats_come_at_their_interval(connect):
     assert instants[10] - instants[0] > 0.7
 
 
-def test_a_command_applies_a_voltage_and_the_current_heats(connect, served):
+def test_a_command_applies_a_voltage_and_the_current_heats(connect, sma):
     _, node = connect()
     command(node, 0)
-    cold = served.truth("sma", "muscle_temperature")
+    cold = sma.control.state()["muscle_temperature"]
     for _ in range(4):
         command(node, 300)
-        served.advance("sma", 1.0)
+        sma.control.advance(1.0)
     assert upload(node, 0x2102, 1, signed=True) == 300
-    assert upload(node, 0x2100, 1, signed=True) / 10 == pytest.approx(served.truth("sma", "supply_current"), abs=0.3)
-    assert served.truth("sma", "supply_voltage") == pytest.approx(3.0)
-    assert served.truth("sma", "muscle_temperature") > cold + 5.0
+    assert upload(node, 0x2100, 1, signed=True) / 10 == pytest.approx(sma.control.state()["supply_current"], abs=0.3)
+    assert sma.control.state()["supply_voltage"] == pytest.approx(3.0)
+    assert sma.control.state()["muscle_temperature"] > cold + 5.0
     command(node, 0)
-    assert served.truth("sma", "supply_voltage") == 0.0
+    assert sma.control.state()["supply_voltage"] == 0.0
 
 
-def test_silence_of_commands_trips_the_watchdog(connect, served):
+def test_silence_of_commands_trips_the_watchdog(connect, sma):
     _, node = connect()
     command(node, 200)
     # Queries do not feed it; 5 s are set.
     for _ in range(7):
-        served.advance("sma", 1.0)
+        sma.control.advance(1.0)
         upload(node, 0x210D, 2)
-    assert served.truth("sma", "supply_voltage") == 0.0
+    assert sma.control.state()["supply_voltage"] == 0.0
     command(node, 0)
 
 
@@ -92,7 +92,7 @@ def test_an_abort_is_raised(connect):
     assert refused.value.code == 0x0602_0000
 
 
-def test_network_management_and_the_boot_up_after_a_restart(connect, served):
+def test_network_management_and_the_boot_up_after_a_restart(connect, sma):
     network, node = connect()
     node.nmt.state = "PRE-OPERATIONAL"
     watch = Stopwatch()
@@ -100,7 +100,7 @@ def test_network_management_and_the_boot_up_after_a_restart(connect, served):
         assert watch.seconds() < PATIENCE
     boots = []
     network.subscribe(0x700 + NODE, lambda _, data, __: boots.append(data[0]))
-    served.control("power-cycle", "sma", instrument="supply")
+    sma.control.power_cycle("supply")
     while 0 not in boots:
         assert watch.seconds() < PATIENCE
         WallClock().sleep(0.01)

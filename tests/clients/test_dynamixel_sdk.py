@@ -21,7 +21,7 @@ def sdk():
 
 
 @pytest.fixture
-def connect(sdk, served):
+def connect(sdk, sma):
     """Open the line of the servo once more; closed at the end of the test."""
 
     class PatientPort(sdk.PortHandler):
@@ -33,7 +33,7 @@ def connect(sdk, served):
     opened = []
 
     def connect():
-        port = PatientPort(served.port("sma", "stage"))
+        port = PatientPort(sma.port("stage"))
         assert port.setBaudRate(57_600)
         opened.append(port)
         return Servo(sdk.PacketHandler(2.0), port)
@@ -63,19 +63,19 @@ class Servo:
         assert (result, error) == (0, 0), self.handler.getTxRxResult(result)
 
 
-def test_the_goal_position_moves_the_shaft(connect, served):
+def test_the_goal_position_moves_the_shaft(connect, sma):
     servo = connect()
     model, result, error = servo.handler.ping(servo.port, 1)
     assert (model, result, error) == (30, 0, 0)
     servo.write(TORQUE_ENABLE, 1, 1)
-    assert served.truth("sma", "stage_torque") == 1.0
+    assert sma.control.state()["stage_torque"] == 1.0
     for goal in (2000, 2400):
         servo.write(GOAL_POSITION, goal)
-        served.advance("sma", 5.0)
+        sma.control.advance(5.0)
         assert servo.read(PRESENT_POSITION) == pytest.approx(goal, abs=2)
-        assert served.truth("sma", "stage_angle") == pytest.approx(goal * COUNT, abs=2 * COUNT)
+        assert sma.control.state()["stage_angle"] == pytest.approx(goal * COUNT, abs=2 * COUNT)
     servo.write(TORQUE_ENABLE, 0, 1)
-    assert served.truth("sma", "stage_torque") == 0.0
+    assert sma.control.state()["stage_torque"] == 0.0
 
 
 def test_a_slow_profile_takes_the_wall_clock_of_the_server(connect):
@@ -119,9 +119,9 @@ def test_errors_of_the_servo_arrive(connect):
     assert (result, error) == (0, 6)
 
 
-def test_a_restarted_servo_has_lost_its_volatile_settings(connect, served):
+def test_a_restarted_servo_has_lost_its_volatile_settings(connect, sma):
     servo = connect()
     servo.write(PROFILE_VELOCITY, 50)
     assert servo.handler.reboot(servo.port, 1) == (0, 0)
-    served.advance("sma", 1.0)
+    sma.control.advance(1.0)
     assert servo.read(PROFILE_VELOCITY) == 0

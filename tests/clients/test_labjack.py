@@ -17,9 +17,9 @@ TEST_ANSWER = bytes.fromhex("0000 0000 0007 01 03 04 00112233")
 
 
 @pytest.fixture
-def place(served):
+def place(sma):
     """Host and port."""
-    return address(served.port("sma", "t7"))
+    return address(sma.port("t7"))
 
 
 @pytest.fixture
@@ -47,21 +47,21 @@ def test_an_output_reads_back(client):
     assert real(client, DAC0) == 2.5
 
 
-def test_a_digital_line_switches_the_fan(client, served):
+def test_a_digital_line_switches_the_fan(client, sma):
     for level in (1, 0):
         assert not client.write_register(FIO0, level, device_id=1).isError()
-        assert served.truth("sma", "fan") == level
+        assert sma.control.state()["fan"] == level
 
 
-def test_an_input_follows_the_wire(client, served):
-    served.control("operate", "sma", task="load", value=1.0)
-    served.advance("sma", 10.0)
+def test_an_input_follows_the_wire(client, sma):
+    sma.control.operate("load", 1.0)
+    sma.control.advance(10.0)
     shares, positions = [], []
     for newtons in (1.0, 9.0):
-        served.control("operate", "sma", task="load", value=newtons)
-        served.advance("sma", 10.0)
+        sma.control.operate("load", newtons)
+        sma.control.advance(10.0)
         shares.append(real(client, AIN0) / real(client, AIN0 + 2))
-        positions.append(served.truth("sma", "position"))
+        positions.append(sma.control.state()["position"])
     # 0.5 to 4.5 V of 5 V over a stroke of 35 mm.
     assert (shares[1] - shares[0]) / 0.8 * 35e-3 == pytest.approx(positions[1] - positions[0], abs=2e-4)
     assert positions[1] - positions[0] > 2e-4
@@ -110,22 +110,6 @@ def test_mbpoll_writes(place, client):
     assert real(client, DAC0) == 1.25
 
 
-def test_the_third_connection_is_refused_and_the_first_two_go_on(place):
-    with socket.create_connection(place, PATIENCE) as first, socket.create_connection(place, PATIENCE) as second:
-        for connection in (first, second):
-            assert exchange(connection, TEST_REQUEST, 13) == TEST_ANSWER
-        try:
-            # It is reset at once, which the client sees in any of these calls.
-            with socket.create_connection(place, PATIENCE) as third:
-                third.sendall(TEST_REQUEST)
-                refused = third.recv(100) == b""
-        except ConnectionError:
-            refused = True
-        assert refused
-        for connection in (first, second):
-            assert exchange(connection, TEST_REQUEST, 13) == TEST_ANSWER
-
-
 def test_a_place_is_free_again_after_a_disconnection_in_mid_frame(place):
     for _ in range(5):
         with socket.create_connection(place, PATIENCE) as first, socket.create_connection(place, PATIENCE) as second:
@@ -141,45 +125,3 @@ def test_a_connection_that_is_reset_leaves_its_place(place):
         connection.close()
     with socket.create_connection(place, PATIENCE) as connection:
         assert exchange(connection, TEST_REQUEST, 13) == TEST_ANSWER
-
-
-def test_several_requests_in_one_segment(place):
-    requests = [struct.pack(">H", number) + TEST_REQUEST[2:] for number in range(40)]
-    answers = b"".join(struct.pack(">H", number) + TEST_ANSWER[2:] for number in range(40))
-    with socket.create_connection(place, PATIENCE) as connection:
-        assert exchange(connection, b"".join(requests), len(answers)) == answers
-
-
-def test_byte_by_byte(place):
-    with socket.create_connection(place, PATIENCE) as connection:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for byte in TEST_REQUEST[:-1]:
-            connection.sendall(bytes((byte,)))
-        assert exchange(connection, TEST_REQUEST[-1:], 13) == TEST_ANSWER
-
-
-def test_what_is_no_modbus_ends_the_connection_only(place):
-    with socket.create_connection(place, PATIENCE) as other:
-        for garbage in (b"GET / HTTP/1.1\r\n\r\n", bytes(300), b"\xff" * 5000):
-            with socket.create_connection(place, PATIENCE) as connection:
-                try:
-                    connection.sendall(garbage)
-                    ended = connection.recv(100) == b""
-                except ConnectionError:
-                    ended = True
-                assert ended
-            assert exchange(other, TEST_REQUEST, 13) == TEST_ANSWER
-
-
-def test_who_does_not_read_its_answers_does_not_stop_the_others(place):
-    with socket.create_connection(place, PATIENCE) as flood, socket.create_connection(place, PATIENCE) as other:
-        flood.setblocking(False)
-        sent = 0
-        try:
-            while sent < 50_000_000:
-                sent += flood.send(TEST_REQUEST * 1000)
-        except BlockingIOError:
-            pass
-        assert sent < 50_000_000
-        for _ in range(20):
-            assert exchange(other, TEST_REQUEST, 13) == TEST_ANSWER

@@ -18,24 +18,23 @@ LINES = {
 
 
 @pytest.fixture(params=LINES, ids="/".join)
-def line(request, served):
+def line(request):
     """The line of an instrument."""
-    return Line(served, *request.param)
+    rig, instrument = request.param
+    return Line(request.getfixturevalue(rig), instrument, LINES[rig, instrument])
 
 
 class Line:
     """A line that can be opened several times, and the request of its protocol that is always answered."""
 
-    def __init__(self, served, rig, instrument):
-        self.served = served
+    def __init__(self, rig, instrument, dialect):
         self.rig = rig
         self.instrument = instrument
-        self.dialect = LINES[rig, instrument]
+        self.dialect = dialect
         self.rng = random.Random(0)
 
     def open(self):
-        path = self.served.port(self.rig, self.instrument)
-        return serial.Serial(path, 57_600, timeout=0.05, write_timeout=PATIENCE)
+        return serial.Serial(self.rig.port(self.instrument), 57_600, timeout=0.05, write_timeout=PATIENCE)
 
     def expect_answer(self, port, send=lambda port, data: port.write(data)):
         """Check that a request is answered, once or, where garbage was before it, when it is repeated."""
@@ -111,7 +110,7 @@ def test_a_flood_that_nobody_reads_the_answers_of(line):
         for _ in range(20):
             port.write(request * 100)
     # Others are served all the same, and this one too, once somebody reads.
-    assert line.served.control("time", line.rig)["time"] > 0.0
+    assert line.rig.control.time() > 0.0
     with line.open() as port:
         line.expect_answer(port)
 
@@ -120,9 +119,9 @@ def test_an_unplugged_line_is_silent_and_comes_back(line):
     request, _ = line.dialect.probe(line.rng)
     with line.open() as port:
         line.expect_answer(port)
-        line.served.control("unplug", line.rig, instrument=line.instrument)
+        line.rig.control.unplug(line.instrument)
         port.reset_input_buffer()
         port.write(request)
         assert port.read(1) == b""
-        line.served.control("plug-in", line.rig, instrument=line.instrument)
+        line.rig.control.plug_in(line.instrument)
         line.expect_answer(port)

@@ -14,18 +14,18 @@ SET_TARE, RESET_TARE = 8, 4
 
 
 @pytest.fixture
-def port(served):
-    return served.port("sma", "load_cell")
+def port(sma):
+    return sma.port("load_cell")
 
 
 @pytest.fixture
-def hang(served):
+def hang(sma):
     """Hang a load (N) on the wire, and let it come to rest."""
 
     def hang(newtons):
-        served.control("operate", "sma", task="load", value=newtons)
-        served.advance("sma", 10.0)
-        assert served.truth("sma", "force") == pytest.approx(newtons, abs=1e-3)
+        sma.control.operate("load", newtons)
+        sma.control.advance(10.0)
+        assert sma.control.state()["force"] == pytest.approx(newtons, abs=1e-3)
 
     return hang
 

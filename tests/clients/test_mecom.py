@@ -19,12 +19,12 @@ VECTORS = (
 
 
 @pytest.fixture
-def connect(served):
+def connect(vo2):
     """Open the line of the controller once more; closed at the end of the test."""
     opened = []
 
     def connect(address=1):
-        opened.append(MeComClient(served.port("vo2", "tec"), address))
+        opened.append(MeComClient(vo2.port("tec"), address))
         return opened[-1]
 
     yield connect
@@ -33,13 +33,13 @@ def connect(served):
 
 
 @pytest.fixture
-def tec(connect, served):
+def tec(connect, vo2):
     """The controller, off and without an error, at the beginning and at the end."""
     client = connect()
 
     def switch_off():
         client.reset()
-        served.advance("vo2", 1.0)
+        vo2.control.advance(1.0)
         client.set_integer(LIVE_ENABLE, 0)
         client.set_integer(ENABLE, 0)
         assert client.integer(STATUS) == READY
@@ -61,35 +61,35 @@ def test_identity_and_type(tec):
     assert tec.integer(STATUS) == READY
 
 
-def test_a_live_current_flows_and_heats(tec, served):
+def test_a_live_current_flows_and_heats(tec, vo2):
     tec.set_integer(INPUT, 1)
-    before = served.truth("vo2", "plate_temperature")
+    before = vo2.control.state()["plate_temperature"]
     for amperes in (1.0, -0.5):
         tec.set_real(LIVE_CURRENT, amperes)
         tec.set_integer(ENABLE, 2)
         tec.set_integer(LIVE_ENABLE, 1)
-        served.advance("vo2", 2.0)
+        vo2.control.advance(2.0)
         assert tec.integer(STATUS) == RUN
         assert tec.real(CURRENT) == pytest.approx(amperes, abs=2e-3)
-        assert served.truth("vo2", "tec_current") == pytest.approx(amperes, abs=1e-6)
+        assert vo2.control.state()["tec_current"] == pytest.approx(amperes, abs=1e-6)
         if amperes > 0:
-            assert served.truth("vo2", "plate_temperature") > before + 0.5
+            assert vo2.control.state()["plate_temperature"] > before + 0.5
     tec.set_integer(LIVE_ENABLE, 0)
-    assert served.truth("vo2", "tec_output") == 0.0
-    served.advance("vo2", 1.0)
-    assert served.truth("vo2", "tec_current") == 0.0
+    assert vo2.control.state()["tec_output"] == 0.0
+    vo2.control.advance(1.0)
+    assert vo2.control.state()["tec_current"] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_the_temperature_goes_to_its_target(tec, served):
+def test_the_temperature_goes_to_its_target(tec, vo2):
     tec.set_integer(INPUT, 2)
     tec.set_real(TARGET, 31.5)
     tec.set_integer(ENABLE, 1)
-    served.advance("vo2", 200.0)
+    vo2.control.advance(200.0)
     assert tec.real(OBJECT) == pytest.approx(31.5, abs=0.05)
-    assert served.truth("vo2", "plate_temperature") == pytest.approx(31.5, abs=0.05)
+    assert vo2.control.state()["plate_temperature"] == pytest.approx(31.5, abs=0.05)
 
 
-def test_each_reading_is_one_of_its_own(tec, connect, served):
+def test_each_reading_is_one_of_its_own(tec, connect, vo2):
     """Four hosts, one after the other, begin with the same sequence number while the plate heats."""
     tec.set_integer(INPUT, 1)
     tec.set_real(LIVE_CURRENT, 1.0)
@@ -97,7 +97,7 @@ def test_each_reading_is_one_of_its_own(tec, connect, served):
     tec.set_integer(LIVE_ENABLE, 1)
     readings = []
     for _ in range(4):
-        served.advance("vo2", 1.0)
+        vo2.control.advance(1.0)
         other = connect()
         readings.append(other.real(OBJECT))
         other.close()
@@ -123,11 +123,11 @@ def test_limits(tec):
     assert tec.limits(INPUT, "i") == (0, 2)
 
 
-def test_the_emergency_stop_is_an_error_that_a_reset_clears(tec, served):
+def test_the_emergency_stop_is_an_error_that_a_reset_clears(tec, vo2):
     tec.emergency_stop()
     assert (tec.integer(STATUS), tec.integer(ERROR_NUMBER)) == (ERROR, 11)
     tec.reset()
-    served.advance("vo2", 1.0)
+    vo2.control.advance(1.0)
     assert (tec.integer(STATUS), tec.integer(ERROR_NUMBER)) == (READY, 0)
 
 
@@ -158,9 +158,9 @@ def test_a_cut_line_is_opened_again_after_half_a_frame(connect):
     assert connect().integer(100) == 1091
 
 
-def test_a_lost_answer_is_asked_for_again(tec, served):
+def test_a_lost_answer_is_asked_for_again(tec, vo2):
     tec.line.timeout = 2.0
-    served.control("drop", "vo2", instrument="tec")
+    vo2.control.drop("tec")
     assert tec.integer(100) == 1091
-    served.control("corrupt", "vo2", instrument="tec")
+    vo2.control.corrupt("tec")
     assert tec.integer(100) == 1091
