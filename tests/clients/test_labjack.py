@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import shutil
 import socket
 import struct
 
@@ -93,7 +92,6 @@ def test_asyncio_reads_at_the_same_time(place):
 
 @needs_mbpoll
 def test_mbpoll_reads(place):
-    assert shutil.which("mbpoll")
     code, output = mbpoll(
         "-m", "tcp", "-p", place[1], "-0", "-r", TEST, "-t", "4:hex", "-c", 2, "-1", "-o", 10, place[0]
     )

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from dialects import Dynamixel, MeCom, ModbusRtu, ModbusTcp, SlcanCanopen, reads, writes
+from dialects import Dynamixel, MalformedError, MeCom, ModbusRtu, ModbusTcp, SlcanCanopen, reads, writes
 
 from bench.clock import VirtualClock
 from rigs.hybrid.laboratory import HybridLaboratory
