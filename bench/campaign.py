@@ -16,8 +16,10 @@ from rich.table import Table
 
 from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
+from bench.extras import MissingExtraError
 from bench.journal import Record
 from bench.protocol import find_protocol
+from bench.results.figures import check_matplotlib
 from bench.results.report import export_run
 from bench.results.tracking import TargetResults, target_results
 from bench.runs import Run, RunResult, carry_out
@@ -193,16 +195,21 @@ def reproduce(
     Raises
     ------
     ConfigurationError
-        If a rig is given to a study that runs on several.
+        If a rig is given to a study that runs on several, or matplotlib is not installed.
     BenchError
         If a run did not complete; its record is kept.
     """
     if rig is not None and study.rig is None:
         raise ConfigurationError(f"--rig {rig}: the study {name} runs on several rigs of its own")
+    check_matplotlib()
     stopwatch = Stopwatch()
     campaign = Campaign(rig or study.rig or "", out / f"reproduce-{name}-seed-{seed}", seed, live, console)
     found = study.carry_out(campaign)
-    recordings = [export_run(run.folder, "rrd", None)[0] for run in campaign.runs]
+    try:
+        recordings = [export_run(run.folder, "rrd", None)[0] for run in campaign.runs]
+    except MissingExtraError as error:
+        console.print(f"no recordings: {error}", highlight=False, markup=False, soft_wrap=True)
+        recordings = []
     values = {
         "seed": seed,
         **found.values,
@@ -239,6 +246,7 @@ def _print_end(values: Mapping[str, Any], console: Console) -> None:
     console.print(f"runs, models and recordings: {values['folder']}", highlight=False, soft_wrap=True)
     for folder in dict.fromkeys(str(Path(path).parent) for path in values["figures"]):
         console.print(f"figures: {folder}", highlight=False, soft_wrap=True)
-    console.print("open a recording with `rerun FILE`:", highlight=False)
+    if values["recordings"]:
+        console.print("open a recording with `rerun FILE`:", highlight=False)
     for path in values["recordings"]:
         console.print(f"  {path}", highlight=False, soft_wrap=True)

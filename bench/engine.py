@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from bench.control.estimators import DriftEstimator, agility_for, preload
+from bench.control.estimators import DriftEstimator, agility_for
 from bench.control.tracking import Command, Trace
 from bench.devices import Actuator, Status
 from bench.errors import (
@@ -546,8 +546,6 @@ def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan
     """
     rig.check_needs(definition.name, definition.names)
     rig.check_needs(definition.name, sorted(expected.watched))
-    if expected.watched:
-        preload()
     for device, (low, high) in expected.extremes.items():
         if device not in rig.actuators:
             raise ConfigurationError(

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -24,6 +24,7 @@ from bench.clock import Stopwatch, make_clock, wall_time
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
+from bench.extras import MissingExtraError, needed_for
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
@@ -31,9 +32,12 @@ from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.terminal import ProgressDisplay, ask_operator
 
+if TYPE_CHECKING:
+    from bench.dashboard import Dashboard
+
 RECORDING_NAME = "run.rrd"
 RIG_FILE_NAME = "rig.toml"
-_PACKAGES = ("actuator-bench", "filterpy", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
+_PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
     Raises
     ------
     ConfigurationError
-        If anything is wrong before the start; nothing has moved.
+        If anything is wrong before the start, or there is no library for the live view; nothing has moved.
     DeviceError
         If a device cannot be connected; nothing has moved.
     """
@@ -124,6 +128,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
+    dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     with ExitStack() as stack:
         rig = Rig(rig_file, clock, run.seed)
@@ -145,12 +150,9 @@ def carry_out(run: Run, console: Console) -> RunResult:
         stack.callback(journal.close)
         observers: list[Any] = []
         dashboard = None
-        if run.live or run.recording:
-            # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
-            from bench.dashboard import Dashboard
-
+        if dashboard_class is not None:
             path = folder / RECORDING_NAME if run.recording else None
-            dashboard = stack.enter_context(Dashboard(signals, meta, path=path, live=run.live))
+            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
             observers.append(dashboard)
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
@@ -164,6 +166,25 @@ def carry_out(run: Run, console: Console) -> RunResult:
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
+    """Import the dashboard if the run needs it, and say so if it is not installed.
+
+    Raises MissingExtraError only for a live view: without a recording the journal has everything.
+    """
+    if not (run.live or run.recording):
+        return None
+    try:
+        # Rerun takes half a second to import; those who neither watch nor record do not pay for it.
+        with needed_for("the live view" if run.live else "an .rrd file", "dashboard"):
+            from bench.dashboard import Dashboard
+    except MissingExtraError as error:
+        if run.live:
+            raise
+        console.print(f"no recording: {error}", highlight=False, markup=False, soft_wrap=True)
+        return None
+    return Dashboard
 
 
 def trace_signals(protocol: ProtocolDefinition, rig: Rig, slots: Slots) -> tuple[Signal, ...]:

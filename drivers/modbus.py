@@ -1,9 +1,17 @@
-"""Shared by the drivers of Modbus instruments: names of exceptions, and values in 16-bit registers."""
+"""Shared by the drivers of Modbus instruments: a client of few calls, names of exceptions, values in registers.
+
+`ModbusClient` is what a driver needs of a client. On `emulated://` addresses it is one of ours (`TcpClient`,
+`RtuClient`), which costs microseconds; on real lines it is pymodbus behind the same calls.
+
+Sources: MODBUS Application Protocol Specification V1.1b3; MODBUS Messaging on TCP/IP V1.0b, 3.1; MODBUS over Serial
+Line V1.02, 2.5.1 and 6.2.2; LabJack, Direct Modbus TCP, Protocol Details, for function 76.
+"""
 
 from __future__ import annotations
 
 import logging
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,6 +30,197 @@ _EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target does not respond",
 }
+
+
+EMULATED = "emulated://"
+"""Scheme of an instrument in this process."""
+
+READ, WRITE_ONE, WRITE, FEEDBACK = 3, 6, 16, 76
+"""Functions: read holding registers, write one, write several, and LabJack's own for both in one packet."""
+
+_READ = struct.Struct(">BHH")  # function, address, number of registers
+_WRITE = struct.Struct(">BHHB")  # the same, and number of bytes
+_MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
+_TRANSACTIONS = 0x10000
+_REFUSED = 0x80
+
+
+class RefusedError(Exception):
+    """The instrument refuses a request.
+
+    Parameters
+    ----------
+    code : int
+        Modbus exception code.
+    """
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"Modbus exception {code}")
+        self.code = code
+
+
+def read_request(address: int, count: int) -> bytes:
+    """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
+    return _READ.pack(READ, address, count)
+
+
+class ModbusClient(ABC):
+    """The connection to one Modbus instrument; one request at a time.
+
+    Values are bytes, high byte and high word first. Every request raises `RefusedError` if the instrument refuses,
+    and `OSError` if it does not answer, its answer belongs to no question, or the line is lost.
+    """
+
+    def read(self, address: int, count: int) -> bytes:
+        """Return the values of `count` registers from `address` on, two bytes each."""
+        reply = self.request(read_request(address, count), 2 + 2 * count)
+        if reply[1] != 2 * count:
+            raise OSError(f"the answer has {reply[1]} bytes of values where {2 * count} were asked for")
+        return reply[2:]
+
+    def write(self, address: int, data: bytes) -> None:
+        """Set registers from `address` on, two bytes each."""
+        request = _WRITE.pack(WRITE, address, len(data) // 2, len(data)) + data
+        self._check_echo(self.request(request, _READ.size), request)
+
+    def write_one(self, address: int, value: int) -> None:
+        """Set one register to a value from 0 to 65535."""
+        request = _READ.pack(WRITE_ONE, address, value)
+        self._check_echo(self.request(request, _READ.size), request)
+
+    def feedback(self, frames: bytes, expected: int) -> bytes:
+        """Carry out frames of LabJack's function 76 in one request; return what those that read give, in bytes."""
+        return self.request(bytes((FEEDBACK,)) + frames, 1 + expected)[1:]
+
+    @abstractmethod
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the line; may be called again."""
+
+    @property
+    @abstractmethod
+    def is_open(self) -> bool:
+        """Whether the line can be used."""
+
+    @staticmethod
+    def _check_echo(reply: bytes, request: bytes) -> None:
+        if reply != request[: _READ.size]:
+            raise OSError(f"the answer {reply.hex(' ')} is none to the request {request.hex(' ')}")
+
+
+class _PortClient(ModbusClient):
+    """A client of ours on a port of pyserial."""
+
+    def __init__(self, port: Any) -> None:  # noqa: ANN401 - pyserial is untyped
+        self._port = port
+
+    def close(self) -> None:
+        """Release the line; may be called again."""
+        self._port.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the line can be used."""
+        try:
+            return bool(self._port.is_open and self._port.in_waiting >= 0)
+        except OSError:
+            return False
+
+    def _receive(self, received: bytes, size: int) -> bytes:
+        """Return what was received up to `size` bytes, after what is missing has been waited for."""
+        if len(received) < size:
+            received += self._port.read(size - len(received))
+            if len(received) < size:
+                raise TimeoutError(f"{len(received)} bytes where {size} were expected")
+        return received
+
+
+class TcpClient(_PortClient):
+    """Modbus TCP over a port of pyserial, for `emulated://` addresses.
+
+    Parameters
+    ----------
+    port : serial.SerialBase
+        The open port.
+    unit : int
+        Unit identifier, 0 to 255.
+    """
+
+    def __init__(self, port: Any, unit: int = 1) -> None:  # noqa: ANN401 - pyserial is untyped
+        super().__init__(port)
+        self._unit = unit
+        self._transaction = 0
+
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
+        transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
+        self._port.write(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
+        # What has come already, as it has in process; the shortest reply is a refusal, a function and a code.
+        reply = self._receive(self._port.read_all(), _MBAP.size + min(expected, 2))
+        answered, protocol, length, unit = _MBAP.unpack_from(reply)
+        function = reply[_MBAP.size]
+        if answered != transaction or protocol != 0 or unit != self._unit or function & ~_REFUSED != request[0]:
+            raise OSError(f"the answer {reply.hex(' ')} belongs to another request")
+        if function & _REFUSED:
+            raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
+        if length != expected + 1:
+            raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
+        return self._receive(reply, _MBAP.size + expected)[_MBAP.size :]
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+        table.append(value)
+    return tuple(table)
+
+
+_CRC = _crc_table()
+
+
+def crc16(data: bytes) -> bytes:
+    """Return the CRC of a Modbus RTU frame as it follows on the line, low byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
+    return crc.to_bytes(2, "little")
+
+
+class RtuClient(_PortClient):
+    """Modbus RTU over a port of pyserial, for `emulated://` addresses, on which no echo and no noise comes.
+
+    Parameters
+    ----------
+    port : serial.SerialBase
+        The open port.
+    unit : int
+        Address of the instrument, 1 to 247.
+    """
+
+    def __init__(self, port: Any, unit: int) -> None:  # noqa: ANN401 - pyserial is untyped
+        super().__init__(port)
+        self._unit = unit
+
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
+        frame = bytes((self._unit,)) + request
+        self._port.write(frame + crc16(frame))
+        reply = self._receive(self._port.read_all(), 5)  # a refusal: address, function, code, CRC
+        refused = reply[1] == request[0] | _REFUSED
+        if not refused:
+            reply = self._receive(reply, expected + 3)
+        if crc16(reply[:-2]) != reply[-2:]:
+            raise OSError(f"the answer {reply.hex(' ')} has a wrong checksum")
+        if reply[0] != self._unit or reply[1] & ~_REFUSED != request[0]:
+            raise OSError(f"the answer {reply.hex(' ')} belongs to another request")
+        if refused:
+            raise RefusedError(reply[2])
+        return reply[1:-2]
 
 
 def exception_text(code: int, doing: str) -> str:

@@ -14,7 +14,7 @@ from bench.clock import Clock
 from bench.errors import ConfigurationError
 from sim_devices import protocol_emulated
 from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 T = TypeVar("T")
@@ -66,7 +66,7 @@ class EmulatedLaboratory:
     title : str
         Its name in messages.
     servers : mapping of str to server
-        The instruments by the name of their port: serial ones, and those on TCP.
+        The instruments by the name of their port: the wire servers of serial ones, and those on TCP.
 
     Attributes
     ----------
@@ -82,34 +82,24 @@ class EmulatedLaboratory:
     instruments: Mapping[str, object] = MappingProxyType({})
     faults: Mapping[str, Fault] = MappingProxyType({})
 
-    def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpServer], clock: Clock) -> None:
+    def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpInstrument], clock: Clock) -> None:
         self._title = title
         self._servers = servers
         self._clock = clock
         self._opened = ExitStack()
 
-    def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name.
-
-        Raises `ValueError` if another laboratory of this process has the same ports open; it keeps them.
-        """
-        ports = {}
-        with ExitStack() as opened:
-            for name, server in self._servers.items():
-                if isinstance(server, ModbusTcpServer):
-                    server.start()
-                    opened.callback(server.close)
-                    ports[name] = server.address
-                else:
-                    ports[name] = protocol_emulated.register(name, server, self._clock)
-                    opened.callback(protocol_emulated.unregister, name)
-            self._opened = opened.pop_all()
-        return ports
-
     @property
-    def servers(self) -> Mapping[str, WireServer | ModbusTcpServer]:
-        """The instruments by the name of their port."""
-        return self._servers
+    def servers(self) -> Mapping[str, WireServer | ModbusTcpInstrument]:
+        """The instruments by the name of their port, to be served elsewhere."""
+        return MappingProxyType(self._servers)
+
+    def open(self) -> Mapping[str, str]:
+        """Switch the instruments on; return the address of each by name, its own in this process."""
+        ports = {}
+        for name, server in self._servers.items():
+            ports[name] = protocol_emulated.register(name, server, self._clock)
+            self._opened.callback(protocol_emulated.unregister, ports[name])
+        return ports
 
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of the plant and of the outputs as they are, by name; the world stands at the present."""

@@ -1,22 +1,38 @@
-"""The `emulated://NAME` address: a serial port whose other end is an emulated instrument in this process.
+"""The `emulated://NAME` address: a serial port or a TCP connection to an emulated instrument in this process.
 
 pyserial finds this module by its name once `install` has been called, so that every client that opens its line with
 `serial.serial_for_url` (our drivers, pymodbus, python-can) reaches the emulator unchanged. There are no threads and
-no sleeps: a write is answered before it returns, a read that would wait advances the clock by its timeout, and each
-byte takes the time of its baud rate on the clock.
+no sleeps: a write is answered before it returns, a read that would wait advances the clock by its timeout, or until
+the instrument next sends something by itself. On a serial line each byte takes the time of its baud rate on the
+clock; a connection of an instrument on TCP (`sim_devices.wire.modbus_tcp`) takes none.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException
 
 from bench.clock import Clock
 from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpStream
 
 _SCHEME = "emulated://"
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
-_servers: dict[str, tuple[WireServer, Clock]] = {}
+
+
+@dataclass(eq=False)
+class _Socket:
+    """The place of an instrument at its address."""
+
+    server: WireServer | ModbusTcpInstrument
+    clock: Clock
+    taken: bool = True
+
+
+_sockets: dict[str, _Socket] = {}
 
 
 def install() -> None:
@@ -26,21 +42,25 @@ def install() -> None:
         serial.protocol_handler_packages.append(package)
 
 
-def register(name: str, server: WireServer, clock: Clock) -> str:
-    """Put an emulated instrument at `emulated://NAME` and return that address.
+def register(name: str, server: WireServer | ModbusTcpInstrument, clock: Clock) -> str:
+    """Put an emulated instrument at an address of its own in this process, and return the address.
 
-    Raises `ValueError` if the name is taken.
+    It is `emulated://NAME`, or `emulated://NAME-2` and so on while other instruments of that name are there.
     """
-    if name in _servers:
-        raise ValueError(f"name: {_SCHEME}{name} is taken by another emulated instrument of this process")
     install()
-    _servers[name] = (server, clock)
-    return f"{_SCHEME}{name}"
+    number, free = 1, name
+    while free in _sockets:
+        number += 1
+        free = f"{name}-{number}"
+    _sockets[free] = _Socket(server, clock)
+    return f"{_SCHEME}{free}"
 
 
-def unregister(name: str) -> None:
+def unregister(address: str) -> None:
     """Take an instrument off its address; ports that are open to it go dead, as if it were unplugged."""
-    _servers.pop(name, None)
+    socket = _sockets.pop(address.removeprefix(_SCHEME), None)
+    if socket is not None:
+        socket.taken = False
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
@@ -56,82 +76,144 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     def open(self) -> None:
         """Connect to the instrument.
 
-        Raises `serial.SerialException` if the port is open already, or no emulated instrument has this name.
+        Raises `serial.SerialException` if the port is open already, no emulated instrument has this name, or an
+        instrument on TCP refuses one more connection.
         """
         if self.is_open:
             raise SerialException("Port is already open.")
-        name = str(self.portstr).removeprefix(_SCHEME)
-        if name not in _servers:
-            known = ", ".join(_SCHEME + other for other in sorted(_servers)) or "none"
-            raise SerialException(f"no emulated instrument at {_SCHEME}{name}; there are: {known}")
-        self._name = name
+        self._name = str(self.portstr).removeprefix(_SCHEME)
+        if self._name not in _sockets:
+            known = ", ".join(_SCHEME + other for other in sorted(_sockets)) or "none"
+            raise SerialException(f"no emulated instrument at {_SCHEME}{self._name}; there are: {known}")
         self._received = bytearray()
+        self._plug_in()
         self.is_open = True
+
+    def _plug_in(self) -> None:
+        socket = _sockets[self._name]
+        stream: WireServer | ModbusTcpStream
+        if isinstance(socket.server, ModbusTcpInstrument):
+            try:
+                stream = socket.server.connect()
+            except ConnectionRefusedError as refusal:
+                raise SerialException(f"{_SCHEME}{self._name}: {refusal}") from None
+        else:
+            stream = socket.server
+        self._socket, self._stream = socket, stream
+        self._receive = stream.receive
+        self._line = None if isinstance(stream, ModbusTcpStream) else stream
+        self._clock = socket.clock
 
     def close(self) -> None:
         """Disconnect."""
+        if self.is_open and isinstance(self._stream, ModbusTcpStream):
+            self._stream.close()
         self.is_open = False
 
     @property
     def in_waiting(self) -> int:
         """Number of bytes that can be read at once."""
-        self._clock_of_open_port()
+        self._check()
+        self._hear()
         return len(self._received)
 
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes; fewer only after the timeout has passed on the clock.
 
-        Raises `serial.SerialException` if bytes are missing and there is no timeout: a real port would wait for ever.
+        Raises `serial.SerialException` if bytes are missing, there is no timeout, and the instrument will send
+        nothing by itself: a real port would wait for ever.
         """
-        clock = self._clock_of_open_port()
-        if len(self._received) < size and self._timeout is None:
-            raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
-        if len(self._received) < size and self._timeout:
-            # Nothing can arrive unasked, so all that waiting brings is that the time is gone.
-            clock.sleep(self._timeout)
-        data = bytes(self._received[:size])
-        del self._received[:size]
+        self._check()
+        received = self._received
+        if self._line is not None or len(received) < size:
+            self._wait_for(size)
+        data = bytes(received[:size])
+        del received[:size]
         return data
+
+    def read_all(self) -> bytes:
+        """Return what was received; nothing is waited for."""
+        if not self.is_open or not self._socket.taken:
+            self._check()
+        self._hear()
+        data = bytes(self._received)
+        self._received.clear()
+        return data
+
+    def _wait_for(self, size: int) -> None:
+        """Let time pass until so many bytes are there, at most the timeout."""
+        self._hear()
+        if self._timeout == 0:
+            return
+        end = math.inf if self._timeout is None else self._clock.now() + self._timeout
+        while len(self._received) < size:
+            instant = end if self._line is None else min(end, self._line.next_unsolicited())
+            if instant == math.inf:
+                raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
+            self._clock.sleep_until(instant)
+            self._hear()
+            if instant == end or self._clock.now() < instant:
+                return
+
+    def _hear(self) -> None:
+        if self._line is not None:
+            self._received += self._line.unsolicited()
 
     def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
         """Return what was received up to `expected`, or `size` bytes; what there is after the timeout on the clock.
 
         pyserial's own reads byte by byte and watches the wall clock, by which nothing emulated may fail.
         """
-        self._clock_of_open_port()
+        self._check()
+        self._hear()
         end = self._received.find(expected)
         found = len(self._received) + 1 if end < 0 else end + len(expected)
         return self.read(found if size is None else min(found, size))
 
     def write(self, data: bytes, /) -> int:
-        """Send bytes; the answer is ready for `read` when this returns."""
-        clock = self._clock_of_open_port()
+        """Send bytes; the answer is ready for `read` when this returns.
+
+        Raises `serial.SerialException` if an instrument on TCP ends the connection over them.
+        """
+        if not self.is_open or not self._socket.taken:
+            self._check()
         sent = bytes(data)
-        clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
-        answer = _servers[self._name][0].receive(sent)
-        clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
+        if self._line is None:
+            try:
+                self._received += self._receive(sent)
+            except (FramingError, ConnectionError) as error:
+                raise SerialException(f"{_SCHEME}{self._name} ended the connection: {error}") from None
+            return len(sent)
+        self._clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
+        self._hear()
+        answer = self._receive(sent)
+        self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
 
     def flush(self) -> None:
         """Do nothing: what was written has arrived."""
-        self._clock_of_open_port()
+        self._check()
 
     def reset_input_buffer(self) -> None:
         """Forget what was received and not read."""
-        self._clock_of_open_port()
+        self._check()
+        self._hear()
         self._received.clear()
 
     def reset_output_buffer(self) -> None:
         """Do nothing: what was written has arrived."""
-        self._clock_of_open_port()
+        self._check()
 
-    def _clock_of_open_port(self) -> Clock:
+    def _check(self) -> None:
         if not self.is_open:
             raise PortNotOpenError
-        if self._name not in _servers:
+        if self._socket.taken:
+            return
+        if self._name not in _sockets or self._line is None:
             raise SerialException(f"{_SCHEME}{self._name} was unplugged")
-        return _servers[self._name][1]
+        # A serial line that is plugged in again goes on; a connection does not.
+        self._plug_in()
 
     # Line settings and modem lines: accepted, and without meaning here.
     def _reconfigure_port(self, force_update: bool = False) -> None:

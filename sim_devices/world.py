@@ -95,7 +95,9 @@ class World:
                 break
             self._advance_plant(max(due, self._time))
             first.expire()
-        self._advance_plant(target)
+        if target > self._time:
+            self._plant.advance(target - self._time)
+            self._time = target
 
     def _advance_plant(self, instant: float) -> None:
         if instant > self._time:

@@ -6,11 +6,23 @@ import select
 import subprocess
 import threading
 from contextlib import contextmanager
+from itertools import chain, groupby
 from pathlib import Path
 
 import pytest
 
 from bench.cli import main
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Spread the whole studies over the tests: one that came last would leave all workers but its own idle."""
+    studies = [item for item in items if getattr(item, "originalname", "") == "test_campaign"]
+    modules = [list(group) for _, group in groupby((i for i in items if i not in studies), lambda i: i.path)]
+    # Between two modules, so that the fixtures of a module are made once.
+    for place, study in reversed(list(enumerate(studies))):
+        modules.insert(place * len(modules) // len(studies), [study])
+    items[:] = chain.from_iterable(modules)
 
 
 @contextmanager

@@ -25,6 +25,14 @@ ContinueMemory = Annotated[
 ]
 
 
+def _check_figures(folder: Path | None) -> None:
+    """Check before any computing that figures can be drawn, if they are asked for."""
+    if folder is not None:
+        from bench.results.figures import check_matplotlib
+
+        check_matplotlib()
+
+
 @app.command("identify")
 def identify_(
     file: DataArgument,
@@ -81,6 +89,7 @@ def identify_(
     """
     from bench.results.models import certificate_lines, identify_file
 
+    _check_figures(figures)
     found = identify_file(
         file,
         input_column=input_column,
@@ -186,6 +195,7 @@ def compare_(
     """
     from bench.results.models import compare_models
 
+    _check_figures(figures)
     result = compare_models(models, data, input_column, output_column, skip=skip)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")

@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 
 import numpy as np
-
-
-def preload() -> None:
-    """Import what a `DriftEstimator` needs, so that making one later takes no time.
-
-    That import takes half a second and more, which only those who settle until steady shall pay, and not while
-    a device is on and its watchdog waits for the next word.
-    """
-    importlib.import_module("filterpy.kalman")
 
 
 def agility_for(*, drift: float, noise: float, period: float) -> float:
@@ -65,17 +55,14 @@ class DriftEstimator:
     -----
     A Kalman filter with the state (value, drift) and white acceleration of spectral density `agility`²
     (Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001,
-    section 6.2.2), carried out by filterpy.
+    section 6.2.2).
     """
 
     def __init__(self, *, noise: float, agility: float) -> None:
         if not (0 < noise < math.inf and 0 < agility < math.inf):
             raise ValueError(f"noise, agility: expected positive numbers, got {noise} and {agility}")
-        from filterpy.kalman import KalmanFilter
-
-        self._filter = KalmanFilter(dim_x=2, dim_z=1)
-        self._filter.H = np.array([[1.0, 0.0]])
-        self._filter.R = np.array([[noise**2]])
+        self._state = np.zeros(2)
+        self._covariance = np.eye(2)
         self._noise = noise
         self._agility = agility
         self._time: float | None = None
@@ -101,30 +88,43 @@ class DriftEstimator:
         if not math.isfinite(t):
             raise ValueError(f"t: expected a finite number, got {t}")
         if self._time is None:
-            self._filter.x = np.array([value, 0.0])
+            self._state = np.array([value, 0.0])
             # Nothing is known of the drift; the first reading fixes the value.
-            self._filter.P = np.diag([self._noise**2, (1e6 * max(self._noise, self._agility)) ** 2])
+            self._covariance = np.diag([self._noise**2, (1e6 * max(self._noise, self._agility)) ** 2])
         else:
             dt = t - self._time
             if dt < 0:
                 raise ValueError(f"t: expected a time not before {self._time}, got {t}")
-            self._filter.F = np.array([[1.0, dt], [0.0, 1.0]])
-            density = self._agility**2
-            self._filter.Q = density * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-            self._filter.predict()
-            self._filter.update(np.array([value]))
+            self._predict(dt)
+            self._correct(value)
         self._time = t
         self._readings += 1
+
+    def _predict(self, dt: float) -> None:
+        transition = np.array([[1.0, dt], [0.0, 1.0]])
+        walk = self._agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        self._state = np.dot(transition, self._state)
+        self._covariance = np.dot(np.dot(transition, self._covariance), transition.T) + walk
+
+    def _correct(self, value: float) -> None:
+        variance = self._noise**2
+        # Only the value is read, so its column of the covariance is all that the reading sees.
+        column = self._covariance[:, 0]
+        gain = column * (1.0 / (column[0] + variance))
+        self._state = self._state + gain * (value - self._state[0])
+        # Joseph's form, which stays symmetric and positive.
+        kept = np.array([[1.0 - gain[0], 0.0], [-gain[1], 1.0]])
+        self._covariance = np.dot(np.dot(kept, self._covariance), kept.T) + np.outer(gain * variance, gain)
 
     @property
     def drift(self) -> float:
         """The estimated drift, in units/s; nan before two readings."""
-        return float(self._filter.x[1]) if self._readings >= 2 else math.nan
+        return float(self._state[1]) if self._readings >= 2 else math.nan
 
     @property
     def uncertainty(self) -> float:
         """Standard deviation of the estimated drift, in units/s; infinite before two readings."""
-        return math.sqrt(float(self._filter.P[1, 1])) if self._readings >= 2 else math.inf
+        return math.sqrt(float(self._covariance[1, 1])) if self._readings >= 2 else math.inf
 
     def is_steady(self, limit: float) -> bool:
         """Return whether drift and uncertainty together are within `limit` (units/s)."""
@@ -152,7 +152,7 @@ class DisturbanceEstimator:
 
     Notes
     -----
-    A Kalman filter of a random walk, carried out by filterpy: P⁻ = P + q, K = P⁻ / (P⁻ + r),
+    A Kalman filter of a random walk: P⁻ = P + q, K = P⁻ / (P⁻ + r),
     d += K (z - d), P = (1 - K) P⁻, with the steady state P⁻ = (q + √(q² + 4 q r)) / 2 (Bar-Shalom, Li,
     Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001). Where a
     controller takes the estimate away from its next target, and the true local gain is g times the
@@ -170,17 +170,9 @@ class DisturbanceEstimator:
         first = 1e9 * (walk_variance + reading_variance) if initial_variance is None else initial_variance
         if not 0 < first < math.inf:
             raise ValueError(f"initial_variance: expected a positive number, got {initial_variance}")
-        # Half a second of import that only those who estimate shall pay.
-        from filterpy.kalman import KalmanFilter
-
-        self._filter = KalmanFilter(dim_x=1, dim_z=1)
-        self._filter.x = np.zeros(1)
-        self._filter.F = np.eye(1)
-        self._filter.H = np.eye(1)
-        self._filter.Q = np.array([[walk_variance]])
-        self._filter.R = np.array([[reading_variance]])
-        self._filter.P = np.array([[first]])
-        self._first = first
+        self._value = 0.0
+        self._variance = self._first = first
+        self._walk, self._noise = walk_variance, reading_variance
 
     def update(self, value: float | None) -> float:
         """Take in one measured disturbance and return the estimate.
@@ -196,37 +188,40 @@ class DisturbanceEstimator:
         ValueError
             If the value is not finite.
         """
-        # filterpy would take a nan silently and never recover.
+        # A nan would stay in the estimate for ever.
         if value is not None and not math.isfinite(value):
             raise ValueError(f"value: expected a finite number or None, got {value}")
-        self._filter.predict()
-        self._filter.update(None if value is None else np.array([value]))
-        return self.value
+        self._variance += self._walk
+        if value is not None:
+            gain = self._variance * (1.0 / (self._variance + self._noise))
+            self._value += gain * (value - self._value)
+            # Joseph's form of (1 - K) P⁻, which stays positive.
+            self._variance = (1.0 - gain) * self._variance * (1.0 - gain) + gain * self._noise * gain
+        return self._value
 
     def reset(self) -> None:
         """Forget everything."""
-        self._filter.x = np.zeros(1)
-        self._filter.P = np.array([[self._first]])
+        self._value, self._variance = 0.0, self._first
 
     @property
     def value(self) -> float:
         """The estimated disturbance, output units; 0 before the first reading."""
-        return float(self._filter.x[0])
+        return self._value
 
     @property
     def uncertainty(self) -> float:
         """Standard deviation of the estimate, output units."""
-        return math.sqrt(float(self._filter.P[0, 0]))
+        return math.sqrt(self._variance)
 
     @property
     def gain(self) -> float:
         """The part K, 0 to 1, that the next value will have in the estimate."""
-        predicted = float(self._filter.P[0, 0] + self._filter.Q[0, 0])
-        return predicted / (predicted + float(self._filter.R[0, 0]))
+        predicted = self._variance + self._walk
+        return predicted / (predicted + self._noise)
 
     @property
     def steady_gain(self) -> float:
         """The gain K that many readings lead to."""
-        q, r = float(self._filter.Q[0, 0]), float(self._filter.R[0, 0])
+        q, r = self._walk, self._noise
         predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
         return predicted / (predicted + r)

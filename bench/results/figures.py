@@ -10,20 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 
-mpl.use("Agg")
-
-from matplotlib.figure import Figure
-
+from bench.extras import needed_for
 from bench.hysteresis import Density, MemoryCurve
 from bench.hysteresis.density import density_unit
 from bench.units import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Floats = npt.NDArray[np.float64]
 
@@ -43,9 +40,22 @@ _MARKED = 200
 """Most samples of a curve that are marked one by one."""
 
 
+def check_matplotlib() -> None:
+    """Import matplotlib, which takes half a second the first time.
+
+    Raises MissingExtraError if it is not installed.
+    """
+    with needed_for("a figure", "report"):
+        import matplotlib.figure  # noqa: F401
+
+
 @contextmanager
 def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and save it."""
+    check_matplotlib()
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
     with mpl.rc_context({**_STYLE, "axes.grid": grid}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure

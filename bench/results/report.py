@@ -14,12 +14,20 @@ from rich.table import Table as Columns
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
+from bench.extras import needed_for
 from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table, run_card
 from bench.model_file import ModelFile, parse_model
 from bench.results.data import write_csv
-from bench.results.figures import plot_coverage, plot_densities, plot_errors, plot_loops, plot_signals
+from bench.results.figures import (
+    check_matplotlib,
+    plot_coverage,
+    plot_densities,
+    plot_errors,
+    plot_loops,
+    plot_signals,
+)
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
@@ -44,7 +52,10 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
     ------
     DataError
         If the run or a model cannot be read.
+    MissingExtraError
+        If matplotlib is not installed.
     """
+    check_matplotlib()
     with Record(run) as record:
         folder = _make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
@@ -84,12 +95,13 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
     DataError
         If the run cannot be read or a file cannot be written.
     ConfigurationError
-        If the format is unknown, or a recording exists already.
+        If the format is unknown, a recording exists already, or a library that the format needs is not installed.
     """
     with Record(run) as record:
         folder = _make_folder(out or record.path.parent)
         if format_ == "rrd":
-            from bench.dashboard import rebuild
+            with needed_for("an .rrd file", "dashboard"):
+                from bench.dashboard import rebuild
 
             path = folder / RECORDING_NAME
             if path.exists():
@@ -122,7 +134,8 @@ def draw_comparison(result: ComparedModels, out: Path) -> Path:
 
 
 def _picture(record: Record, folder: Path) -> Path:
-    from bench.dashboard import picture, rebuild
+    with needed_for("a picture of the dashboard", "dashboard"):
+        from bench.dashboard import picture, rebuild
 
     path = folder / "dashboard.png"
     with tempfile.TemporaryDirectory() as scratch:
@@ -291,8 +304,9 @@ def _headers(record: Record, table: Table) -> list[str]:
 
 def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
     # Takes a fifth of a second to import.
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    with needed_for("a parquet file", "report"):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
 
     try:
         pq.write_table(pa.table(dict(zip(header, table.columns.values(), strict=True))), path)

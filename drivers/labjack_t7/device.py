@@ -1,4 +1,4 @@
-"""The base of all devices on a LabJack T7: the address of the instrument, and a connection of their own."""
+"""The base of all devices on a LabJack T7: the address of the instrument, and the connection that they share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class T7ConnectionSettings(DriverSettings):
     """Where a T7 is; every device on one extends it."""
 
     port: str = Field(
-        description="address as tcp://HOST:PORT, such as tcp://192.168.1.207:502; HOST alone means port 502"
+        description="address as tcp://HOST:PORT, such as tcp://192.168.1.207:502, HOST alone for port 502, or "
+        "emulated://NAME"
     )
     timeout: float = Field(default=1.0, ge=0.05, le=60.0, description="longest wait for a reply in s, 0.05 to 60")
 
@@ -29,7 +30,7 @@ class T7ConnectionSettings(DriverSettings):
     @classmethod
     def _check_port(cls, value: str) -> str:
         if value.startswith("emulated://"):
-            return value  # the rig replaces it by the loopback address of its emulated laboratory
+            return value
         match = _HOST.fullmatch(value.strip())
         number = int(match["port"] or DEFAULT_PORT) if match else 0
         if match is None or not 1 <= number <= 65535:
@@ -43,7 +44,8 @@ T7SettingsT = TypeVar("T7SettingsT", bound=T7ConnectionSettings)
 class T7Device(LineDevice[T7SettingsT, LabJackT7]):
     """A device on a LabJack T7.
 
-    Several may share one instrument, each with a connection of its own; they are set up one after the other.
+    Several may share one instrument, and share the connection to it then (`drivers.modbus_tcp`); they are
+    set up one after the other. A connection that breaks ends for all of them: each has to connect again.
     `connect` raises `DeviceConnectionError` also if the words or bytes of a value arrive in swapped order.
     """
 

@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
+from bench.clock import Clock
 from bench.errors import DeviceError
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
@@ -32,7 +33,9 @@ from drivers.labjack_t7.registers import (
     AIN_SETTLING_US,
     STREAM_RESOLUTION_INDEX,
     STREAM_SETTLING_US,
+    LabJackT7,
     Register,
+    Span,
 )
 
 CHANNELS = 14
@@ -91,14 +94,6 @@ class T7InputSettings(T7ConnectionSettings):
         return self
 
 
-class _Voltage(NamedTuple):
-    """One input over a burst, in V."""
-
-    mean: float
-    maximum: float
-    minimum: float
-
-
 InputSettingsT = TypeVar("InputSettingsT", bound=T7InputSettings)
 
 
@@ -113,6 +108,14 @@ class T7InputDevice(T7Device[InputSettingsT]):
     The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one instrument:
     give sensors on the same one the same `resolution_index` and `settling_us`.
     """
+
+    def __init__(self, name: str, settings: InputSettingsT, clock: Clock, line: LabJackT7) -> None:
+        super().__init__(name, settings, clock, line)
+        self._limit = RAIL * settings.range
+        self._conversions = _spans(AIN, settings.channels)
+        self._means = _spans(AIN_EF_READ_AVERAGE, settings.channels)
+        self._maxima = _spans(AIN_EF_READ_MAXIMUM, settings.channels)
+        self._minima = _spans(AIN_EF_READ_MINIMUM, settings.channels)
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
@@ -136,45 +139,67 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def glance(self) -> dict[str, float]:
         """Measure every signal by one conversion of each input; raises what `measure` does."""
-        return self._values(*self._convert())
+        if len(self._conversions) > 1:
+            return self._values(*self._convert())
+        # As above, but many thousand times a second.
+        voltages = self._line.read_span(self._conversions[0])
+        limit = self._limit
+        for volts in voltages:
+            if not -limit < volts < limit:
+                raise self._invalid(voltages)
+        return self._values(*voltages)
 
     @abstractmethod
     def _values(self, *volts: float) -> dict[str, float]: ...
 
-    def _average(self) -> list[float]:
+    def _average(self) -> Sequence[float]:
         """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
         if self._settings.samples == 1:
             return self._convert()
-        means = self._read(AIN_EF_READ_AVERAGE)  # this one starts the burst and waits for its end
-        maxima = self._read(AIN_EF_READ_MAXIMUM)
-        minima = self._read(AIN_EF_READ_MINIMUM)
-        return self._checked([_Voltage(*each) for each in zip(means, maxima, minima, strict=True)])
+        means = self._read(self._means)  # this one starts the burst and waits for its end
+        maxima = self._read(self._maxima)
+        minima = self._read(self._minima)
+        for extremes in (maxima, minima):
+            self._check(extremes)
+        return self._check(means)
 
-    def _convert(self) -> list[float]:
+    def _convert(self) -> Sequence[float]:
         """Get one conversion of each input in V."""
-        return self._checked([_Voltage(volts, volts, volts) for volts in self._read(AIN)])
+        return self._check(self._read(self._conversions))
 
-    def _read(self, register: Register) -> list[float]:
-        """Get the value of a register for every input, in one request where they are neighbours."""
-        channels = self._settings.channels
-        if channels == tuple(range(channels[0], channels[0] + len(channels))):
-            return self._line.read(register.of(channels[0]), len(channels))
-        return [self._line.read(register.of(channel))[0] for channel in channels]
+    def _read(self, spans: Sequence[Span]) -> Sequence[float]:
+        if len(spans) == 1:
+            return self._line.read_span(spans[0])
+        return [value for span in spans for value in self._line.read_span(span)]
 
-    def _checked(self, voltages: Sequence[_Voltage]) -> list[float]:
-        for channel, voltage in zip(self._settings.channels, voltages, strict=True):
-            if not all(map(math.isfinite, voltage)) or _MISSED_SAMPLE in voltage:
-                raise DeviceError(
+    def _check(self, voltages: Sequence[float]) -> Sequence[float]:
+        """Return one voltage for each input; raise `DeviceError` for one that is not valid or over the range."""
+        limit = self._limit
+        for volts in voltages:
+            if not -limit < volts < limit:
+                raise self._invalid(voltages)
+        return voltages
+
+    def _invalid(self, voltages: Sequence[float]) -> DeviceError:
+        limit = self._settings.range
+        for channel, volts in zip(self._settings.channels, voltages, strict=True):
+            if not math.isfinite(volts) or volts == _MISSED_SAMPLE:
+                return DeviceError(
                     self.name,
                     f"AIN{channel} gave no valid conversion; choose a lower `sample_rate` or `resolution_index`",
                 )
-            limit = self._settings.range
-            extreme = max(voltage, key=abs)
-            if abs(extreme) >= RAIL * limit:
-                larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
-                raise DeviceError(
-                    self.name,
-                    f"AIN{channel} reads {extreme:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
-                    "what is measured back into it",
-                )
-        return [voltage.mean for voltage in voltages]
+            if abs(volts) >= self._limit:
+                break
+        larger = "choose a larger `range`, or " if limit < _LARGEST_RANGE else ""
+        return DeviceError(
+            self.name,
+            f"AIN{channel} reads {volts:.4g} V and is over its range of ±{limit:g} V; {larger}bring "
+            "what is measured back into it",
+        )
+
+
+def _spans(register: Register, channels: Sequence[int]) -> tuple[Span, ...]:
+    """Return what to read for every input: one span where they are neighbours."""
+    if tuple(channels) == tuple(range(channels[0], channels[0] + len(channels))):
+        return (Span.of(register.of(channels[0]), len(channels)),)
+    return tuple(Span.of(register.of(channel)) for channel in channels)

@@ -11,10 +11,12 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from bench.clock import Clock
 from bench.errors import DeviceError
 from bench.roles import PositionSensor
 from drivers.device import Slope
 from drivers.labjack_t7.inputs import T7InputDevice, T7InputSettings
+from drivers.labjack_t7.registers import LabJackT7
 
 _USABLE = 0.95  # share of a detector's length that limits may use
 _READOUTS = {"voltage": 1, "currents": 2, "ratiometric": 2}  # inputs that each takes
@@ -105,6 +107,10 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
 
     Settings: ClassVar[type[T7PositionSettings]] = T7PositionSettings
 
+    def __init__(self, name: str, settings: T7PositionSettings, clock: Clock, line: LabJackT7) -> None:
+        super().__init__(name, settings, clock, line)
+        self._signal = f"{name}_position"
+
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
 
@@ -116,10 +122,14 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
             position = self._from_currents(*volts)
         else:
             position = self._from_ratio(*volts)
-        text = f"position {position:.6g} m is outside of its calibrated range"
-        advice = "bring the actuator back or extend the calibration and `position_limits`"
-        self._check_range(text, position, settings.position_limits, "m", advice)
-        return {f"{self.name}_position": position}
+        low, high = settings.position_limits
+        if not low <= position <= high:
+            raise DeviceError(
+                self.name,
+                f"position {position:.6g} m is outside of its calibrated range {low:g} to {high:g} m; bring the "
+                "actuator back or extend the calibration and `position_limits`",
+            )
+        return {self._signal: position}
 
     def _from_currents(self, first: float, second: float) -> float:
         settings = self._settings

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
-
-from pymodbus.client import ModbusTcpClient
-from pymodbus.exceptions import ModbusException
-from pymodbus.pdu import ModbusPDU
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.modbus import exception_text, pack, swapped, unpack
+from drivers.modbus import RefusedError, exception_text, read_request, swapped
+from drivers.modbus_tcp import share
+
+Kind = Literal["F32", "U32", "U16"]
+Access = Literal["R", "W", "RW"]
+
+_FORMS = {"F32": "f", "U32": "I", "U16": "H"}
 
 
 class Register(NamedTuple):
@@ -30,52 +32,81 @@ class Register(NamedTuple):
     """Name in the map, with # for the number of a channel."""
     address: int
     """Modbus address."""
-    form: str
-    """Type of its value by its letter in `struct`: f FLOAT32, I UINT32, H UINT16."""
+    kind: Kind
+    """Type of its value."""
+    access: Access
+    """Whether it can be read, written, or both."""
+
+    @property
+    def form(self) -> str:
+        """Letter of its type in `struct`."""
+        return _FORMS[self.kind]
 
     def of(self, channel: int) -> Register:
         """Return the register of a channel."""
         words = struct.calcsize(f">{self.form}") // 2
-        return Register(self.name.replace("#", str(channel)), self.address + words * channel, self.form)
+        return self._replace(name=self.name.replace("#", str(channel)), address=self.address + words * channel)
 
 
-AIN = Register("AIN#", 0, "f")
-DAC = Register("DAC#", 1000, "f")
-DIO = Register("DIO#", 2000, "H")
-DIO_STATE = Register("DIO_STATE", 2800, "I")
-DIO_DIRECTION = Register("DIO_DIRECTION", 2850, "I")
-STREAM_SETTLING_US = Register("STREAM_SETTLING_US", 4008, "f")
-STREAM_RESOLUTION_INDEX = Register("STREAM_RESOLUTION_INDEX", 4010, "I")
-AIN_EF_READ_AVERAGE = Register("AIN#_EF_READ_A", 7000, "f")
-AIN_EF_READ_MAXIMUM = Register("AIN#_EF_READ_B", 7300, "f")
-AIN_EF_READ_MINIMUM = Register("AIN#_EF_READ_C", 7600, "f")
-AIN_EF_INDEX = Register("AIN#_EF_INDEX", 9000, "I")
-AIN_EF_SAMPLES = Register("AIN#_EF_CONFIG_A", 9300, "I")
-AIN_EF_SCAN_RATE = Register("AIN#_EF_CONFIG_D", 10200, "f")
-TDAC = Register("TDAC#", 30000, "f")
-AIN_RANGE = Register("AIN#_RANGE", 40000, "f")
-AIN_NEGATIVE_CH = Register("AIN#_NEGATIVE_CH", 41000, "H")
-AIN_RESOLUTION_INDEX = Register("AIN#_RESOLUTION_INDEX", 41500, "H")
-AIN_SETTLING_US = Register("AIN#_SETTLING_US", 42000, "f")
-LAST_ERR_DETAIL = Register("LAST_ERR_DETAIL", 55000, "H")
-TEST = Register("TEST", 55100, "I")
-TEST_FLOAT32 = Register("TEST_FLOAT32", 55124, "f")
-PRODUCT_ID = Register("PRODUCT_ID", 60000, "f")
-FIRMWARE_VERSION = Register("FIRMWARE_VERSION", 60004, "f")
-SERIAL_NUMBER = Register("SERIAL_NUMBER", 60028, "I")
-WATCHDOG_ENABLE = Register("WATCHDOG_ENABLE_DEFAULT", 61600, "I")
-WATCHDOG_TIMEOUT_S = Register("WATCHDOG_TIMEOUT_S_DEFAULT", 61604, "I")
-WATCHDOG_STRICT_ENABLE = Register("WATCHDOG_STRICT_ENABLE_DEFAULT", 61610, "I")
-WATCHDOG_DIO_ENABLE = Register("WATCHDOG_DIO_ENABLE_DEFAULT", 61630, "I")
-WATCHDOG_DIO_STATE = Register("WATCHDOG_DIO_STATE_DEFAULT", 61632, "I")
-WATCHDOG_DIO_DIRECTION = Register("WATCHDOG_DIO_DIRECTION_DEFAULT", 61634, "I")
-WATCHDOG_DIO_INHIBIT = Register("WATCHDOG_DIO_INHIBIT_DEFAULT", 61636, "I")
+class Span(NamedTuple):
+    """Neighbouring registers of one type, to be read at once again and again."""
+
+    address: int
+    request: bytes
+    """Asks for them."""
+    size: int
+    """Bytes of the reply."""
+    reply: struct.Struct
+    """Form of the reply: the number of bytes of the values, and the values."""
+
+    @classmethod
+    def of(cls, register: Register, count: int = 1) -> Span:
+        """Return the span of `count` registers from one on.
+
+        Raises `ValueError` if they can only be written.
+        """
+        if "R" not in register.access:
+            raise ValueError(f"{register.name} can only be written")
+        reply = struct.Struct(f">xB{count}{register.form}")
+        return cls(register.address, read_request(register.address, reply.size // 2 - 1), reply.size, reply)
+
+
+AIN = Register("AIN#", 0, "F32", "R")
+DAC = Register("DAC#", 1000, "F32", "RW")
+DIO = Register("DIO#", 2000, "U16", "RW")
+DIO_STATE = Register("DIO_STATE", 2800, "U32", "RW")
+DIO_DIRECTION = Register("DIO_DIRECTION", 2850, "U32", "RW")
+STREAM_SETTLING_US = Register("STREAM_SETTLING_US", 4008, "F32", "RW")
+STREAM_RESOLUTION_INDEX = Register("STREAM_RESOLUTION_INDEX", 4010, "U32", "RW")
+AIN_EF_READ_AVERAGE = Register("AIN#_EF_READ_A", 7000, "F32", "R")
+AIN_EF_READ_MAXIMUM = Register("AIN#_EF_READ_B", 7300, "F32", "RW")
+AIN_EF_READ_MINIMUM = Register("AIN#_EF_READ_C", 7600, "F32", "RW")
+AIN_EF_INDEX = Register("AIN#_EF_INDEX", 9000, "U32", "RW")
+AIN_EF_SAMPLES = Register("AIN#_EF_CONFIG_A", 9300, "U32", "RW")
+AIN_EF_SCAN_RATE = Register("AIN#_EF_CONFIG_D", 10200, "F32", "RW")
+TDAC = Register("TDAC#", 30000, "F32", "W")
+AIN_RANGE = Register("AIN#_RANGE", 40000, "F32", "RW")
+AIN_NEGATIVE_CH = Register("AIN#_NEGATIVE_CH", 41000, "U16", "RW")
+AIN_RESOLUTION_INDEX = Register("AIN#_RESOLUTION_INDEX", 41500, "U16", "RW")
+AIN_SETTLING_US = Register("AIN#_SETTLING_US", 42000, "F32", "RW")
+LAST_ERR_DETAIL = Register("LAST_ERR_DETAIL", 55000, "U16", "R")
+TEST = Register("TEST", 55100, "U32", "R")
+TEST_FLOAT32 = Register("TEST_FLOAT32", 55124, "F32", "R")
+PRODUCT_ID = Register("PRODUCT_ID", 60000, "F32", "R")
+FIRMWARE_VERSION = Register("FIRMWARE_VERSION", 60004, "F32", "R")
+SERIAL_NUMBER = Register("SERIAL_NUMBER", 60028, "U32", "R")
+WATCHDOG_ENABLE = Register("WATCHDOG_ENABLE_DEFAULT", 61600, "U32", "RW")
+WATCHDOG_TIMEOUT_S = Register("WATCHDOG_TIMEOUT_S_DEFAULT", 61604, "U32", "RW")
+WATCHDOG_STRICT_ENABLE = Register("WATCHDOG_STRICT_ENABLE_DEFAULT", 61610, "U32", "RW")
+WATCHDOG_DIO_ENABLE = Register("WATCHDOG_DIO_ENABLE_DEFAULT", 61630, "U32", "RW")
+WATCHDOG_DIO_STATE = Register("WATCHDOG_DIO_STATE_DEFAULT", 61632, "U32", "RW")
+WATCHDOG_DIO_DIRECTION = Register("WATCHDOG_DIO_DIRECTION_DEFAULT", 61634, "U32", "RW")
+WATCHDOG_DIO_INHIBIT = Register("WATCHDOG_DIO_INHIBIT_DEFAULT", 61636, "U32", "RW")
 WATCHDOG_DAC_ENABLE = (
-    Register("WATCHDOG_DAC0_ENABLE_DEFAULT", 61640, "I"),
-    Register("WATCHDOG_DAC1_ENABLE_DEFAULT", 61650, "I"),
+    Register("WATCHDOG_DAC0_ENABLE_DEFAULT", 61640, "U32", "RW"),
+    Register("WATCHDOG_DAC1_ENABLE_DEFAULT", 61650, "U32", "RW"),
 )
 
-_UNIT = 1  # LabJack takes any
 _TEST_WORDS = [0x0011, 0x2233]
 _TEST_FLOAT = -9999.0
 _PRODUCT = 7.0
@@ -112,36 +143,46 @@ class LabJackT7:
     def __init__(self, name: str, port: str, timeout: float) -> None:
         self._name = name
         self._address = port
-        host, _, number = port.removeprefix("tcp://").rpartition(":")
-        # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
-        self._client = ModbusTcpClient(host.strip("[]"), port=int(number), timeout=timeout, retries=0)
         self._timeout = timeout
-        self._connected: bool = self._client.connect()  # type: ignore[no-untyped-call]
-        if not self._connected:
-            self.close()
+        try:
+            self._connection = share(port, timeout)
+        except OSError as error:
+            reason = f" ({error})" if str(error) else ""
             raise DeviceConnectionError(
-                name, f"cannot connect to {port}; check the address, the cable and that the instrument has power"
-            )
+                name,
+                f"cannot connect to {port}{reason}; check the address, the cable and that the instrument has power",
+            ) from None
+        self._client = self._connection.client
+        self._lock = self._connection.lock
+        self._connected = True
 
     def close(self) -> None:
-        """Release the connection."""
-        self._connected = False
-        self._client.close()  # type: ignore[no-untyped-call]
+        """Release the connection; it is closed with its last user."""
+        if self._connected:
+            self._connected = False
+            self._connection.close()
 
     def read_words(self, address: int, count: int) -> list[int]:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
-        response = self._exchange(
-            lambda: self._client.read_holding_registers(address, count=count, device_id=_UNIT),
-            f"reading register {address}",
-        )
-        if len(response.registers) != count:
-            raise DeviceError(self._name, f"sent {len(response.registers)} registers where {count} were asked for")
-        return list(response.registers)
+        return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
+
+    def read_span(self, span: Span) -> list[float]:
+        """Get the values of neighbouring registers of one type."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                reply = self._client.request(span.request, span.size)
+            size, *values = span.reply.unpack(reply)
+            if size != span.size - 2:
+                raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, f"reading register {span.address}") from error
+        return values
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""
-        form = f"{count}{register.form}"
-        return list(unpack(form, self.read_words(register.address, struct.calcsize(f">{form}") // 2)))
+        return self.read_span(Span.of(register, count))
 
     def read_integer(self, register: Register) -> int:
         """Get the value of a UINT32 or UINT16 register."""
@@ -149,11 +190,27 @@ class LabJackT7:
 
     def write(self, register: Register, *values: float) -> None:
         """Set registers of one type from `register` on, in one request."""
-        words = pack(f"{len(values)}{register.form}", *values)
-        self._exchange(
-            lambda: self._client.write_registers(register.address, words, device_id=_UNIT),
-            f"writing register {register.address}",
-        )
+        self.write_span(register.address, self.encode(register, *values))
+
+    @staticmethod
+    def encode(register: Register, *values: float) -> bytes:
+        """Return values for registers from `register` on, as they are sent.
+
+        Raises `ValueError` if they can only be read.
+        """
+        if "W" not in register.access:
+            raise ValueError(f"{register.name} can only be read")
+        return struct.pack(f">{len(values)}{register.form}", *values)
+
+    def write_span(self, address: int, data: bytes) -> None:
+        """Set neighbouring registers from an address on."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                self._client.write(address, data)
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, f"writing register {address}") from error
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type in one request, and read them back.
@@ -163,7 +220,7 @@ class LabJackT7:
         first = next(iter(values))
         self.write(first, *values.values())
         for (register, value), actual in zip(values.items(), self.read(first, len(values)), strict=True):
-            tolerance = 1e-5 if register.form == "f" else 0.0
+            tolerance = 1e-5 if register.kind == "F32" else 0.0
             if not math.isclose(actual, value, rel_tol=tolerance, abs_tol=0.1 * tolerance):
                 raise DeviceError(
                     self._name,
@@ -199,35 +256,37 @@ class LabJackT7:
         (firmware,) = self.read(FIRMWARE_VERSION)
         return Identity("LabJack", "T7", str(self.read_integer(SERIAL_NUMBER)), f"{firmware:.4f}")
 
-    def _exchange(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
-        if not self._connected:
-            raise DeviceConnectionError(
-                self._name,
-                f"the connection to {self._address} is closed; connect again, so that the instrument is set up again",
-            )
-        response = self._answer(request)
-        if not response.isError():
-            return response
-        message = exception_text(response.exception_code, doing)
-        cause = self._answer(
-            lambda: self._client.read_holding_registers(LAST_ERR_DETAIL.address, count=1, device_id=_UNIT)
+    def _failure(self, error: RefusedError | OSError, doing: str) -> DeviceError:
+        """Return the error for a request that failed; without an answer, end the connection."""
+        if isinstance(error, RefusedError):
+            return self._refusal(error, doing)
+        # A late reply must not be taken for that to the next request, and an instrument that restarted has
+        # lost its settings: the connection ends here.
+        self._connection.end()
+        return DeviceConnectionError(
+            self._name,
+            f"no reply from {self._address} within {self._timeout:g} s, or the connection broke; "
+            f"check cable and power, then connect again ({error})",
         )
-        if not cause.isError() and cause.registers and (detail := cause.registers[0]):
-            message += f"; LAST_ERR_DETAIL {detail} ({_DETAILS.get(detail, 'see the LabJack error codes')})"
-        raise DeviceError(self._name, message)
 
-    def _answer(self, request: Callable[[], ModbusPDU]) -> ModbusPDU:
+    def _refusal(self, refusal: RefusedError, doing: str) -> DeviceError:
+        message = exception_text(refusal.code, doing)
         try:
-            return request()
-        except (ModbusException, OSError) as error:
-            # A late reply must not be taken for that to the next request, and an instrument that restarted has
-            # lost its settings: the connection ends here.
-            self.close()
-            raise DeviceConnectionError(
-                self._name,
-                f"no reply from {self._address} within {self._timeout:g} s, or the connection broke; "
-                f"check cable and power, then connect again ({error})",
-            ) from error
+            with self._lock:
+                (detail,) = struct.unpack(">H", self._client.read(LAST_ERR_DETAIL.address, 1))
+        except RefusedError:
+            detail = 0
+        except OSError as error:
+            return self._failure(error, doing)
+        if detail:
+            message += f"; LAST_ERR_DETAIL {detail} ({_DETAILS.get(detail, 'see the LabJack error codes')})"
+        return DeviceError(self._name, message)
+
+    def _closed(self) -> DeviceConnectionError:
+        return DeviceConnectionError(
+            self._name,
+            f"the connection to {self._address} is closed; connect again, so that the instrument is set up again",
+        )
 
     def _wrong(self, what: str) -> DeviceConnectionError:
         return DeviceConnectionError(self._name, f"the device at {self._address} {what}")

@@ -81,8 +81,8 @@ class StepParameters(ProtocolParameters):
 def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 
-    The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig whose
-    instruments are called directly.
+    The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig on the
+    virtual clock.
     """
     setup = _setup(parameters, lambda t: parameters.step if t >= parameters.rest else 0.0)
     controller = make_controller("hybrid-fine", "notch", setup)

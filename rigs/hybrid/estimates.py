@@ -215,8 +215,27 @@ class ThermalNoise:
         check_positive(self)
 
 
+# Weights of the centre and of the 2 n other sigma points of n = 4 states. A spread of √n standard deviations gives
+# the centre none: the cubature rule, with equal positive weights and without cancellation.
+_STATES = 4
+_WEIGHTS = np.array([0.0] + [0.5 / _STATES] * (2 * _STATES))
+
+
+def _sigma_points(mean: Floats, covariance: Floats) -> Floats:
+    """Return the sigma points of a distribution, shape (9, 4)."""
+    spread = np.linalg.cholesky(_STATES * covariance).T
+    return np.concatenate([[mean], mean + spread, mean - spread])
+
+
+def _moments(points: Floats, noise: Floats) -> tuple[Floats, Floats]:
+    """Return mean and covariance of transformed sigma points, with additive noise."""
+    mean = np.dot(_WEIGHTS, points)
+    spread = points - mean
+    return mean, np.dot(spread.T, _WEIGHTS[:, np.newaxis] * spread) + noise
+
+
 class UnscentedEstimate(ThermalEstimate):
-    """Unscented Kalman filter of base, tip, a disturbing heat and an offset of the deflection, by filterpy.
+    """Unscented Kalman filter of base, tip, a disturbing heat and an offset of the deflection.
 
     The heat stands for deviations of room, block and network from the model, the offset for the error of the
     polynomial, creep of the piezo part and drift of the sensor; both are random walks. The filter runs once in a
@@ -226,48 +245,41 @@ class UnscentedEstimate(ThermalEstimate):
     def __init__(
         self, bending: Bending, network: ReducedNetwork, noise: ThermalNoise, period: float, every: int
     ) -> None:
-        # Half a second of import, needed by this estimate only.
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-
         super().__init__(bending)
         self._network = network
         self._period = period
         self._step = period * every
         self._noise = noise
-        # These settings give the cubature rule: equal positive weights, without cancellation.
-        points = MerweScaledSigmaPoints(
-            4, alpha=1.0, beta=0.0, kappa=0.0, sqrt_method=lambda matrix: np.linalg.cholesky(matrix).T
-        )
-        self._filter = UnscentedKalmanFilter(4, 3, self._step, self._observe, self._move, points)
-        self._filter.Q = np.diag(np.square([noise.base, noise.tip, noise.heat, noise.offset])) * self._step
-        self._filter.R = np.diag(np.square([noise.thermistor, noise.thermistor, noise.deflection]))
-        self._filter.R[2, 2] /= every
-        self._heat = 0.0, 0.0
+        self._walk = np.diag(np.square([noise.base, noise.tip, noise.heat, noise.offset])) * self._step
+        self._reading_noise = np.diag(np.square([noise.thermistor, noise.thermistor, noise.deflection]))
+        self._reading_noise[2, 2] /= every
+        self._state, self._covariance = np.zeros(_STATES), np.eye(_STATES)
         self._sum, self._count = 0.0, 0
 
     def begin(self, deflection: float, base: float, tip: float) -> None:
         """Start in equilibrium with the first readings."""
         n = self._noise
-        self._filter.x = np.array([base, tip, 0.0, deflection - self._bending.deflection(tip)])
+        self._state = np.array([base, tip, 0.0, deflection - self._bending.deflection(tip)])
         spread = 2.0 * abs(self._bending.slope(tip)) * n.thermistor
-        self._filter.P = np.diag(np.square([n.thermistor, n.thermistor, 10.0 * n.heat, spread]))
+        self._covariance = np.diag(np.square([n.thermistor, n.thermistor, 10.0 * n.heat, spread]))
         self.value = deflection
 
-    def _move(self, state: Floats, dt: float) -> list[float]:
-        base, tip, heat, offset = state.tolist()
-        n = self._network
-        constant, slope = self._heat
+    def _move(self, points: Floats, current: float) -> Floats:
+        """Return states (9, 4) one thermal period later, at a current (A)."""
+        base, tip, heat, _ = points.T
+        n, dt = self._network, self._step
+        constant, slope = n.heat_flow(current)
         along = (base - tip) * n.along
-        return [
-            base + dt * (constant + slope * base + heat - along) / n.base_capacity,
-            tip + dt * (along - n.tip_air * tip) / n.tip_capacity,
-            heat,
-            offset,
-        ]
+        moved = points.copy()
+        moved[:, 0] = base + dt * (constant + slope * base + heat - along) / n.base_capacity
+        moved[:, 1] = tip + dt * (along - n.tip_air * tip) / n.tip_capacity
+        return moved
 
-    def _observe(self, state: Floats) -> list[float]:
-        base, tip, _, offset = state.tolist()
-        return [base, tip, self._bending.deflection(tip) + offset]
+    def _observe(self, points: Floats) -> Floats:
+        """Return what is read in states (9, 4): rises of base and tip (K) and deflection (m), shape (9, 3)."""
+        readings = points[:, :3].copy()
+        readings[:, 2] = [self._bending.deflection(tip) for tip in points[:, 1].tolist()] + points[:, 3]
+        return readings
 
     def sample(self, deflection: float) -> None:
         """Advance at the rate of the model, and keep the deflection for the next correction."""
@@ -277,11 +289,11 @@ class UnscentedEstimate(ThermalEstimate):
 
     def correct(self, base: float, tip: float, current: float) -> None:
         """Predict, and update with the mean of the deflections since the last thermal sample."""
-        self._heat = self._network.heat_flow(current)
-        self._filter.predict()
+        moved = self._move(_sigma_points(self._state, self._covariance), current)
+        self._state, self._covariance = _moments(moved, self._walk)
         if self._count:
             self._take_in(base, tip)
-        here, there, _, offset = self._filter.x.tolist()
+        here, there, _, offset = self._state.tolist()
         n = self._network
         cooling = ((here - there) * n.along - n.tip_air * there) / n.tip_capacity
         self.rate = self._bending.slope(there) * cooling
@@ -292,8 +304,15 @@ class UnscentedEstimate(ThermalEstimate):
         age = 0.5 * (self._count - 1) * self._period
         mean = self._sum / self._count + self.rate * age
         self._sum, self._count = 0.0, 0
-        self._filter.update(np.array([base, tip, mean]))
+        points = _sigma_points(self._state, self._covariance)
+        readings = self._observe(points)
+        expected, variance = _moments(readings, self._reading_noise)
+        spread = _WEIGHTS[:, np.newaxis] * (points - self._state)
+        across = (spread[:, :, np.newaxis] * (readings - expected)[:, np.newaxis, :]).sum(axis=0)
+        gain = np.dot(across, np.linalg.inv(variance))
+        self._state = self._state + np.dot(gain, np.array([base, tip, mean]) - expected)
+        self._covariance = self._covariance - np.dot(gain, np.dot(variance, gain.T))
 
     def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
         """Return the offset of the deflection and its standard deviation, m."""
-        return float(self._filter.x[3]), math.sqrt(float(self._filter.P[3, 3]))
+        return float(self._state[3]), math.sqrt(float(self._covariance[3, 3]))

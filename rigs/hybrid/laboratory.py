@@ -1,34 +1,24 @@
-"""The emulated laboratory of the thermo-piezoelectric hybrid, over its wires or called directly.
+"""The emulated laboratory of the thermo-piezoelectric hybrid.
 
 A cantilever of piezo-ceramic and copper on a Peltier element. A TEC controller drives the latter as a current
 source; a high-voltage amplifier, set and enabled by a LabJack T7, drives the piezo. An optical sensor sees the
 tip; two thermistors are at the base and the tip.
-
-The classes whose names begin with `Direct` take the place of drivers in a rig file: the emulated instruments
-themselves, without a wire, for loops of many kHz on the virtual clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import ClassVar, Literal, Self
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.devices import Device, DriverSettings, Identity
-from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.rig_file import LaboratorySettings
-from bench.roles import PositionSensor, TECMode
+from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.instruments.t7_roles import (
-    EmulatedHighVoltageSupply,
-    EmulatedPositionSensor,
-    EmulatedTemperatureSensor,
-)
 from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
@@ -36,7 +26,7 @@ from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.mecom import MeComServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 DISPLACEMENT_INPUT = 0
@@ -69,9 +59,6 @@ FaultName = Literal[
     "amplifier-trips",
 ]
 
-_direct: dict[str, Device] = {}
-"""Instruments of the open laboratory with `direct` by name: one such rig at a time in a process."""
-
 
 class HybridLaboratorySettings(LaboratorySettings):
     """Settings of this laboratory in a rig file."""
@@ -86,9 +73,6 @@ class HybridLaboratorySettings(LaboratorySettings):
     )
     current_limit: float = Field(
         default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
-    )
-    direct: bool = Field(
-        default=False, description="whether the instruments are called directly, by the Direct classes of this module"
     )
     fault: FaultName = Field(
         default="none",
@@ -105,9 +89,7 @@ def _use(plant: HybridCantilever) -> float:
 
 
 class HybridLaboratory(EmulatedLaboratory):
-    """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP).
-
-    With `direct` they are `tec`, `displacement`, `base`, `tip` and `piezo`, without wires.
+    """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP), and the `witness`.
 
     Parameters
     ----------
@@ -120,7 +102,6 @@ class HybridLaboratory(EmulatedLaboratory):
     """
 
     Settings = HybridLaboratorySettings
-    world: World
 
     def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
         # One stream a source of noise: reading one instrument must not change the noise of another.
@@ -131,7 +112,7 @@ class HybridLaboratory(EmulatedLaboratory):
         )
         compile_loops(self.plant, _use)
         self.world = World(self.plant, clock)
-        self.tec = DirectTEC("tec", self.world, self.plant.peltier, rng=tec)
+        self.tec = EmulatedTEC("tec", self.world, self.plant.peltier, rng=tec)
         self.tec.write_parameter(_CURRENT_LIMIT_PARAMETER, settings.current_limit)
         self.tec.write_parameter(_COLDEST_PARAMETER, _COLDEST)
         self._beyond = 0.0
@@ -153,7 +134,15 @@ class HybridLaboratory(EmulatedLaboratory):
         self.t7.add_follower(
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )
-        super().__init__("hybrid laboratory", {"t7": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        super().__init__(
+            "hybrid laboratory",
+            {
+                "t7": ModbusTcpInstrument(self.t7),
+                "tec": MeComServer(self.tec),
+                "witness": ModbusTcpInstrument(WitnessRegisters(self.world, self.plant)),
+            },
+            clock,
+        )
         self.instruments = {"t7": self.t7, "tec": self.tec}
         self.faults = {
             "open-thermistor": Fault(
@@ -175,46 +164,6 @@ class HybridLaboratory(EmulatedLaboratory):
             self.world.add(Event(settings.ambient_step_time, self._step_room))
         if settings.fault != "none":
             self.world.add(Event(settings.fault_time, partial(self.inject, settings.fault)))
-
-    def open(self) -> Mapping[str, str]:
-        """Switch the instruments on; return the port of each by name.
-
-        Raises
-        ------
-        ValueError
-            If another laboratory of this process has the port of the TEC controller; it keeps it.
-        ConfigurationError
-            If another one with `direct` is open in this process.
-        """
-        if not self._settings.direct:
-            return super().open()
-        ports = self._open_directly()
-        self._opened.callback(_direct.clear)
-        return ports
-
-    def _open_directly(self) -> dict[str, str]:
-        if _direct:
-            raise ConfigurationError("another rig with directly called instruments is open in this process")
-        self.tec.select_mode(TECMode.CURRENT)
-        _direct.update(
-            {
-                "tec": self.tec,
-                "displacement": DirectPositionSensor(
-                    "displacement",
-                    self.t7,
-                    channels=(DISPLACEMENT_INPUT,),
-                    volts_per_metre=5e4,
-                    position_limits=(-REACH, REACH),
-                ),
-                "base": DirectTemperatureSensor("base", self.t7, channels=BASE_INPUTS),
-                "tip": DirectTemperatureSensor("tip", self.t7, channels=TIP_INPUTS),
-                "piezo": DirectHighVoltageSupply(
-                    "piezo", self.t7, line=ENABLE_LINE, channels=AMPLIFIER_INPUTS, gain=GAIN
-                ),
-                "witness": DirectWitness("witness", self.world, self.plant),
-            }
-        )
-        return {name: name for name in _direct}
 
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of cantilever, controller and amplifier."""
@@ -238,86 +187,3 @@ class HybridLaboratory(EmulatedLaboratory):
 
     def _go_beyond(self, metres: float) -> None:
         self._beyond = metres
-
-
-class DirectSettings(DriverSettings):
-    """Settings of an instrument that is called directly."""
-
-    port: str = Field(description="emulated://NAME of an instrument of a laboratory with `direct`")
-
-
-class Direct(Device):
-    """Base of the instruments that are called directly: the laboratory's own instance, without a wire."""
-
-    Settings: ClassVar[type[DirectSettings]] = DirectSettings
-
-    @classmethod
-    def connect(cls, name: str, settings: DirectSettings, clock: Clock) -> Self:  # noqa: ARG003
-        """Return the instrument of the laboratory that is open.
-
-        Raises DeviceConnectionError if the laboratory has no such instrument, or one of another name.
-        """
-        device = _direct.get(settings.port)
-        if not isinstance(device, cls):
-            known = ", ".join(port for port, each in _direct.items() if isinstance(each, cls))
-            raise DeviceConnectionError(
-                name,
-                f"no such instrument at {settings.port}; "
-                f"there are: {known or 'none: the table [emulation] needs direct = true'}",
-            )
-        # Its signals carry its name, and the rig expects them under its own.
-        if name != device.name:
-            raise DeviceConnectionError(name, f"is called directly and has to be named {device.name}, as it is there")
-        return device
-
-
-class DirectTEC(Direct, EmulatedTEC):
-    """The TEC controller in current mode, without its wire."""
-
-
-class DirectPositionSensor(Direct, EmulatedPositionSensor):
-    """The displacement sensor on the T7, without its wire."""
-
-
-class DirectTemperatureSensor(Direct, EmulatedTemperatureSensor):
-    """A thermistor on the T7, without its wire."""
-
-
-class DirectHighVoltageSupply(Direct, EmulatedHighVoltageSupply):
-    """The amplifier on the T7, without its wire."""
-
-
-class DirectWitness(Direct, PositionSensor):
-    """The deflection itself, without noise: an ideal sensor beside the loop.
-
-    Parameters
-    ----------
-    name : str
-        Name in the rig.
-    world : World
-        The laboratory's time.
-    plant : HybridCantilever
-        The cantilever.
-    """
-
-    def __init__(self, name: str, world: World, plant: HybridCantilever) -> None:
-        super().__init__(name, world.clock)
-        self._world = world
-        self._plant = plant
-
-    @property
-    def identity(self) -> Identity:
-        """Made up: no such instrument is sold."""
-        return Identity("emulated", "witness", "0", "0")
-
-    def measure(self) -> dict[str, float]:
-        """Return the deflection, m."""
-        with self._world.lock:
-            self._world.advance()
-            return {f"{self.name}_position": self._plant.deflection}
-
-    def safe(self) -> None:
-        """Do nothing: a sensor is safe in any state."""
-
-    def close(self) -> None:
-        """Do nothing: there is no line."""

@@ -42,8 +42,8 @@ from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 Floats = npt.NDArray[np.float64]
 
-DIRECT = "hybrid-direct"
-"""Rig of the fast loops: the same laboratory, its instruments called directly."""
+WITNESSED = "hybrid-witness"
+"""Rig of the loops whose errors count: the same instruments, and a sensor that sees the deflection itself."""
 
 FREQUENCIES = (0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008)
 SWEEP_AMPLITUDE = 0.02
@@ -287,7 +287,9 @@ def _carry_out(campaign: Campaign) -> StudyResult:
 def _track(
     campaign: Campaign, model: Path, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
 ) -> Tracking:
-    run = campaign.run("hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=DIRECT)
+    run = campaign.run(
+        "hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=WITNESSED
+    )
     samples = read_loop(run.folder)
     return Tracking(samples.times, samples["reference"], samples[WITNESS])
 
@@ -298,7 +300,7 @@ def _fine_step(campaign: Campaign, model: Path, offset: float) -> dict[str, floa
         "fine-step",
         {"model": str(model), "witness": "true"},
         {"emulation.resonance_offset": str(offset)},
-        rig=DIRECT,
+        rig=WITNESSED,
     )
     samples = read_loop(run.folder)
     reference, deflection = samples["reference"], samples[WITNESS]

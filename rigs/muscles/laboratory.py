@@ -32,7 +32,7 @@ from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 LOAD, STAGE = "load", "stage"
@@ -228,7 +228,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         super().__init__(
             "muscle laboratory",
             {
-                "t7": ModbusTcpServer(self.t7),
+                "t7": ModbusTcpInstrument(self.t7),
                 "supply": CanopenSlcanServer(self.supply),
                 "load_cell": ModbusRtuServer(self.load_cell),
                 "stage": Dynamixel2Server([self.servo]),

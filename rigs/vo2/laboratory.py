@@ -16,7 +16,7 @@ from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 _OVER_CURRENT, _OBJECT_TOO_HOT = 100, 138
@@ -74,7 +74,7 @@ class VO2Laboratory(EmulatedLaboratory):
             rng=psd_stream,
         )
         self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
-        super().__init__("VO2 laboratory", {"psd": ModbusTcpServer(self.t7), "tec": MeComServer(self.tec)}, clock)
+        super().__init__("VO2 laboratory", {"psd": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)}, clock)
         self.instruments = {"psd": self.t7, "tec": self.tec}
         self.faults = {
             "tec-over-current": Fault("the TEC controller trips: error 100", partial(self.tec.trip, _OVER_CURRENT)),

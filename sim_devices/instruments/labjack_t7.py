@@ -26,16 +26,18 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
+from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.devices import Identity
 from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
 
@@ -139,6 +141,43 @@ class _Watchdog:
     dac1: float = 0.0
 
 
+class _Service:
+    """The time in which an instrument serves a request, to be entered again and again."""
+
+    def __init__(self, begin: Callable[[], None], end: Callable[[BaseException | None], None]) -> None:
+        self._begin = begin
+        self._end = end
+
+    def __enter__(self) -> None:
+        self._begin()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end(error)
+
+
+class _Scale(NamedTuple):
+    """What a reading of the converter is made of, V."""
+
+    noise: float
+    step: float
+    lowest: float
+    highest: float
+
+
+def _scale(volts: float, index: int) -> _Scale:
+    rail = RAIL * volts
+    code = 2 * rail / CODES
+    conversions = CONVERSIONS[index - 1]
+    step = code / conversions
+    return _Scale(code / math.sqrt(conversions), step, -rail, rail - step)
+
+
+_SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in range(1, len(CONVERSIONS) + 1)}
+"""By range and resolution index."""
+
+
 class EmulatedT7(RegisterInstrument):
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
@@ -172,7 +211,9 @@ class EmulatedT7(RegisterInstrument):
         self.serial_number = serial_number
         self.firmware = firmware
         self._sources = dict(inputs)
-        self._rng = rng
+        self._normals = normals(rng)
+        self._service = _Service(self._begin, self._end)
+        self._touched = False
         self._inputs = [_Input() for _ in range(CHANNELS)]
         self._stream_index = 0
         self._stream_settling = 0.0
@@ -214,7 +255,7 @@ class EmulatedT7(RegisterInstrument):
         return bool(levels >> number & 1)
 
     def add_follower(self, follow: Callable[[], None]) -> None:
-        """Call `follow()` now, after every request and when the watchdog acts.
+        """Call `follow()` now, after every request that touches an output, and when the watchdog acts.
 
         A load at the outputs reads them then; the world stands at that instant.
         """
@@ -229,19 +270,40 @@ class EmulatedT7(RegisterInstrument):
 
     # The requests.
 
-    @contextmanager
-    def _request(self) -> Iterator[None]:
-        with self.world.lock:
-            self._attend()
-            try:
-                yield
-            except RegisterError as refusal:
-                self._last_error = refusal.detail if isinstance(refusal, _DetailedError) else 0
-                raise
-            finally:
+    def _request(self) -> AbstractContextManager[None]:
+        return self._service
+
+    def _begin(self) -> None:
+        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
+        world, dog = self.world, self._watchdog
+        world.lock.acquire()
+        try:
+            world.advance()
+            if not dog.enabled:
+                return
+            if not dog.strict:
+                self._due = world.time + dog.timeout
+                self._expired_at = None
+            elif self._expired_at is not None:
+                # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
+                periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
+                self._due = self._expired_at + periods * dog.timeout
+                self._expired_at = None
+        except BaseException:
+            world.lock.release()
+            raise
+
+    def _end(self, error: BaseException | None) -> None:
+        try:
+            if isinstance(error, RegisterError):
+                self._last_error = error.detail if isinstance(error, _DetailedError) else 0
+            if self._touched:
                 self._lead()
+        finally:
+            self.world.lock.release()
 
     def _lead(self) -> None:
+        self._touched = False
         for follow in self._followers:
             follow()
 
@@ -265,20 +327,6 @@ class EmulatedT7(RegisterInstrument):
         self._expired_at = self._due
         self._due = math.inf
         self._lead()
-
-    def _attend(self) -> None:
-        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
-        self.world.advance()
-        dog = self._watchdog
-        if not dog.enabled:
-            return
-        if not dog.strict:
-            self._feed()
-        elif self._expired_at is not None:
-            # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
-            periods = math.floor((self.world.time - self._expired_at) / dog.timeout) + 1
-            self._due = self._expired_at + periods * dog.timeout
-            self._expired_at = None
 
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout
@@ -321,10 +369,11 @@ class EmulatedT7(RegisterInstrument):
 
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
-        # Nothing that a follower looks at changes, and nothing is refused.
-        with self.world.lock:
-            self._attend()
-            return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
+        with self._request():
+            return self._reading(channel)
+
+    def _reading(self, channel: int) -> float:
+        return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -352,12 +401,9 @@ class EmulatedT7(RegisterInstrument):
         volts = self._terminal(channel)
         if settings.negative != SINGLE_ENDED:
             volts -= self._terminal(settings.negative)
-        rail = RAIL * settings.range
-        code = 2 * rail / CODES
-        conversions = CONVERSIONS[index - 1]
-        volts += code / math.sqrt(conversions) * self._rng.standard_normal()
-        step = code / conversions
-        return float(min(max(round(volts / step) * step, -rail), rail - step))
+        noise, step, lowest, highest = _SCALES[settings.range, index]
+        volts += noise * next(self._normals)
+        return min(max(round(volts / step) * step, lowest), highest)
 
     def _terminal(self, channel: int) -> float:
         source = self._sources.get(channel)
@@ -416,17 +462,21 @@ class EmulatedT7(RegisterInstrument):
     # The outputs, and the digital lines.
 
     def _set_dac(self, number: int, value: float) -> None:
+        self._touched = True
         self._dacs[number] = min(max(value, 0.0), _DAC_TOP)
 
     def _set_tdac(self, number: int, value: float) -> None:
+        self._touched = True
         self._tdacs[number] = min(max(value, -_TDAC_TOP), _TDAC_TOP)
 
     def _read_dio(self, number: int) -> float:
+        self._touched = True
         self._dio_direction &= ~(1 << number)
         return self.dio_level(number)
 
     def _set_dio(self, number: int, value: float) -> None:
         # Writing a line also makes it an output, as ljm_constants.json says of FIO0.
+        self._touched = True
         bit = 1 << number
         self._dio_direction |= bit
         self._dio_state = self._dio_state | bit if value else self._dio_state & ~bit
@@ -435,6 +485,7 @@ class EmulatedT7(RegisterInstrument):
         return self._dio_state & self._dio_direction | ~self._dio_direction & ALL_DIO
 
     def _set_dio_bank(self, attribute: str, value: float) -> None:
+        self._touched = True
         affected = ALL_DIO if attribute == "_dio_inhibit" else ~self._dio_inhibit & ALL_DIO
         setattr(self, attribute, getattr(self, attribute) & ~affected | int(value) & affected)
 
@@ -444,7 +495,7 @@ class EmulatedT7(RegisterInstrument):
         """Return the emulated rows of `ljm_constants.json`."""
         inputs, dog = self._inputs, self._dog
         return (
-            Register("AIN#", 0, "F32", self.convert, None, CHANNELS),
+            Register("AIN#", 0, "F32", self._reading, None, CHANNELS),
             Register("DAC#", 1000, "F32", self._dacs.__getitem__, self._set_dac, len(self._dacs)),
             Register("DIO#", 2000, "U16", self._read_dio, self._set_dio, _DIOS),
             Register("DIO_STATE", 2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state")),

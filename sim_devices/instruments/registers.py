@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from sim_devices.wire.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
 
@@ -66,6 +66,34 @@ class Register:
         )
 
 
+class _Reads(NamedTuple):
+    """What a read of neighbouring words takes."""
+
+    read: tuple[Callable[[], float], ...]
+    values: struct.Struct
+    words: struct.Struct
+    skipped: int
+    """Bytes of the first value that were not asked for."""
+
+
+class _Writes(NamedTuple):
+    """What a write of neighbouring words takes: the registers, up to the one for which it is refused."""
+
+    registers: tuple[Register, ...]
+    values: struct.Struct
+    words: struct.Struct
+    refusal: RegisterError | None
+
+
+def _integer(read: Callable[[], float]) -> int:
+    return int(read())
+
+
+def _joint(registers: Iterable[Register]) -> struct.Struct:
+    """Return the form of the values of neighbouring registers."""
+    return struct.Struct(">" + "".join(_FORMATS[register.kind][1:] for register in registers))
+
+
 class RegisterInstrument(ABC):
     """A bank of registers with names; a `sim_devices.wire.modbus.RegisterBank`."""
 
@@ -73,6 +101,9 @@ class RegisterInstrument(ABC):
         registers = [register for row in rows for register in row.each()]
         self._named = {register.name: register for register in registers}
         self._words = {register.address + word: register for register in registers for word in range(register.words)}
+        # What a request means is found once; a host asks the same few again and again.
+        self._known_reads: dict[tuple[int, int], _Reads] = {}
+        self._known_writes: dict[tuple[int, int], _Writes] = {}
 
     @abstractmethod
     def _request(self) -> AbstractContextManager[None]:
@@ -81,19 +112,12 @@ class RegisterInstrument(ABC):
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return `count` registers from `address` on, of one instant; reading half a value is allowed.
 
-        Raises `RegisterError` if one of them does not exist or cannot be read.
+        Raises `RegisterError` if one of them does not exist or cannot be read; nothing was read then.
         """
         with self._request():
-            values: dict[int, tuple[int, ...]] = {}
-            words = []
-            for each in range(address, address + count):
-                register = self._at(each)
-                if register.read is None:
-                    raise RegisterError(ILLEGAL_ADDRESS, f"{register.name} can only be written")
-                if register.address not in values:
-                    values[register.address] = register.encode(register.read())
-                words.append(values[register.address][each - register.address])
-            return words
+            reads = self._known_reads.get((address, count)) or self._reads(address, count)
+            data = reads.values.pack(*[read() for read in reads.read])
+            return list(reads.words.unpack_from(data, reads.skipped))
 
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values.
@@ -101,18 +125,47 @@ class RegisterInstrument(ABC):
         Raises `RegisterError` if one of them does not exist or cannot be written, or if a value is not allowed; the
         values before it have been written then.
         """
+        count = len(values)
         with self._request():
-            position = 0
-            while position < len(values):
-                register = self._at(address + position)
-                words = values[position : position + register.words]
-                self._check_write(register, register.address == address + position and len(words) == register.words)
-                value = register.decode(words)
+            writes = self._known_writes.get((address, count)) or self._writes(address, count)
+            decoded = writes.values.unpack_from(writes.words.pack(*values))
+            for register, value in zip(writes.registers, decoded, strict=True):
                 if not math.isfinite(value):
                     raise RegisterError(ILLEGAL_VALUE, f"{register.name}: allowed are finite numbers, got {value}")
                 if register.write is not None:
                     register.write(value)
+            if writes.refusal is not None:
+                raise writes.refusal
+
+    def _reads(self, address: int, count: int) -> _Reads:
+        registers = list(dict.fromkeys(self._at(each) for each in range(address, address + count)))
+        read = []
+        for register in registers:
+            if register.read is None:
+                raise RegisterError(ILLEGAL_ADDRESS, f"{register.name} can only be written")
+            read.append(register.read if register.kind == "F32" else partial(_integer, register.read))
+        self._known_reads[address, count] = reads = _Reads(
+            tuple(read), _joint(registers), struct.Struct(f">{count}H"), 2 * (address - registers[0].address)
+        )
+        return reads
+
+    def _writes(self, address: int, count: int) -> _Writes:
+        registers: list[Register] = []
+        refusal = None
+        position = address
+        try:
+            while position < address + count:
+                register = self._at(position)
+                self._check_write(
+                    register, register.address == position and position + register.words <= address + count
+                )
+                registers.append(register)
                 position += register.words
+        except RegisterError as error:
+            refusal = error
+        writes = _Writes(tuple(registers), _joint(registers), struct.Struct(f">{count}H"), refusal)
+        self._known_writes[address, count] = writes
+        return writes
 
     def _check_write(self, register: Register, whole: bool) -> None:
         if not whole:

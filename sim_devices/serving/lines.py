@@ -12,9 +12,8 @@ from typing import Protocol
 from bench.clock import Stopwatch
 from sim_devices.serving.clock import ServedClock
 from sim_devices.serving.endpoints import Connection, End, Listener, PseudoTerminal, socket_address
-from sim_devices.serving.instruments import ModbusTcpInstrument
 from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import FramingError
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument
 
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
 _SLICE = 64  # bytes that are served at once, so that a flood of bursts moves the clock no further than a few of them

@@ -1,4 +1,6 @@
-"""An emulated rig served by a process of its own, for scripts, `unittest` and pytest::
+"""An emulated rig served by a process of its own, for scripts, `unittest` and pytest.
+
+Example::
 
     with serve("vo2") as rig:
         line = serial.serial_for_url(rig.port("tec"), 57600, timeout=1.0)

@@ -13,10 +13,9 @@ from bench.rig_file import RigFile
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock
 from sim_devices.serving.endpoints import HAS_PSEUDO_TERMINALS, Listener, PseudoTerminal
-from sim_devices.serving.instruments import ModbusTcpInstrument
 from sim_devices.serving.lines import Cable, Line, Watched
 from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 
 _SCHEME = "emulated://"
 
@@ -173,17 +172,16 @@ class ServedLaboratory:
         if self.laboratory.world is not None:
             self.laboratory.world.advance()
 
-    def _open(self, name: str, server: WireServer | ModbusTcpServer, speed: float, serving: Serving) -> Line:
+    def _open(self, name: str, server: WireServer | ModbusTcpInstrument, speed: float, serving: Serving) -> Line:
         port = serving.ports.get(f"{self.name}.{name}")
-        reached = ModbusTcpInstrument(server._bank) if isinstance(server, ModbusTcpServer) else server
-        self._protocols[name] = reached.protocol if isinstance(reached, WireServer) else "Modbus TCP"
-        on_tcp = not isinstance(reached, WireServer) or serving.tcp or not HAS_PSEUDO_TERMINALS or port is not None
+        self._protocols[name] = server.protocol if isinstance(server, WireServer) else "Modbus TCP"
+        on_tcp = not isinstance(server, WireServer) or serving.tcp or not HAS_PSEUDO_TERMINALS or port is not None
         try:
             end = Listener((serving.host, port or 0)) if on_tcp else PseudoTerminal()
         except OSError as error:
             where = f"port {port} of {serving.host}" if port else serving.host if on_tcp else "a pseudo-terminal"
             raise ConfigurationError(f"{self.name}: {name} cannot be served at {where}: {error.strerror}") from None
-        return Line(name, reached, end, self.clock, speed)
+        return Line(name, server, end, self.clock, speed)
 
 
 def one_of(laboratories: Sequence[ServedLaboratory], rig: str | None) -> ServedLaboratory:

@@ -7,6 +7,8 @@ from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
+from sim_devices.noise import normals
+
 
 @dataclass(eq=False)
 class DisplacementSensor:
@@ -26,8 +28,11 @@ class DisplacementSensor:
     rng: np.random.Generator
     """Source of the noise."""
 
+    def __post_init__(self) -> None:
+        self._normals = normals(self.rng)
+
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        noisy = self.displacement() + self.noise * self.rng.standard_normal()
+        noisy = self.displacement() + self.noise * next(self._normals)
         shown = round(noisy / self.resolution) * self.resolution
         return self.volts_per_metre * min(max(shown, -self.reach), self.reach)

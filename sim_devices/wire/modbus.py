@@ -1,12 +1,14 @@
 """Modbus for emulated instruments that are banks of registers, independent of the transport.
 
-Source: MODBUS Application Protocol Specification V1.1b3.
+Sources: MODBUS Application Protocol Specification V1.1b3; LabJack, Direct Modbus TCP, Protocol Details.
 """
 
 from __future__ import annotations
 
 import logging
 import struct
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Protocol
 
 ILLEGAL_FUNCTION = 1
@@ -14,10 +16,19 @@ ILLEGAL_ADDRESS = 2
 ILLEGAL_VALUE = 3
 DEVICE_FAILURE = 4
 
+FEEDBACK = 76
+"""LabJack's own function: reads and writes at several addresses in one packet."""
+
 _READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY = 3, 4, 6, 16
 _MOST_READ = 125  # registers in one read, Application Protocol 6.3
 _MOST_WRITTEN = 123  # registers in one write, Application Protocol 6.12
 _REGISTERS = 0x10000
+_FUNCTIONS = frozenset((_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY))
+_BODY = struct.Struct(">BHH")  # function, address, and value or number of registers
+_WORDS = tuple(struct.Struct(f">{number}H") for number in range(256))
+_FRAME = struct.Struct(">BHB")  # of function 76: kind, address, number of registers
+_FRAME_READ, _FRAME_WRITE = 0, 1
+_MOST_FEEDBACK = 1040 - 8  # bytes that a packet of a T7 has behind its header and the function
 
 _log = logging.getLogger(__name__)
 
@@ -48,11 +59,17 @@ class RegisterBank(Protocol):
         """Write registers from `address` on, each 0 to 65535; raise `RegisterError` to refuse."""
 
 
-def answer(bank: RegisterBank, request: bytes) -> bytes:
+OwnFunctions = Mapping[int, Callable[[RegisterBank, bytes], bytes]]
+"""Functions that only some instruments have: each takes what follows its code in a request, and returns the same."""
+
+
+def answer(bank: RegisterBank, request: bytes, own: OwnFunctions = MappingProxyType({})) -> bytes:
     """Return the reply to one request, both without a header and at least one byte long."""
     function = request[0]
     try:
-        return bytes([function]) + _carry_out(bank, function, request[1:])
+        if function in own:
+            return request[:1] + own[function](bank, request[1:])
+        return request[:1] + _carry_out(bank, function, request)
     except RegisterError as refusal:
         return bytes([function | 0x80, refusal.code])
     except Exception:
@@ -61,28 +78,61 @@ def answer(bank: RegisterBank, request: bytes) -> bytes:
         return bytes([function | 0x80, DEVICE_FAILURE])
 
 
-def _carry_out(bank: RegisterBank, function: int, body: bytes) -> bytes:
-    if function not in (_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY):
+def _carry_out(bank: RegisterBank, function: int, request: bytes) -> bytes:
+    if function not in _FUNCTIONS:
         raise RegisterError(ILLEGAL_FUNCTION, f"function {function} is not supported")
-    if len(body) < 4:
+    size = len(request)
+    if size < _BODY.size:
         raise RegisterError(ILLEGAL_VALUE, "the request is too short")
-    address, number = struct.unpack_from(">HH", body)
+    _, address, number = _BODY.unpack_from(request)
     if function == _WRITE_ONE:
-        if len(body) != 4:
+        if size != _BODY.size:
             raise RegisterError(ILLEGAL_VALUE, "the request is too long")
         bank.write_registers(address, [number])
-        return body
+        return request[1:]
     if function == _WRITE_MANY:
-        if not 1 <= number <= _MOST_WRITTEN or len(body) != 5 + 2 * number or body[4] != 2 * number:
+        if not 1 <= number <= _MOST_WRITTEN or size != 6 + 2 * number or request[5] != 2 * number:
             raise RegisterError(ILLEGAL_VALUE, "count and data do not agree")
         _check_range(address, number)
-        bank.write_registers(address, list(struct.unpack_from(f">{number}H", body, 5)))
-        return body[:4]
-    if len(body) != 4 or not 1 <= number <= _MOST_READ:
+        bank.write_registers(address, list(_WORDS[number].unpack_from(request, 6)))
+        return request[1 : _BODY.size]
+    if size != _BODY.size or not 1 <= number <= _MOST_READ:
         raise RegisterError(ILLEGAL_VALUE, f"count: allowed are 1 to {_MOST_READ}, got {number}")
     _check_range(address, number)
-    words = bank.read_registers(address, number)
-    return struct.pack(f">B{number}H", 2 * number, *words)
+    words: bytes = _WORDS[number].pack(*bank.read_registers(address, number))
+    return bytes((2 * number,)) + words
+
+
+def feedback(bank: RegisterBank, body: bytes) -> bytes:
+    """Carry the frames of LabJack's function 76 out, one after the other, and return what the reads among them give.
+
+    A frame is its kind (0 read, 1 write), the address, and the number of registers, followed by their values if it
+    is a write (Direct Modbus TCP, Protocol Details, Modbus Feedback). The first frame that is refused ends the
+    request; those before it have been carried out.
+    """
+    values = b""
+    position = 0
+    if not body:
+        raise RegisterError(ILLEGAL_VALUE, "there is no frame")
+    while position < len(body):
+        if len(body) < position + _FRAME.size:
+            raise RegisterError(ILLEGAL_VALUE, "a frame is too short")
+        kind, address, number = _FRAME.unpack_from(body, position)
+        position += _FRAME.size
+        if kind not in (_FRAME_READ, _FRAME_WRITE) or number == 0:
+            raise RegisterError(ILLEGAL_VALUE, f"frame of kind {kind} with {number} registers")
+        _check_range(address, number)
+        words = _WORDS[number]
+        if kind == _FRAME_READ:
+            values += words.pack(*bank.read_registers(address, number))
+        elif len(body) < position + words.size:
+            raise RegisterError(ILLEGAL_VALUE, "count and data do not agree")
+        else:
+            bank.write_registers(address, list(words.unpack_from(body, position)))
+            position += words.size
+    if len(values) > _MOST_FEEDBACK:
+        raise RegisterError(ILLEGAL_VALUE, "the reply is longer than a packet")
+    return values
 
 
 def _check_range(address: int, count: int) -> None:

@@ -1,4 +1,4 @@
-"""Modbus TCP on a loopback port, for any emulated instrument that is a bank of registers.
+"""Modbus TCP as LabJack speaks it, for any emulated instrument that is a bank of registers.
 
 A small server of our own rather than pymodbus's, which was tried in its version 3.16: of several requests in
 one segment it answers the first only, and after a frame with a foreign protocol identifier it keeps waiting
@@ -17,48 +17,103 @@ import selectors
 import socket
 import struct
 import threading
+from collections.abc import Callable
 from types import TracebackType
 
-from sim_devices.wire.modbus import RegisterBank, answer
+from sim_devices.wire.modbus import FEEDBACK, RegisterBank, answer, feedback
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
-_MOST_BYTES = 254  # unit identifier and the longest PDU
+_MOST_BYTES = 1034  # unit identifier and the longest PDU of a T7, whose packets have up to 1040 bytes
+_FUNCTIONS = {FEEDBACK: feedback}
 
 
 class FramingError(Exception):
     """The bytes are no Modbus TCP, and where the next frame begins cannot be known."""
 
 
-class ModbusTcpStream:
-    """The instrument's end of one connection: bytes in, bytes out."""
+class ModbusTcpInstrument:
+    """An instrument on TCP that accepts a few connections at a time.
 
-    def __init__(self, bank: RegisterBank) -> None:
+    Parameters
+    ----------
+    bank : RegisterBank
+        The instrument.
+    connections : int
+        How many connections it accepts: a T7 two on port 502 (T-series datasheet, 6.0 Ethernet). That it refuses one
+        more, and does not end the oldest instead, is an assumption.
+    """
+
+    def __init__(self, bank: RegisterBank, *, connections: int = 2) -> None:
+        self.bank = bank
+        self._most = connections
+        self._open: list[ModbusTcpStream] = []
+
+    def connect(self) -> ModbusTcpStream:
+        """Open a connection.
+
+        Raises `ConnectionRefusedError` if as many as the instrument accepts are open.
+        """
+        if len(self._open) >= self._most:
+            raise ConnectionRefusedError(f"connection refused: the instrument has {self._most} open already")
+        stream = ModbusTcpStream(self.bank, self._open.remove)
+        self._open.append(stream)
+        return stream
+
+
+class ModbusTcpStream:
+    """The instrument's end of one connection: bytes in, bytes out.
+
+    Parameters
+    ----------
+    closed : callable
+        Called once with the connection when it ends.
+    """
+
+    def __init__(self, bank: RegisterBank, closed: Callable[[ModbusTcpStream], None] = lambda _: None) -> None:
         self._bank = bank
-        self._received = bytearray()
+        self._closed = closed
+        self._received = b""
+        self._is_open = True
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the client, in pieces of any size; return the replies to whole frames.
 
-        Raises `FramingError` if the header is not one of Modbus; the connection is to be closed.
+        Raises
+        ------
+        FramingError
+            If the header is not one of Modbus; the connection is closed.
+        ConnectionResetError
+            If the connection is closed.
         """
-        self._received += data
-        replies = bytearray()
-        while len(self._received) >= _HEADER.size:
-            transaction, protocol, length, unit = _HEADER.unpack_from(self._received)
+        if not self._is_open:
+            raise ConnectionResetError("the connection is closed")
+        received = self._received + data if self._received else data
+        replies = b""
+        begin, size = 0, len(received)
+        while size - begin >= _HEADER.size:
+            transaction, protocol, length, unit = _HEADER.unpack_from(received, begin)
             if protocol != 0 or not 2 <= length <= _MOST_BYTES:
+                self.close()
                 raise FramingError(f"protocol {protocol}, length {length}")
-            end = _HEADER.size + length - 1
-            if len(self._received) < end:
+            end = begin + _HEADER.size + length - 1
+            if size < end:
                 break
-            reply = answer(self._bank, bytes(self._received[_HEADER.size : end]))
-            del self._received[:end]
+            reply = answer(self._bank, received[begin + _HEADER.size : end], _FUNCTIONS)
             # Any unit is echoed: a device on TCP is addressed by its port.
             replies += _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
-        return bytes(replies)
+            begin = end
+        self._received = received[begin:]
+        return replies
+
+    def close(self) -> None:
+        """End the connection; may be called again."""
+        if self._is_open:
+            self._is_open = False
+            self._closed(self)
 
 
 class ModbusTcpServer:
-    """Serves an emulated instrument to any number of clients.
+    """Serves an emulated instrument to as many clients as it accepts; it closes the connection of one more.
 
     Parameters
     ----------
@@ -74,7 +129,7 @@ class ModbusTcpServer:
     _SEND_TIMEOUT = 1.0  # a client that does not read its replies for so long is dropped
 
     def __init__(self, bank: RegisterBank, *, port: int = 0) -> None:
-        self._bank = bank
+        self._instrument = ModbusTcpInstrument(bank)
         self._port = port
         self._thread: threading.Thread | None = None
 
@@ -136,8 +191,9 @@ class ModbusTcpServer:
                 for key, _ in selector.select():
                     ready = key.fileobj
                     if ready is wakened:
-                        for client in clients:
+                        for client, stream in clients.items():
                             client.close()
+                            stream.close()
                         return
                     if ready is listener:
                         self._accept(listener, selector, clients)
@@ -145,7 +201,7 @@ class ModbusTcpServer:
                     assert isinstance(ready, socket.socket)
                     if not self._exchange(ready, clients[ready]):
                         selector.unregister(ready)
-                        del clients[ready]
+                        clients.pop(ready).close()
                         ready.close()
 
     def _accept(
@@ -160,7 +216,11 @@ class ModbusTcpServer:
             return  # the client went away before it was let in
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.settimeout(self._SEND_TIMEOUT)
-        clients[client] = ModbusTcpStream(self._bank)
+        try:
+            clients[client] = self._instrument.connect()
+        except ConnectionRefusedError:
+            client.close()
+            return
         selector.register(client, selectors.EVENT_READ)
 
     @staticmethod

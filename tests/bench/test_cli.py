@@ -766,7 +766,7 @@ class TestIdentifyHybrid:
         self.identify(bench, hybrid_runs, "--plays", "6", "--out", model)
         assert len(json.loads(model.read_text())["model"]["hysteresis"]["weights"]) == 6
         code, _, err = bench(
-            "run", "fine-step", "--rig", "hybrid-direct", "--clock", "virtual", "--set", f"model={model}",
+            "run", "fine-step", "--rig", "hybrid", "--clock", "virtual", "--set", f"model={model}",
             "--out", tmp_path, "--json", tmp_path / "run.json",
         )  # fmt: skip
         assert (code, err) == (0, "")
@@ -842,5 +842,5 @@ class TestHelpOfTheHybrid:
     def test_rigs_and_protocols_are_listed(self, bench):
         code, out, _ = bench("list")
         assert code == 0
-        for name in ("hybrid", "hybrid-direct", "hybrid-hardware", "hybrid-control", "thermomechanical"):
+        for name in ("hybrid", "hybrid-witness", "hybrid-hardware", "hybrid-control", "thermomechanical"):
             assert name in out

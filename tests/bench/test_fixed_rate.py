@@ -667,10 +667,10 @@ class TestWallClockTime:
 
 
 class TestTwentyKilohertz:
-    """The rig `hybrid-direct`, whose instruments are called without a wire."""
+    """A loop through the drivers, on the virtual clock."""
 
     def test_every_sample_is_there(self, tmp_path):
-        b = Bench(tmp_path, "hybrid-direct")
+        b = Bench(tmp_path, "hybrid")
         outcome = b.run(find_protocol("piezo-step"))
         assert outcome.status == "completed", outcome.reason
         assert outcome.safe_state == dict.fromkeys(b.devices, "safe")

@@ -618,7 +618,7 @@ class TestQuickReader:
 
     def test_agrees_with_a_quick_reading_of_everything(self):
         def read(ask):
-            with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
+            with Rig(load_rig("hybrid"), VirtualClock(), 1) as rig:
                 return ask(rig)
 
         everything = read(lambda rig: rig.glance())

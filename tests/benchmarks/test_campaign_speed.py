@@ -10,7 +10,7 @@ CAMPAIGN = """
 import json, resource, sys
 from pathlib import Path
 import bench.cli, bench.runs, bench.dashboard, bench.identification, drivers.labjack_t7, drivers.meerstetter
-import filterpy.kalman, numba, rigs.vo2.laboratory
+import numba, rigs.vo2.laboratory
 from bench.protocol import find_protocol
 from bench.runs import Run, carry_out
 from rich.console import Console

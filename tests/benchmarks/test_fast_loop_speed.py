@@ -54,7 +54,7 @@ def through_the_engine(folder, record_every):
         )
 
     folder.mkdir()
-    with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
+    with Rig(load_rig(__import__("os").environ.get("BRIG", "hybrid-direct")), VirtualClock(), 1) as rig:
         journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig, {})), {})
         watch = Stopwatch()
         outcome = Engine(rig, journal, (), Interrupts()).run(fine, Nothing())
@@ -66,7 +66,7 @@ def through_the_engine(folder, record_every):
 
 def by_hand():
     """Return the same of a loop that calls sensor, controller and amplifier, and nothing else."""
-    with Rig(load_rig("hybrid-direct"), VirtualClock(), 1) as rig:
+    with Rig(load_rig(__import__("os").environ.get("BRIG", "hybrid-direct")), VirtualClock(), 1) as rig:
         sensor, supply = rig.devices["displacement"], rig.devices["piezo"]
         controller, clock = make_controller(), rig.clock
         start = clock.now()

@@ -10,6 +10,8 @@ import pytest
 from bench.clock import VirtualClock
 from bench.devices import Device
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 
 _numbers = itertools.count()
 
@@ -39,7 +41,7 @@ class Given:
         self.value += self.rate * dt
 
 
-class RecordingServer:
+class RecordingServer(WireServer):
     """A wire server that keeps the requests."""
 
     def __init__(self, server):
@@ -57,6 +59,13 @@ def serial_port(stack, server, clock):
     recording = RecordingServer(server)
     stack.callback(unregister, name)
     return register(name, recording, clock), recording.requests
+
+
+def tcp_port(stack, bank, clock):
+    """Put a bank of registers at a port of its own until the stack is closed, and return the port."""
+    port = register(f"contract-{next(_numbers)}", ModbusTcpInstrument(bank), clock)
+    stack.callback(unregister, port)
+    return port
 
 
 class OnABench:

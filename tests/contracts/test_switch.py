@@ -1,4 +1,4 @@
-"""What every switch promises, run against the emulated device and the driver on its wire."""
+"""What every switch promises, run against the driver of a T7 on the wire of the emulated one."""
 
 import math
 from contextlib import ExitStack
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from emulated_bench import tcp_port
 
 from bench.clock import VirtualClock
 from bench.contracts.roles import SwitchContract
@@ -13,8 +14,6 @@ from bench.errors import DeviceError, LimitError
 from bench.roles import Switch
 from drivers.labjack_t7 import T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.instruments.t7_roles import EmulatedSwitch
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 WATCHDOG = 5
@@ -43,24 +42,18 @@ class RecordingT7(EmulatedT7):
 class Laboratory:
     """Makes switches on the lines of one instrument."""
 
-    kind: str
     active_high: bool
     stack: ExitStack
     clock: VirtualClock = field(default_factory=VirtualClock)
-    server: ModbusTcpServer | None = None
 
     def __post_init__(self) -> None:
         self.t7 = RecordingT7(World(Lamp(), self.clock), {}, rng=np.random.default_rng(4))
         self.t7.requests = []
-        if self.kind == "driver":
-            self.server = self.stack.enter_context(ModbusTcpServer(self.t7))
+        self.port = tcp_port(self.stack, self.t7, self.clock)
 
     def connect(self, line: int, watchdog: int = WATCHDOG, name: str = "fan") -> Switch:
         said = {"line": line, "active_high": self.active_high, "watchdog": watchdog}
-        if self.server is None:
-            switch: Switch = EmulatedSwitch(name, self.t7, **said)
-        else:
-            switch = T7Switch.connect(name, T7Switch.Settings(port=self.server.address, **said), self.clock)
+        switch = T7Switch.connect(name, T7Switch.Settings(port=self.port, **said), self.clock)
         self.stack.callback(switch.close)
         return switch
 
@@ -74,8 +67,8 @@ class Laboratory:
 
 
 @pytest.fixture(params=[True, False], ids=["active high", "active low"])
-def lab(kind, request, stack) -> Laboratory:
-    return Laboratory(kind, request.param, stack)
+def lab(request, stack) -> Laboratory:
+    return Laboratory(request.param, stack)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from emulated_bench import Bench, OnABench, serial_port
+from emulated_bench import Bench, OnABench, serial_port, tcp_port
 
 from bench.clock import VirtualClock
 from bench.contracts.faults import SilentInstrumentContract
@@ -16,10 +16,9 @@ from drivers.labjack_t7 import T7HighVoltageSupply
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
 from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
-from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 WATCHDOG = 1
@@ -47,7 +46,7 @@ class Resistor:
         pass
 
 
-class LosingServer:
+class LosingServer(WireServer):
     """A wire server that can lose a command."""
 
     def __init__(self, server):
@@ -116,7 +115,7 @@ def falls_to_zero(volts):
 
 
 PWM = ["emulated average", "emulated rms", "driver average", "driver rms"]
-LINEAR = ["T7 emulated dc", "T7 driver dc"]
+LINEAR = ["T7 driver dc"]
 
 
 @pytest.fixture(params=[*PWM, *LINEAR])
@@ -131,7 +130,7 @@ def output(kind):
 
 @pytest.fixture
 def bench(kind, output, stack):
-    return high_voltage("driver" in kind, stack) if kind in LINEAR else switching("driver" in kind, output, stack)
+    return high_voltage(stack) if kind in LINEAR else switching("driver" in kind, output, stack)
 
 
 def switching(driver, output, stack):
@@ -164,7 +163,7 @@ def switching(driver, output, stack):
     )  # fmt: skip
 
 
-def high_voltage(driver, stack):
+def high_voltage(stack):
     """A T7 and the amplifier behind it; its load draws a current only while the voltage changes."""
     clock, load = VirtualClock(), Resistor()
     world = load.world = World(load, clock)
@@ -185,12 +184,8 @@ def high_voltage(driver, stack):
         settling=0.01,
     )
     said = {"line": 5, "gain": GAIN, "watchdog": WATCHDOG}
-    if driver:
-        server = stack.enter_context(ModbusTcpServer(t7))
-        settings = T7HighVoltageSupply.Settings(port=server.address, **said)
-        device = T7HighVoltageSupply.connect("supply", settings, clock)
-    else:
-        device = EmulatedHighVoltageSupply("supply", t7, **said)
+    settings = T7HighVoltageSupply.Settings(port=tcp_port(stack, t7, clock), **said)
+    device = T7HighVoltageSupply.connect("supply", settings, clock)
     stack.callback(device.close)
     return SupplyBench(
         clock=clock, device=device, instrument=t7, plant=load, facts=facts, requests=t7.requests, amplifier=amplifier

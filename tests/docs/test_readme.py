@@ -69,7 +69,7 @@ def test_the_script_runs(tmp_path, monkeypatch):
     assert len(names["setpoints"]) == 2
 
 
-@pytest.mark.parametrize("rig", ["vo2", "hybrid-direct"])
+@pytest.mark.parametrize("rig", ["vo2", "hybrid"])
 def test_the_protocol_runs_on_every_rig(tmp_path, rig):
     (text,) = (block for block in blocks("python") if "@protocol" in block)
     (tmp_path / "soak.py").write_text(text)

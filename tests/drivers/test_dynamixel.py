@@ -15,6 +15,7 @@ from drivers.dynamixel.mx28 import MX28Settings
 from drivers.dynamixel.protocol2 import ServoLine, frame
 from drivers.dynamixel.protocol2 import crc as driver_crc
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire import WireServer
 
 PORT = "emulated://scripted-servo"
 COUNT = 2.0 * math.pi / 4096
@@ -39,7 +40,7 @@ def packet(servo_id, instruction, parameters=b""):
     return head + crc(head)
 
 
-class Script:
+class Script(WireServer):
     """A servo of a few lines: a table of values, what it received, and answers put into its mouth.
 
     `instead` holds, request by request, bytes to send in place of the right answer (None for the right

@@ -19,6 +19,7 @@ from bench.errors import DeviceConnectionError, DeviceError
 from drivers.flintec_dad141 import FlintecDAD141
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
+from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import RegisterError
 from sim_devices.wire.modbus_rtu import ModbusRtuServer, crc16
 from sim_devices.world import World
@@ -37,7 +38,7 @@ class Still:
         pass
 
 
-class Tap:
+class Tap(WireServer):
     """A line that keeps the bytes, and may alter what comes back."""
 
     def __init__(self, server: ModbusRtuServer) -> None:
@@ -478,7 +479,7 @@ def test_a_damaged_reply_is_asked_for_again(bench, damage):
 
 @needs_pty
 def test_a_late_reply_is_not_taken_for_the_next(bench, pseudo_terminal):
-    class Late:
+    class Late(WireServer):
         slow = False
 
         def receive(self, data: bytes) -> bytes:

@@ -640,7 +640,7 @@ def test_a_host_that_hangs_up_in_the_middle():
 def test_too_few_registers_are_noticed():
     with Scripted(("0001 0000 0006 01 03 d73c 0002", "0001 0000 0005 01 03 02 0011")) as server:
         t7 = LabJackT7("psd", server.address, 1.0)
-        with pytest.raises(DeviceError, match="1 registers where 2"):
+        with pytest.raises(DeviceError, match="the answer has 4 bytes where 6 were expected"):
             t7.read_integer(TEST)
         t7.close()
 

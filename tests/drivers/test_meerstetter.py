@@ -16,6 +16,7 @@ from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
 from drivers.meerstetter import tec as driver
 from drivers.meerstetter.mecom import RefusedError, TECLine, decode, encode
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire import WireServer
 
 PORT = "emulated://scripted-tec"
 REALS = {1000, 1001, 1020, 1021, 2030, 2031, 2060, 3000, 4040, 4041, 6310, 50001, 50002, 50012}
@@ -31,7 +32,7 @@ def bits(number, value):
     return b"%08X" % (value & 0xFFFFFFFF)
 
 
-class Script:
+class Script(WireServer):
     """A device of a few lines: a table of values, what it received, and answers put into its mouth.
 
     `instead` holds, request by request, bytes to send in place of the right answer (None for the right

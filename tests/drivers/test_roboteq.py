@@ -18,6 +18,7 @@ from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupp
 from drivers.roboteq.canopen import NodeLine
 from drivers.roboteq.supply import _VOLTS
 from sim_devices.protocol_emulated import register, unregister
+from sim_devices.wire import WireServer
 
 PORT = "emulated://scripted-supply"
 QUERIES = 0x40
@@ -27,7 +28,7 @@ def line(identifier, data):
     return b"t%03X%d%s\r" % (identifier, len(data), bytes(data).hex().upper().encode())
 
 
-class Script:
+class Script(WireServer):
     """An adapter and a node of a few lines: objects, what was received, and answers put into its mouth.
 
     `objects` holds (value, size) by index and subindex; `instead`, request by request, lines to send in place
@@ -821,7 +822,7 @@ def test_settings_say_what_they_are():
     assert (settings.node, settings.bitrate, settings.channel, settings.watchdog) == (1, 125_000, 1, 1.0)
 
 
-class LocalNode:
+class LocalNode(WireServer):
     """A node of the package canopen behind slcan lines; no emulator of ours takes part."""
 
     def __init__(self, canopen):

@@ -16,16 +16,14 @@ from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
 from bench.clock import VirtualClock
-from bench.errors import DeviceError
-from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, TDAC_STEP, EmulatedT7
-from sim_devices.instruments.t7_roles import EmulatedHighVoltageSupply, EmulatedPositionSensor, EmulatedSwitch
+from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, EmulatedT7
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import STEINHART_HART, Thermistor
 from sim_devices.wire.modbus import RegisterError, answer
-from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpServer, ModbusTcpStream
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpServer, ModbusTcpStream
 from sim_devices.world import World
 
 LSB = 2 * RAIL * 10 / 65536
@@ -44,8 +42,8 @@ class Ramp:
 class Quiet:
     """A generator without noise, for exact vectors."""
 
-    def standard_normal(self) -> float:
-        return 0.0
+    def standard_normal(self, size: int) -> np.ndarray:
+        return np.zeros(size)
 
 
 def make(inputs: dict[int, Callable[[], float]] | None = None, *, seed: int | None = None) -> EmulatedT7:
@@ -711,60 +709,6 @@ def test_monitors_of_the_amplifier_have_noise_and_an_error_of_scale():
     assert abs(hv.voltage - 20.0) > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("output", "register", "offset", "step"),
-    [("tdac5", 30010, 0.0, TDAC_STEP), ("dac1", 1002, 2.5, DAC_STEP)],
-)
-def test_emulated_high_voltage_supply_sends_to_its_output(output, register, offset, step):
-    hv, load, world = amplifier(offset_volts=offset)
-    t7 = EmulatedT7(world, {0: hv.voltage_monitor, 1: hv.current_monitor, 2: hv.status}, rng=Quiet())
-    read = (lambda: t7.tdac_volts(5)) if output == "tdac5" else (lambda: t7.dac_volts(1))
-    t7.add_follower(lambda: hv.drive(read(), t7.dio_level(7, pulled_down=True)))
-    supply = EmulatedHighVoltageSupply("hv", t7, line=7, analog_output=output, offset_volts=offset)
-    assert not hv.on
-    supply.set(12.34)
-    wait(world, 0.01)
-    assert load.volts == pytest.approx(12.34, abs=20.0 * step / 2 + 1e-6)
-    assert load.volts / (20.0 * step) == pytest.approx(round(load.volts / (20.0 * step)), abs=1e-6)
-
-
-def test_emulated_high_voltage_supply_passes_a_refusal_on():
-    hv, _, world = amplifier()
-    t7 = EmulatedT7(world, {2: hv.status}, rng=Quiet())
-    supply = EmulatedHighVoltageSupply("hv", t7, line=7)
-    t7.write_value(9000, 0)
-    with pytest.raises(DeviceError, match="hv: the instrument refuses"):
-        supply.measure()
-
-
-def test_emulated_switch_keeps_what_else_is_under_the_watchdog(t7):
-    arm(t7)
-    switch = EmulatedSwitch("fan", t7, line=5, watchdog=60)
-    switch.set(1.0)
-    t7.write_value(1000, 4.0)
-    t7.write_value(2000, 1)
-    t7.write_value(2001, 1)
-    assert t7.read_value(61604) == 2
-    t7.world.clock.sleep(2.0)
-    t7.world.advance()
-    assert t7.dac_volts(0) == pytest.approx(0.5, abs=DAC_STEP / 2)
-    assert not t7.dio_level(0)
-    assert not t7.dio_level(5)
-    assert t7.dio_level(1)
-
-
-def test_emulated_sensor_refuses_a_wrong_number_of_channels(t7):
-    with pytest.raises(ValueError, match="currents needs 2, got 1"):
-        EmulatedPositionSensor("tip", t7, readout="currents", channels=(0,))
-
-
-def test_emulated_sensor_passes_a_refusal_on(t7):
-    sensor = EmulatedPositionSensor("tip", t7)
-    t7.write_value(9000, 0)
-    with pytest.raises(DeviceError, match="tip: the instrument refuses"):
-        sensor.measure()
-
-
 # The wire
 
 
@@ -814,6 +758,47 @@ def test_requests_may_come_in_any_pieces(cuts):
     assert replies == b"".join(frame(reply) for _, reply in VECTORS)
 
 
+FEEDBACK_VECTORS = [  # LabJack's function 76: kind, address, number of registers, and the values of a write
+    ("0001 0000 0006 01 4c 00 d73c 02", "0001 0000 0006 01 4c 0011 2233"),
+    ("0002 0000 000a 01 4c 00 d73c 02 00 d754 02", "0002 0000 000a 01 4c 0011 2233 c61c 3c00"),
+    ("0003 0000 000e 01 4c 01 03e8 02 4020 0000 00 03e8 02", "0003 0000 0006 01 4c 4020 0000"),  # DAC0 and back
+    ("0004 0000 000a 01 4c 01 03ea 02 3fc0 0000", "0004 0000 0002 01 4c"),  # a write alone has no values
+    ("0005 0000 0002 01 4c", "0005 0000 0003 01 cc 03"),
+    ("0006 0000 0005 01 4c 00 d73c", "0006 0000 0003 01 cc 03"),
+    ("0007 0000 0006 01 4c 02 d73c 02", "0007 0000 0003 01 cc 03"),  # a kind that there is not
+    ("0008 0000 0006 01 4c 00 d73c 00", "0008 0000 0003 01 cc 03"),
+    ("0009 0000 0008 01 4c 01 03e8 02 4020", "0009 0000 0003 01 cc 03"),  # half of the value
+    ("000a 0000 0006 01 4c 00 7530 02", "000a 0000 0003 01 cc 02"),  # TDAC0 can only be written
+    ("000b 0000 0006 01 4c 00 ffff 02", "000b 0000 0003 01 cc 02"),
+]
+
+
+def test_byte_vectors_of_feedback(wired):
+    stream = ModbusTcpStream(wired)
+    for sent, reply in FEEDBACK_VECTORS:
+        assert stream.receive(frame(sent)).hex(" ") == frame(reply).hex(" ")
+    assert [wired.dac_volts(n) for n in (0, 1)] == pytest.approx([2.5, 1.5], abs=DAC_STEP)
+
+
+def test_feedback_carries_out_what_is_before_a_refusal(wired):
+    stream = ModbusTcpStream(wired)
+    request = "0001 0000 0013 01 4c 01 03e8 02 4020 0000 01 a21c 01 0009 00 d73c 02"
+    assert stream.receive(frame(request)) == frame("0001 0000 0003 01 cc 04")
+    assert wired.dac_volts(0) == pytest.approx(2.5, abs=DAC_STEP)
+    assert wired.read_value("LAST_ERR_DETAIL") == 2375
+
+
+def test_a_reply_to_feedback_that_does_not_fit_into_a_packet_is_refused(wired):
+    stream = ModbusTcpStream(wired)
+    body = "4c" + "00 0000 1c" * 19  # AIN0 to AIN13, 56 bytes each
+    request = f"0001 0000 {len(frame(body)) + 1:04x} 01" + body
+    assert stream.receive(frame(request)) == frame("0001 0000 0003 01 cc 03")
+
+
+def test_feedback_is_no_function_of_other_instruments(wired):
+    assert answer(wired, frame("4c 00 d73c 02")) == frame("cc 01")
+
+
 @given(st.binary(min_size=1, max_size=253))
 def test_any_request_is_answered(request_bytes):
     reply = answer(make(), request_bytes)
@@ -832,7 +817,7 @@ def test_any_bytes_are_answered_or_end_the_connection(pieces):
         pass
 
 
-@pytest.mark.parametrize("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 00ff 01"])
+@pytest.mark.parametrize("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 040b 01"])
 def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
     with ModbusTcpServer(wired) as server:
         with socket.create_connection(("127.0.0.1", server.port), timeout=60) as spoilt:
@@ -856,7 +841,7 @@ def test_several_requests_in_one_segment(wired):
         assert received == expected
 
 
-def test_many_clients_at_once(wired):
+def test_two_clients_at_once(wired):
     failures = []
 
     def ask(port: int) -> None:
@@ -867,12 +852,56 @@ def test_many_clients_at_once(wired):
                     failures.append(sent)
 
     with ModbusTcpServer(wired) as server:
-        threads = [threading.Thread(target=ask, args=(server.port,)) for _ in range(8)]
+        threads = [threading.Thread(target=ask, args=(server.port,)) for _ in range(2)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
     assert not failures
+
+
+def test_a_third_connection_is_refused_until_one_ends(wired):
+    instrument = ModbusTcpInstrument(wired)
+    first, second = instrument.connect(), instrument.connect()
+    with pytest.raises(ConnectionRefusedError, match="the instrument has 2 open already"):
+        instrument.connect()
+    second.close()
+    second.close()
+    with pytest.raises(ConnectionResetError, match="closed"):
+        second.receive(frame(VECTORS[0][0]))
+    third = instrument.connect()
+    with pytest.raises(FramingError):
+        third.receive(frame("0001 0001 0006 01 03 0000 0001"))
+    for each in (first, instrument.connect()):
+        assert each.receive(frame(VECTORS[0][0])) == frame(VECTORS[0][1])
+
+
+def test_a_third_client_is_hung_up_on_and_disturbs_no_other(wired):
+    def connected() -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", server.port), timeout=60)
+        client.sendall(frame(VECTORS[0][0]))
+        return client
+
+    def served(client: socket.socket) -> bool:
+        try:
+            return client.recv(100) == frame(VECTORS[0][1])
+        except ConnectionResetError:
+            return False
+
+    with ModbusTcpServer(wired) as server, connected() as first, connected() as second:
+        assert served(first)
+        assert served(second)
+        with connected() as third:
+            assert not served(third)
+        first.sendall(frame(VECTORS[0][0]))
+        assert served(first)
+        second.close()
+        for _ in range(1000):  # the server may see the end of the second a little later
+            with connected() as another:
+                if served(another):
+                    break
+        else:
+            pytest.fail("no connection became free")
 
 
 def test_start_and_close_leave_nothing(wired):

@@ -5,9 +5,11 @@ import pytest
 import serial
 
 from sim_devices import protocol_emulated
+from sim_devices.wire import WireServer
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 
 
-class Echo:
+class Echo(WireServer):
     """Answers every line with itself, reversed."""
 
     def __init__(self):
@@ -45,8 +47,12 @@ class TestAddress:
 
     @pytest.mark.usefixtures("echo")
     def test_is_not_given_twice(self, clock):
-        with pytest.raises(ValueError, match="emulated://echo is taken"):
-            protocol_emulated.register("echo", Echo(), clock)
+        others = [protocol_emulated.register("echo", Echo(), clock) for _ in range(2)]
+        try:
+            assert others == ["emulated://echo-2", "emulated://echo-3"]
+        finally:
+            for other in others:
+                protocol_emulated.unregister(other)
 
     @pytest.mark.usefixtures("echo")
     def test_is_free_again_after_unregistering(self, clock):
@@ -77,7 +83,7 @@ class TestAddress:
         code = (
             "import sys, threading, serial; before = list(serial.protocol_handler_packages); "
             "import sim_devices.protocol_emulated as p; "
-            "assert serial.protocol_handler_packages == before; assert p._servers == {}; "
+            "assert serial.protocol_handler_packages == before; assert p._sockets == {}; "
             "assert threading.active_count() == 1"
         )
         subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
@@ -137,7 +143,7 @@ class TestTime:
         assert clock.now() - before == pytest.approx(16 * 10 / 9600, rel=1e-9)
 
     def test_the_instrument_gets_its_request_when_the_last_byte_has_gone(self, clock):
-        class Watch:
+        class Watch(WireServer):
             def receive(self, _):
                 self.at = clock.now()
                 return b"12345"
@@ -201,6 +207,121 @@ class TestTime:
             port.read(1)
 
 
+class Beating(WireServer):
+    """Sends a beat by itself every 0.3 s from 0.3 s on, and answers nothing."""
+
+    def __init__(self, clock):
+        self.clock = clock
+        self.sent = 0
+
+    def receive(self, data):  # noqa: ARG002
+        return b""
+
+    def unsolicited(self):
+        due = int(self.clock.now() / 0.3 + 1e-9) - self.sent
+        self.sent += due
+        return b"b" * due
+
+    def next_unsolicited(self):
+        return 0.3 * (self.sent + 1)
+
+
+class TestUnsolicited:
+    @pytest.fixture
+    def port(self, clock):
+        address = protocol_emulated.register("heart", Beating(clock), clock)
+        with serial.serial_for_url(address, baudrate=1e6, timeout=1.0) as port:
+            yield port
+        protocol_emulated.unregister(address)
+
+    def test_what_has_come_is_there(self, port, clock):
+        assert port.in_waiting == 0
+        clock.sleep(0.7)
+        assert port.in_waiting == 2
+        assert port.read(2) == b"bb"
+        assert clock.now() == 0.7
+
+    def test_a_read_waits_for_it_and_no_longer(self, port, clock):
+        assert port.read(1) == b"b"
+        assert clock.now() == pytest.approx(0.3)
+        assert port.read(2) == b"bb"
+        assert clock.now() == pytest.approx(0.9)
+
+    def test_a_read_ends_at_its_timeout(self, port, clock):
+        assert port.read(10) == b"bbb"
+        assert clock.now() == 1.0
+
+    def test_a_read_without_a_timeout_waits_for_what_will_come(self, port, clock):
+        port.timeout = None
+        assert port.read(4) == b"bbbb"
+        assert clock.now() == pytest.approx(1.2)
+
+    def test_it_comes_while_something_is_sent(self, port, clock):
+        port.baudrate = 100
+        port.write(b"12345")
+        assert clock.now() == 0.5
+        assert port.in_waiting == 1
+
+    def test_it_can_be_forgotten(self, port, clock):
+        clock.sleep(0.7)
+        port.reset_input_buffer()
+        assert port.in_waiting == 0
+
+
+class Bank:
+    """A bank of registers that read as their addresses."""
+
+    def read_registers(self, address, count):
+        return list(range(address, address + count))
+
+    def write_registers(self, address, values):
+        pass
+
+
+class TestConnection:
+    READ = bytes.fromhex("0001 0000 0006 01 03 0005 0001")
+    REPLY = bytes.fromhex("0001 0000 0005 01 03 02 0005")
+
+    @pytest.fixture
+    def address(self, clock):
+        address = protocol_emulated.register("meter", ModbusTcpInstrument(Bank()), clock)
+        yield address
+        protocol_emulated.unregister(address)
+
+    def test_bytes_take_no_time(self, address, clock):
+        with serial.serial_for_url(address, timeout=1.0) as port:
+            port.write(self.READ[:3])
+            assert port.in_waiting == 0
+            port.write(self.READ[3:])
+            assert port.read(len(self.REPLY)) == self.REPLY
+            assert clock.now() == 0.0
+            assert port.read(1) == b""
+            assert clock.now() == 1.0
+
+    def test_the_instrument_accepts_two(self, address):
+        first, second = (serial.serial_for_url(address) for _ in range(2))
+        with pytest.raises(serial.SerialException, match=r"emulated://meter: connection refused"):
+            serial.serial_for_url(address)
+        second.close()
+        with serial.serial_for_url(address) as third:
+            third.write(self.READ)
+            assert third.in_waiting == len(self.REPLY)
+        first.close()
+
+    def test_a_foreign_frame_ends_it(self, address):
+        with serial.serial_for_url(address) as port:
+            for _ in range(2):
+                with pytest.raises(serial.SerialException, match="emulated://meter ended the connection"):
+                    port.write(b"\xff" * 8)
+
+    def test_it_does_not_outlive_the_instrument(self, address, clock):
+        with serial.serial_for_url(address) as port:
+            protocol_emulated.unregister(address)
+            assert protocol_emulated.register("meter", ModbusTcpInstrument(Bank()), clock) == address
+            with pytest.raises(serial.SerialException, match="emulated://meter was unplugged"):
+                port.write(self.READ)
+
+
 class TestLine:
     @pytest.mark.usefixtures("echo")
     def test_a_port_that_is_not_open(self):
@@ -248,7 +369,7 @@ class TestLine:
 
     @pytest.mark.usefixtures("echo")
     def test_two_ports_do_not_mix(self, clock):
-        class Other:
+        class Other(WireServer):
             def receive(self, data):
                 return data.upper()
 

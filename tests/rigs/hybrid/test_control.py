@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from bench.control.references import AddedSine, SmoothMoves, staircase
 from bench.identification.dynamics import identify_dynamics
@@ -489,6 +490,46 @@ def test_kalman_filter_finds_deflection_and_offset(room):
     # A warmer room heats the tip too, which the model knows nothing of: part of the offset then.
     if room == 22.0:
         assert abs(offset - 0.3 * MICRO) < 4 * uncertainty < 0.1 * MICRO
+
+
+def test_kalman_filter_is_that_of_an_independent_package():
+    noise, rng, every = ThermalNoise(), np.random.default_rng(2), 4
+    rises = np.linspace(-20.0, 25.0, 12)
+    bending = Bending(identify_polynomial(rises, MICRO * (-7.4 * rises - 0.05 * rises**2), 2).model)
+    reduced = ReducedNetwork(Design().network(), 22.0)
+    current = 0.06
+
+    def move(state, dt):
+        base, tip, heat, offset = state
+        constant, slope = reduced.heat_flow(current)
+        along = (base - tip) * reduced.along
+        base += dt * (constant + slope * base + heat - along) / reduced.base_capacity
+        return [base, tip + dt * (along - reduced.tip_air * tip) / reduced.tip_capacity, heat, offset]
+
+    def observe(state):
+        return [state[0], state[1], bending.deflection(state[1]) + state[3]]
+
+    points = MerweScaledSigmaPoints(4, alpha=1.0, beta=0.0, kappa=0.0)
+    reference = UnscentedKalmanFilter(4, 3, every * PERIOD, observe, move, points)
+    reference.Q = np.diag(np.square([noise.base, noise.tip, noise.heat, noise.offset])) * every * PERIOD
+    reference.R = np.diag(np.square([noise.thermistor, noise.thermistor, noise.deflection / math.sqrt(every)]))
+    spread = 2.0 * abs(bending.slope(0.0)) * noise.thermistor
+    reference.P = np.diag(np.square([noise.thermistor, noise.thermistor, 10.0 * noise.heat, spread]))
+
+    kalman = UnscentedEstimate(bending, reduced, noise, PERIOD, every)
+    kalman.begin(0.0, 0.0, 0.0)
+    for k in range(300):
+        base, tip, deflection = 0.002 * k, 0.0015 * k, -0.011 * k * MICRO
+        base, tip = np.array([base, tip]) + 0.02 * rng.standard_normal(2)
+        kalman.sample(deflection)
+        kalman.correct(base, tip, current)
+        reference.predict()
+        reference.update(np.array([base, tip, deflection]))
+        thermal = bending.deflection(reference.x[1]) + reference.x[3]
+        assert kalman.value == pytest.approx(thermal, rel=1e-9, abs=1e-15)
+        offset, uncertainty = kalman.describe(0.0)
+        assert offset == pytest.approx(reference.x[3], rel=1e-6, abs=1e-15)
+        assert uncertainty == pytest.approx(math.sqrt(reference.P[3, 3]), rel=1e-6)
 
 
 # Wrong input.

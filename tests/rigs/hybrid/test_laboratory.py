@@ -1,6 +1,4 @@
-"""The laboratory of the hybrid: the same by wire and called directly, its wiring, its faults, and what it leaves."""
-
-import socket
+"""The laboratory of the hybrid: with and without the witness, its wiring, its faults, and what it leaves."""
 
 import numpy as np
 import pytest
@@ -11,21 +9,18 @@ from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from bench.rig import Rig
 from bench.rig_file import load_rig
+from bench.roles import TECMode
 from rigs.hybrid.laboratory import (
     ENABLE_LINE,
     GAIN,
     REACH,
-    DirectHighVoltageSupply,
-    DirectPositionSensor,
-    DirectTEC,
-    DirectTemperatureSensor,
-    DirectWitness,
     HybridLaboratory,
     HybridLaboratorySettings,
 )
+from rigs.hybrid.witness import Witness
 
-WIRED, DIRECT = "hybrid", "hybrid-direct"
-RIGS = (WIRED, DIRECT)
+PLAIN, WITNESSED = "hybrid", "hybrid-witness"
+RIGS = (PLAIN, WITNESSED)
 TDAC0, WATCHDOG = 30000, 5.0
 """Register of the amplifier's set-point, and the time after which the T7's watchdog lets the enable line fall, s."""
 RESONANCE = 693.7
@@ -35,7 +30,7 @@ def laboratory(seed=1, **settings):
     return HybridLaboratory(HybridLaboratorySettings(**settings), VirtualClock(), seed)
 
 
-def rig(name=WIRED, seed=1, **emulation):
+def rig(name=PLAIN, seed=1, **emulation):
     overrides = {f"emulation.{key}": str(value) for key, value in emulation.items()}
     return Rig(load_rig(name, overrides), VirtualClock(), seed)
 
@@ -53,7 +48,7 @@ def look(rig, until):
     rig.clock.sleep_until(until)
 
 
-class TestWiredAndDirect:
+class TestWitnessed:
     def drive(self, name, seed=3):
         with rig(name, seed) as bench:
             bench.clock.sleep_until(1.0)
@@ -65,21 +60,12 @@ class TestWiredAndDirect:
             bench.laboratory.world.advance()
             return bench.glance(), bench.laboratory.plant.deflection
 
-    def test_physics_are_the_same(self):
-        (wired, bent), (direct, bent_directly) = self.drive(WIRED), self.drive(DIRECT)
-        # By wire the set-points come some milliseconds later.
-        assert bent == pytest.approx(bent_directly, abs=20e-9)
+    def test_the_witness_changes_nothing(self):
+        (plain, bent), (witnessed, bent_as_well) = self.drive(PLAIN), self.drive(WITNESSED)
+        assert bent == bent_as_well == witnessed.pop("witness_position")
+        assert plain == witnessed
         assert bent < -80e-6
-        for name, noise in (
-            ("displacement_position", 10e-9),
-            ("base_temperature", 0.02),
-            ("tip_temperature", 0.02),
-            ("tec_temperature", 0.02),
-            ("tec_current", 1e-3),
-            ("piezo_voltage", 0.05),
-        ):
-            assert wired[name] == pytest.approx(direct[name], abs=8 * noise), name
-        assert wired["displacement_position"] == pytest.approx(bent, abs=60e-9)
+        assert plain["displacement_position"] == pytest.approx(bent, abs=60e-9)
 
     def test_signals_are_the_same_but_for_the_witness(self):
         signals = []
@@ -91,17 +77,18 @@ class TestWiredAndDirect:
         assert len(signals[1]) == len(signals[0]) + 1
 
     def test_rig_files_say_the_same(self):
-        wired, direct, real = map(load_rig, (*RIGS, "hybrid-hardware"))
-        for other in (direct, real):
-            assert other.interlocks == wired.interlocks
-            assert other.telemetry == wired.telemetry
-            assert other.dashboard == wired.dashboard
-        assert [entry.name for entry in real.devices] == [entry.name for entry in wired.devices]
-        for ours, theirs in zip(wired.devices, real.devices, strict=True):
+        plain, witnessed, real = map(load_rig, (*RIGS, "hybrid-hardware"))
+        for other in (witnessed, real):
+            assert other.interlocks == plain.interlocks
+            assert other.telemetry == plain.telemetry
+            assert other.dashboard == plain.dashboard
+        assert witnessed.devices[:-1] == plain.devices
+        assert [entry.name for entry in real.devices] == [entry.name for entry in plain.devices]
+        for ours, theirs in zip(plain.devices, real.devices, strict=True):
             assert ours.driver is theirs.driver
             assert ours.settings.model_dump(exclude={"port"}) == theirs.settings.model_dump(exclude={"port"})
-        assert wired.emulated
-        assert direct.emulated
+        assert plain.emulated
+        assert witnessed.emulated
         assert not real.emulated
 
     def test_limits_are_the_same(self):
@@ -214,10 +201,11 @@ class TestCooler:
             assert bench.laboratory.plant.current == pytest.approx(0.15)
 
     def test_the_limit_is_a_setting(self):
-        with rig(DIRECT, current_limit=0.05) as bench:
-            with pytest.raises(LimitError, match=r"outside of -0.05 to 0.05 A"):
-                bench.devices["tec"].set(0.06)
-            bench.devices["tec"].set(-0.05)
+        tec = laboratory(current_limit=0.05).tec
+        tec.select_mode(TECMode.CURRENT)
+        with pytest.raises(LimitError, match=r"outside of -0.05 to 0.05 A"):
+            tec.set(0.06)
+        tec.set(-0.05)
 
     @pytest.mark.parametrize("name", RIGS)
     @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -299,17 +287,6 @@ class TestFaults:
             with pytest.raises(DeviceError, match=words):
                 bench.devices[device].glance()
 
-    @pytest.mark.parametrize(("fault", "device"), [entry[:2] for entry in FAULTS])
-    def test_each_is_seen_without_a_wire_too(self, fault, device):
-        with rig(DIRECT, fault=fault, fault_time=8.0) as bench:
-            bench.devices["tec"].set(0.05)
-            bench.devices["piezo"].set(10.0)
-            look(bench, 7.9)
-            bench.glance()
-            bench.clock.sleep_until(8.1)
-            with pytest.raises(DeviceError, match=f"^{device}: "):
-                bench.devices[device].glance()
-
     def test_an_amplifier_that_tripped_stays_off_until_it_is_disabled(self):
         bench = laboratory(fault="amplifier-trips", fault_time=1.0)
         bench.t7.write_value(TDAC0, 5.0)
@@ -329,7 +306,7 @@ class TestFaults:
 
     @pytest.mark.parametrize(("fault", "number"), [("tec-over-current", 100), ("tec-over-temperature", 138)])
     def test_a_controller_that_tripped_drives_no_current(self, fault, number):
-        with rig(DIRECT, fault=fault, fault_time=5.0) as bench:
+        with rig(fault=fault, fault_time=5.0) as bench:
             bench.devices["tec"].set(0.1)
             wait(bench.laboratory, 4.9)
             assert bench.laboratory.plant.current == pytest.approx(0.1)
@@ -350,48 +327,33 @@ class TestOpening:
         bench = laboratory()
         for _ in range(2):
             ports = bench.open()
-            assert set(ports) == {"tec", "t7"}
-            host, port = ports["t7"].removeprefix("tcp://").split(":")
-            socket.create_connection((host, int(port))).close()
+            assert ports == {name: f"emulated://{name}" for name in ("tec", "t7", "witness")}
+            for port in ports.values():
+                serial.serial_for_url(port).close()
             bench.close()
-            with pytest.raises(ConnectionRefusedError):
-                socket.create_connection((host, int(port)))
-            with pytest.raises(serial.SerialException, match="there are: none"):
-                serial.serial_for_url(ports["tec"])
-
-    def test_the_same_without_wires(self):
-        bench = laboratory(direct=True)
-        for _ in range(2):
-            assert set(bench.open()) == {"tec", "displacement", "base", "tip", "piezo", "witness"}
-            bench.close()
-            with pytest.raises(DeviceConnectionError, match="there are: none"):
-                DirectTEC.connect("tec", DirectTEC.Settings(port="tec"), bench.world.clock)
+            for port in ports.values():
+                with pytest.raises(serial.SerialException, match="there are: none"):
+                    serial.serial_for_url(port)
 
     @pytest.mark.parametrize("name", RIGS)
-    def test_a_second_one_leaves_the_first_as_it_is(self, name):
-        with rig(name, seed=1) as bench:
-            second = laboratory(seed=2, direct=name == DIRECT)
-            with pytest.raises((ValueError, ConfigurationError), match=r"is taken|another rig"):
-                second.open()
-            second.close()
-            assert bench.glance()["base_temperature"] == pytest.approx(22.0, abs=1.0)
-            third = laboratory(seed=3, direct=name == DIRECT)
-            with pytest.raises((ValueError, ConfigurationError), match=r"is taken|another rig"):
-                third.open()
-        with rig(name, seed=2) as bench:
-            assert bench.glance()["base_temperature"] == pytest.approx(22.0, abs=1.0)
-
-    def test_a_second_direct_one_in_a_process_is_refused(self):
-        with rig(DIRECT), pytest.raises(ConfigurationError, match="another rig with directly called instruments"):
-            rig(DIRECT)
-
-    def test_one_of_each_kind_may_be_open(self):
-        with rig(WIRED) as wired, rig(DIRECT) as direct:
-            direct.devices["piezo"].set(20.0)
-            for bench in (wired, direct):
+    def test_two_in_one_process_do_not_disturb_each_other(self, name):
+        with rig(name, seed=1) as first, rig(name, seed=2) as second:
+            second.devices["piezo"].set(20.0)
+            second.devices["tec"].set(0.05)
+            for bench in (first, second):
                 bench.clock.sleep_until(1.0)
-            assert wired.glance()["piezo_voltage"] == pytest.approx(0.0, abs=0.3)
-            assert direct.glance()["piezo_voltage"] == pytest.approx(20.0, abs=0.3)
+            assert first.glance()["piezo_voltage"] == pytest.approx(0.0, abs=0.3)
+            assert second.glance()["piezo_voltage"] == pytest.approx(20.0, abs=0.3)
+            assert first.laboratory.plant.current == 0.0
+            assert second.laboratory.plant.current == pytest.approx(0.05)
+
+    def test_each_has_addresses_of_its_own_for_what_is_in_it(self):
+        first, second = laboratory(seed=1), laboratory(seed=2)
+        ports = [*first.open().values(), *second.open().values()]
+        assert len(set(ports)) == 6
+        assert set(first.servers) == {"tec", "t7", "witness"}
+        first.close()
+        second.close()
 
     def test_closing_twice_or_what_was_never_opened_does_no_harm(self):
         bench = laboratory()
@@ -405,58 +367,37 @@ class TestOpening:
             laboratory().operate("load", 1.0)
 
 
-class TestDirect:
-    CLASSES = (
-        (DirectTEC, "tec"),
-        (DirectPositionSensor, "displacement"),
-        (DirectTemperatureSensor, "base"),
-        (DirectTemperatureSensor, "tip"),
-        (DirectHighVoltageSupply, "piezo"),
-        (DirectWitness, "witness"),
-    )
+class TestWitness:
+    def test_needs_an_emulated_laboratory(self):
+        with pytest.raises(DeviceConnectionError, match="witness: cannot connect to emulated://witness: no emulated"):
+            Witness.connect("witness", Witness.Settings(port="emulated://witness"), VirtualClock())
 
-    @pytest.mark.parametrize(("kind", "name"), CLASSES)
-    def test_needs_a_laboratory_with_direct(self, kind, name):
-        with pytest.raises(DeviceConnectionError) as caught:
-            kind.connect(name, kind.Settings(port=f"emulated://{name}"), VirtualClock())
-        assert str(caught.value) == (
-            f"{name}: no such instrument at emulated://{name}; "
-            "there are: none: the table [emulation] needs direct = true"
-        )
-
-    def test_a_rig_whose_laboratory_has_wires_says_so(self):
-        with pytest.raises(DeviceConnectionError, match=r"tec: no such .*\[emulation\] needs direct = true"):
-            rig(DIRECT, direct="false")
-
-    @pytest.mark.parametrize(("kind", "name"), CLASSES)
-    def test_another_kind_of_instrument_is_refused(self, kind, name):
-        bench = laboratory(direct=True)
-        bench.open()
+    def test_another_instrument_is_refused(self):
+        bench = laboratory()
+        ports = bench.open()
         try:
-            for other, port in self.CLASSES:
-                if other is not kind:
-                    with pytest.raises(DeviceConnectionError, match=f"no such instrument at {port}; there are: "):
-                        kind.connect(port, kind.Settings(port=port), bench.world.clock)
-            assert isinstance(kind.connect(name, kind.Settings(port=name), bench.world.clock), kind.__mro__[1])
+            with pytest.raises(DeviceConnectionError, match="thermometer: no witness at emulated://tec"):
+                Witness.connect("thermometer", Witness.Settings(port=ports["tec"]), bench.world.clock)
         finally:
             bench.close()
 
-    def test_another_name_is_refused_as_its_signals_would_have_the_first(self):
-        file = load_rig(DIRECT, {"devices.base.port": "emulated://tip"})
-        with pytest.raises(DeviceConnectionError) as caught:
-            Rig(file, VirtualClock(), 1)
-        assert str(caught.value) == "base: is called directly and has to be named tip, as it is there"
-        # What was open before is closed again.
-        rig(DIRECT).__exit__(None, None, None)
+    @pytest.mark.parametrize("request_", ["03 0000 0002", "03 0001 0004", "10 0000 0004 08 0000 0000 0000 0000"])
+    def test_has_one_value_that_can_only_be_read(self, request_):
+        bench = laboratory()
+        stream = bench.servers["witness"].connect()
+        body = bytes.fromhex(request_)
+        reply = stream.receive(bytes([0, 1, 0, 0, 0, len(body) + 1, 1]) + body)
+        assert reply == bytes([0, 1, 0, 0, 0, 3, 1, body[0] | 0x80, 2])
 
     def test_the_witness_sees_the_deflection_itself(self):
-        with rig(DIRECT) as bench:
+        with rig(WITNESSED) as bench:
             witness, sensor, plant = bench.devices["witness"], bench.devices["displacement"], bench.laboratory.plant
             bench.devices["tec"].set(-0.1)
             bench.devices["piezo"].set(20.0)
             errors = []
             for k in range(1, 101):
                 bench.clock.sleep_until(0.5 * k)
+                bench.devices["tec"].glance()  # feeds its watchdog
                 seen = witness.glance()
                 assert seen == witness.measure() == {"witness_position": plant.deflection}
                 errors.append(sensor.glance()["displacement_position"] - seen["witness_position"])
@@ -466,16 +407,15 @@ class TestDirect:
             assert abs(np.mean(errors)) < 10e-9
 
     def test_the_witness_has_nothing_to_switch_off(self):
-        with rig(DIRECT) as bench:
+        with rig(WITNESSED) as bench:
             witness = bench.devices["witness"]
             before = witness.measure()
             witness.safe()
-            witness.close()
             assert witness.measure() == before
             assert str(witness.identity).startswith("emulated witness")
 
     def test_the_sensor_ends_where_the_rig_file_says(self):
-        settings = next(entry.settings for entry in load_rig(WIRED).devices if entry.name == "displacement")
+        settings = next(entry.settings for entry in load_rig(PLAIN).devices if entry.name == "displacement")
         assert settings.position_limits == (-REACH, REACH)
 
 
@@ -494,7 +434,6 @@ class TestSettings:
             ("fault", "fire", "'open-thermistor'"),
             ("fault_time", "-1", "greater than or equal to 0"),
             ("fault_time", "nan", "finite number"),
-            ("direct", "2", "valid boolean"),
             ("temperature", "20", "there is no such key"),
         ],
     )

@@ -29,7 +29,7 @@ from rigs.hybrid.identification import read_loop, read_loops
 from rigs.hybrid.laboratory import ENABLE_LINE, HybridLaboratory
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 
-WIRED, DIRECT = "hybrid", "hybrid-direct"
+PLAIN, WITNESSED = "hybrid", "hybrid-witness"
 DEFLECTION, BASE, TIP = "displacement_position", "base_temperature", "tip_temperature"
 WITNESS = "witness_position"
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
@@ -71,12 +71,12 @@ def parsed(protocol, settings):
 
 
 @cache
-def slots_of(protocol, rig=WIRED):
+def slots_of(protocol, rig=PLAIN):
     with Rig(load_rig(rig), VirtualClock(), 1) as connected:
         return connected.slots(find_protocol(protocol))
 
 
-def planned(protocol, rig=WIRED, **settings):
+def planned(protocol, rig=PLAIN, **settings):
     return plan(*parsed(protocol, settings), slots_of(protocol, rig))
 
 
@@ -130,7 +130,7 @@ class TestPlan:
         assert expected.extremes == EXTREMES.get(protocol, {})
 
     @pytest.mark.parametrize("protocol", [entry[0] for entry in DEFAULTS])
-    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
     def test_both_rigs_have_what_they_need(self, files, rig, protocol):
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         definition, parameters = parsed(protocol, settings)
@@ -142,12 +142,12 @@ class TestPlan:
     @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
     def test_a_witness_only_where_there_is_one(self, files, protocol):
         settings = {"model": files["hybrid"], "witness": True}
-        expected = planned(protocol, DIRECT, **settings)
+        expected = planned(protocol, WITNESSED, **settings)
         assert WITNESS in expected.watched
-        with Rig(load_rig(DIRECT), VirtualClock(), 1) as rig:
+        with Rig(load_rig(WITNESSED), VirtualClock(), 1) as rig:
             check_before_moving(rig, find_protocol(protocol), expected)
         with pytest.raises(ConfigurationError, match=r"witness: the rig binds no \[roles\.witness\]"):
-            planned(protocol, WIRED, **settings)
+            planned(protocol, PLAIN, **settings)
 
     def test_durations_follow_the_settings(self, files):
         assert planned("current-sine", frequencies="0.01, 0.05", periods=3).seconds == pytest.approx(300.0 + 60.0)
@@ -377,7 +377,7 @@ class TestRefused:
 
     def test_a_staircase_beyond_the_rig_s_limits_is_found_before_anything_moves(self, bench, tmp_path):
         code, _, err = bench(
-            "run", "thermomechanical", "--rig", WIRED, "--clock", "virtual", "--set", "hottest=0.2", "--out", tmp_path
+            "run", "thermomechanical", "--rig", PLAIN, "--clock", "virtual", "--set", "hottest=0.2", "--out", tmp_path
         )
         assert code == 2
         assert "would set tec to between -0.15 and 0.2 A; rig hybrid allows -0.15 to 0.15 A" in flat(err)
@@ -407,7 +407,7 @@ def record(folder, protocol, rig, **settings):
 class TestRuns:
     def test_a_slow_loop_keeps_the_watchdogs_fed(self, tmp_path):
         """Ten seconds from sample to sample, where five without a word switch everything off."""
-        run = record(tmp_path, "current-sine", WIRED, rate=0.1, frequencies="0.01")
+        run = record(tmp_path, "current-sine", PLAIN, rate=0.1, frequencies="0.01")
         samples = read_loops(run)["0.01 Hz"]
         assert len(samples.times) == 20
         assert samples.period == pytest.approx(10.0)
@@ -415,11 +415,11 @@ class TestRuns:
             # A reading by wire takes some milliseconds.
             assert np.diff(found.telemetry()["t"]).max() <= 2.01
 
-    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
     @pytest.mark.parametrize("controller", ["hybrid", "thermal-feedback", "open-loop"])
     def test_control(self, files, tmp_path, rig, controller):
         settings = {"positions": "4e-6", "hold": 8, "controller": controller, "model": files["hybrid"]}
-        if rig == WIRED and controller != "hybrid":
+        if rig == PLAIN and controller != "hybrid":
             settings["hold"] = 1
         run = record(tmp_path, "hybrid-control", rig, **settings)
         samples = read_loop(run)
@@ -437,7 +437,7 @@ class TestRuns:
 
     @pytest.mark.parametrize("step", [5e-6, -3e-6])
     def test_a_fine_step_has_every_sample(self, files, tmp_path, step):
-        run = record(tmp_path, "fine-step", DIRECT, model=files["hybrid"], step=step, witness=True)
+        run = record(tmp_path, "fine-step", WITNESSED, model=files["hybrid"], step=step, witness=True)
         samples = read_loop(run)
         assert len(samples.times) == 5000
         assert samples.period == pytest.approx(50e-6, rel=1e-9)
@@ -450,7 +450,7 @@ class TestRuns:
 
     def test_the_same_loop_in_wall_clock_time(self, bench, tmp_path):
         code, _, err = bench(
-            "run", "piezo-loops", "--rig", WIRED, "--clock", "wall", "--out", tmp_path,
+            "run", "piezo-loops", "--rig", PLAIN, "--clock", "wall", "--out", tmp_path,
             "--json", tmp_path / "run.json",
             *assignments("--set", {"amplitudes": "10", "frequency": 1, "rate": 200}),
         )  # fmt: skip
@@ -495,7 +495,7 @@ class TestBadInput:
         monkeypatch.setattr(HybridLaboratory, "open", remember)
         return opened
 
-    @pytest.mark.parametrize("rig", [WIRED, DIRECT])
+    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
     @pytest.mark.parametrize(("fault", "words"), FAULTS)
     def test_ends_the_run_in_the_safe_state(self, bench, laboratories, tmp_path, rig, fault, words):
         code, _, err = bench(
@@ -508,13 +508,12 @@ class TestBadInput:
         assert err.count("error:") == 1
         assert "Traceback" not in err
         device = words[0].partition(":")[0]
-        if rig == WIRED:
-            for word in words:
-                assert word in flat(err)
+        for word in words:
+            assert word in flat(err)
         assert f"error: {device}: " in flat(err)
 
         result = json.loads((tmp_path / "run.json").read_text())
-        devices = (*DEVICES, "witness") if rig == DIRECT else DEVICES
+        devices = (*DEVICES, "witness") if rig == WITNESSED else DEVICES
         assert result["status"] == "failed"
         assert result["is_safe"]
         assert result["safe_state"] == dict.fromkeys(devices, "safe")
@@ -549,7 +548,7 @@ class TestBadInput:
 
     def test_a_fault_that_comes_after_the_end_changes_nothing(self, bench, tmp_path):
         code, _, err = bench(
-            "run", "piezo-loops", "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            "run", "piezo-loops", "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
             *assignments("--set", {"amplitudes": "10"}),
             *assignments("--override", {"emulation.fault": "amplifier-trips", "emulation.fault_time": 1e5}),
         )  # fmt: skip
@@ -569,7 +568,7 @@ class TestBadInput:
         self, bench, tmp_path, protocol, settings, words
     ):
         code, _, err = bench(
-            "run", protocol, "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            "run", protocol, "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
             *assignments("--set", settings),
         )  # fmt: skip
         assert code == 2
@@ -579,7 +578,7 @@ class TestBadInput:
 
     def test_a_room_that_steps_is_no_fault(self, bench, tmp_path):
         code, _, err = bench(
-            "run", "hybrid-excitation", "--rig", WIRED, "--clock", "virtual", "--out", tmp_path,
+            "run", "hybrid-excitation", "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
             *assignments("--set", {"duration": 60}),
             *assignments("--override", {"emulation.ambient_step": 5, "emulation.ambient_step_time": 20}),
         )  # fmt: skip

@@ -130,7 +130,7 @@ def every_run_is_complete_and_safe(campaign):
     for folder in folders:
         with Record(folder) as record:
             assert record.status == "completed"
-            devices = (*DEVICES, "witness") if record.meta["rig"] == "hybrid-direct" else DEVICES
+            devices = (*DEVICES, "witness") if record.meta["rig"] == "hybrid-witness" else DEVICES
             assert record.meta["safe_state"] == dict.fromkeys(devices, "safe")
             found.append(record.meta["protocol"])
             loops = [event.text for event in record.events() if event.kind == "loop"]
@@ -144,7 +144,7 @@ def every_run_is_complete_and_safe(campaign):
 def the_tables_say_what_the_runs_say(campaign):
     """Once more from the journals: the errors of the controllers, and the noise of the sensor beside them."""
     found = {}
-    for folder in Path(campaign["folder"]).glob("hybrid-direct-hybrid-control-*"):
+    for folder in Path(campaign["folder"]).glob("hybrid-witness-hybrid-control-*"):
         with Record(folder) as record:
             parameters = record.meta["parameters"]
         if parameters["reference"] != "moves":

@@ -145,12 +145,9 @@ def test_garbage_on_tcp_ends_only_its_connection(vo2, connect):
 def test_a_client_that_floods_and_reads_nothing_is_not_read_any_further(vo2, connect):
     keeper, flooding = connect(vo2.port("psd")), connect(vo2.port("psd"))
     flooding.settimeout(2.0)
-    frames, sent = 10_000 * request(3), 0
+    # More than any buffers of the system hold.
     with pytest.raises(TimeoutError):
-        for _ in range(1000):
-            flooding.sendall(frames)
-            sent += len(frames)
-    assert sent < 500 * len(frames)
+        flooding.sendall(10_000_000 * request(3))
     assert product(keeper) == 7.0
     assert vo2.control.time() > 0.0
 

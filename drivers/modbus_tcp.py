@@ -1,0 +1,159 @@
+"""Connections over Modbus TCP, which all devices of a process on one instrument share.
+
+A LabJack T7 accepts two connections on port 502 (T-series datasheet, 6.0 Ethernet), and a rig has more devices on it.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import serial
+from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ModbusException
+from pymodbus.pdu import ModbusPDU
+
+from drivers.modbus import EMULATED, FEEDBACK, ModbusClient, RefusedError, TcpClient
+
+_UNIT = 1  # LabJack takes any
+
+
+class _Request(ModbusPDU):
+    """Any request, for pymodbus to frame and send."""
+
+    def __init__(self, request: bytes) -> None:
+        super().__init__(dev_id=_UNIT)
+        self.function_code = request[0]
+        self._body = request[1:]
+
+    def encode(self) -> bytes:
+        """Return what follows the function."""
+        return self._body
+
+
+class _Feedback(ModbusPDU):
+    """The reply to LabJack's function 76."""
+
+    function_code = FEEDBACK
+    values = b""
+
+    def encode(self) -> bytes:
+        """Return what follows the function."""
+        return self.values
+
+    def decode(self, data: bytes) -> None:
+        """Keep what follows the function."""
+        self.values = data
+
+
+class _PymodbusClient(ModbusClient):
+    """pymodbus's client of Modbus TCP, for real lines."""
+
+    def __init__(self, port: str, timeout: float) -> None:
+        host, _, number = port.removeprefix("tcp://").rpartition(":")
+        # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
+        self._client = ModbusTcpClient(host.strip("[]"), port=int(number), timeout=timeout, retries=0)
+        self._client.register(_Feedback)
+        if not self._client.connect():  # type: ignore[no-untyped-call]
+            raise ConnectionError
+
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
+        try:
+            response = self._client.execute(False, _Request(request))
+        except ModbusException as error:
+            raise ConnectionError(str(error)) from error
+        if response.isError():
+            raise RefusedError(response.exception_code)
+        reply = bytes((response.function_code,)) + response.encode()
+        if reply[0] != request[0] or len(reply) != expected:
+            raise ConnectionError(f"the answer has {len(reply)} bytes where {expected} were expected")
+        return reply
+
+    def close(self) -> None:
+        """Release the line; may be called again."""
+        self._client.close()  # type: ignore[no-untyped-call]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the line can be used."""
+        return self._client.is_socket_open()
+
+
+def _open_client(port: str, timeout: float) -> ModbusClient:
+    if port.startswith(EMULATED):
+        line: Any = serial.serial_for_url(port, timeout=timeout)
+        return TcpClient(line, _UNIT)
+    return _PymodbusClient(port, timeout)
+
+
+class Connection:
+    """A connection to an instrument, in use by one or several devices; made by `share`.
+
+    Attributes
+    ----------
+    lock : threading.RLock
+        Held for each request, as devices may be read by several threads.
+    ended : bool
+        Whether it has been closed, for all its devices.
+    """
+
+    def __init__(self, port: str, timeout: float) -> None:
+        self.lock = threading.RLock()
+        self.client = _open_client(port, timeout)
+        self._key = port, timeout
+        self._users = 0
+        self.ended = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether requests can be sent."""
+        return self.client.is_open
+
+    def close(self) -> None:
+        """End the use by one device; the last one closes the connection."""
+        with _registry:
+            self._users -= 1
+            if self._users <= 0:
+                self.end()
+
+    def end(self) -> None:
+        """Close the connection for all its devices: each has to connect again, so that it is set up again."""
+        with _registry:
+            self.ended = True
+            if _connections.get(self._key) is self:
+                del _connections[self._key]
+        self.client.close()
+
+    def acquire(self) -> None:
+        """Begin the use by one more device."""
+        self._users += 1
+
+
+_registry = threading.RLock()
+_connections: dict[tuple[str, float], Connection] = {}
+
+
+def share(port: str, timeout: float) -> Connection:
+    """Return the open connection of this process to an instrument, or open one.
+
+    Devices that wait for a different time have different connections.
+
+    Parameters
+    ----------
+    port : str
+        Address as `tcp://HOST:PORT` or `emulated://NAME`.
+    timeout : float
+        Longest wait for a connection or a reply, s.
+
+    Raises
+    ------
+    OSError
+        If no connection can be made.
+    """
+    with _registry:
+        connection = _connections.get((port, timeout))
+        if connection is None or not connection.is_open:
+            connection = _connections[port, timeout] = Connection(port, timeout)
+        connection.acquire()
+        return connection

@@ -1,0 +1,82 @@
+"""An ideal sensor beside the loops of the emulated hybrid: the deflection itself, exact and without noise.
+
+It stands on Modbus TCP like the T7, so that it is there in process and for other processes alike: register 0 to 3 are
+the deflection in m, a 64-bit floating-point number, highest word first.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import ClassVar
+
+from pydantic import Field
+
+from bench.clock import Clock
+from bench.devices import DriverSettings, Identity
+from bench.errors import DeviceConnectionError
+from bench.roles import PositionSensor
+from drivers.device import LineDevice
+from drivers.modbus import RefusedError
+from drivers.modbus_tcp import Connection, share
+from sim_devices.plants.hybrid import HybridCantilever
+from sim_devices.wire.modbus import ILLEGAL_ADDRESS, RegisterError
+from sim_devices.world import World
+
+_VALUE = struct.Struct(">d")
+_WORDS = struct.Struct(">4H")
+
+
+class WitnessRegisters:
+    """The registers of the witness; a `sim_devices.wire.modbus.RegisterBank`."""
+
+    def __init__(self, world: World, plant: HybridCantilever) -> None:
+        self._world = world
+        self._plant = plant
+
+    def read_registers(self, address: int, count: int) -> list[int]:
+        """Return the words of the deflection; raise `RegisterError` for any other registers."""
+        if (address, count) != (0, 4):
+            raise RegisterError(ILLEGAL_ADDRESS, "the witness has the registers 0 to 3, to be read at once")
+        with self._world.at_present():
+            return list(_WORDS.unpack(_VALUE.pack(self._plant.deflection)))
+
+    def write_registers(self, address: int, values: list[int]) -> None:  # noqa: ARG002
+        """Raise `RegisterError`: nothing can be written."""
+        raise RegisterError(ILLEGAL_ADDRESS, "the registers of the witness can only be read")
+
+
+class WitnessSettings(DriverSettings):
+    """Settings of the witness in a rig file."""
+
+    port: str = Field(description="emulated://NAME, or tcp://HOST:PORT of an emulated laboratory in another process")
+    timeout: float = Field(default=1.0, ge=0.05, le=60.0, description="longest wait for a reply in s, 0.05 to 60")
+
+
+class Witness(LineDevice[WitnessSettings, Connection], PositionSensor):
+    """The deflection itself, without noise: an ideal sensor beside the loop."""
+
+    Settings: ClassVar[type[WitnessSettings]] = WitnessSettings
+
+    @classmethod
+    def _open_line(cls, name: str, settings: WitnessSettings, clock: Clock) -> Connection:  # noqa: ARG003
+        try:
+            return share(settings.port, settings.timeout)
+        except OSError as error:
+            raise DeviceConnectionError(name, f"cannot connect to {settings.port}: {error}") from None
+
+    def _identify(self) -> Identity:
+        return Identity("emulated", "witness", "0", "0")
+
+    def _start(self) -> None:
+        self.measure()
+
+    def measure(self) -> dict[str, float]:
+        """Return the deflection, m."""
+        try:
+            (deflection,) = _VALUE.unpack(self._line.client.read(0, 4))
+        except (RefusedError, OSError) as error:
+            raise DeviceConnectionError(self.name, f"no witness at {self._settings.port}: {error}") from error
+        return {f"{self.name}_position": deflection}
+
+    def safe(self) -> None:
+        """Do nothing: a sensor is safe in any state."""

@@ -1,0 +1,94 @@
+"""`bench run --attach`: a protocol against served instruments gives what it gives in process."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.results.run_folder import RunFolder
+
+CREEP = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=10"]
+PATIENT = ["--override", "devices.tec.watchdog=300", "--override", "devices.tec.timeout=10",
+           "--override", "devices.psd.timeout=30"]  # fmt: skip
+"""A busy machine keeps the client waiting by the wall clock."""
+
+
+def readings(folder):
+    record = RunFolder(next(folder.iterdir()))
+    assert record.status == "completed"
+    return {name: np.asarray(record.readings[name]) for name in ("tec_temperature", "curvature")}
+
+
+@pytest.mark.slow
+def test_creep_gives_what_it_gives_in_process(bench, emulate, tmp_path):
+    with emulate("vo2", "--clock", "x10"):
+        ports = tmp_path / "endpoints.json"
+        served, inside = tmp_path / "served", tmp_path / "inside"
+        code, out, err = bench("run", "creep", "--rig", "vo2", "--attach", ports, *CREEP, *PATIENT, "--out", served)
+        assert (code, err) == (0, "")
+        assert "completed: 43 steps" in out
+    assert bench("run", "creep", "--rig", "vo2", "--clock", "virtual", *CREEP, "--out", inside)[0] == 0
+    one, other = readings(served), readings(inside)
+    assert len(one["curvature"]) == len(other["curvature"])
+    # Noise of one reading: 0.35 1/m of the detector, and what 5 mK rms of the film make on the slope.
+    for target in (70.0, 50.0):
+        served_last, inside_last = (
+            each["curvature"][abs(each["tec_temperature"] - target) < 0.1][-8:] for each in (one, other)
+        )
+        assert len(served_last) == len(inside_last) == 8
+        assert np.mean(served_last) == pytest.approx(np.mean(inside_last), abs=3.0)
+
+
+@pytest.mark.slow
+def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
+    with emulate("sma", "--clock", "x10"):
+        code, _, err = bench(
+            "run", "creep", "--rig", "sma", "--attach", tmp_path / "endpoints.json", "--out", tmp_path / "runs",
+            "--set", "load=4.9", "--set", "hot=1", "--set", "cool=0", "--set", "duration=1", "--set", "settling=0",
+            "--override", "devices.stage.watchdog=0", "--override", "devices.fan.watchdog=100",
+        )  # fmt: skip
+        assert (code, err) == (0, "")
+        run = RunFolder(next((tmp_path / "runs").iterdir()))
+        assert np.mean(run.readings["load_cell_force"]) == pytest.approx(4.9, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read"),
+        ("{", "is not an endpoints file of `bench emulate --json`"),
+        ("[]", "is not an endpoints file of `bench emulate --json`"),
+        ("{}", "is not an endpoints file of `bench emulate --json`: factor: is missing"),
+    ],
+)
+def test_a_file_that_is_none_is_one_message(bench, tmp_path, text, words):
+    file = tmp_path / "ports.json"
+    if text is not None:
+        file.write_text(text)
+    code, _, err = bench("run", "creep", "--rig", "vo2", "--attach", file)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert words in err
+
+
+def test_a_file_of_another_server_or_rig_is_one_message(bench, vo2, tmp_path):
+    content = json.loads(vo2.endpoints_file.read_text())
+    file = tmp_path / "ports.json"
+    for change, words in (
+        ({"server": "0123"}, "is out of date"),
+        ({"control": "tcp://127.0.0.1:1"}, "is out of date: its server does not answer at tcp://127.0.0.1:1"),
+        ({"rig": "sma"}, "serves sma, not vo2"),
+    ):
+        file.write_text(json.dumps(content | change))
+        code, _, err = bench("run", "creep", "--rig", "vo2", "--attach", file)
+        assert (code, len(err.splitlines())) == (2, 1)
+        assert words in err
+
+
+def test_a_clock_or_seed_of_its_own_is_refused(bench, vo2):
+    for option in (["--clock", "x20"], ["--seed", "3"]):
+        code, _, err = bench("run", "creep", "--rig", "vo2", "--attach", vo2.endpoints_file, *option)
+        assert code == 2
+        assert "--attach: clock and seed are the server's" in err
+    code, _, err = bench("run", "creep", "--rig", "vo2-hardware", "--attach", vo2.endpoints_file)
+    assert code == 2
+    assert "has no emulated laboratory" in err
