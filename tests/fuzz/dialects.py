@@ -92,6 +92,20 @@ class MeCom(Dialect):
         operand = {b"VS": row + word_32(rng).hex().upper().encode(), b"CS": b"0000E100", b"?IF": b"", b"ES": b""}
         return self._sealed(rng, command + operand.get(command, b"" if command == b"RS" else row))
 
+    @staticmethod
+    def _bulk(rng, row):
+        """Return a read of several parameters, or a read or write of many elements of one."""
+        rows = [b"%04X01" % rng.choice(tuple(PARAMETERS)) for _ in range(rng.choice((1, 3, 10)))]
+        first, count = rng.choice((0, 0, 1, 0xFFFFFFFF)), rng.choice((0, 1, 1, 2, 0xFFFF))
+        return rng.choice(
+            (
+                b"?VX%02X" % len(rows) + b"".join(rows),
+                b"?VB" + row + b"%08X%04X" % (first, count),
+                b"VB" + row + b"%08X%04X01" % (first, count) + word_32(rng).hex().upper().encode() * min(count, 3),
+                b"SP",
+            )
+        )
+
     def wild(self, rng):
         command = rng.choice((b"", b"?VR", b"VS", b"?VM", b"?VX", b"VX", b"VB", b"?VB", b"SP", b"CS", b"?", b"?IF"))
         alphabet = rng.choice((b"0123456789ABCDEF", b"0123456789abcdefxyz+-#!", bytes(range(256))))
@@ -177,7 +191,28 @@ class _Modbus(Dialect):
 
 
 class ModbusTcp(_Modbus):
-    """MODBUS Messaging on TCP/IP V1.0b."""
+    """MODBUS Messaging on TCP/IP V1.0b, and LabJack's function 76: several reads and writes in one request."""
+
+    _FEEDBACK = 76
+
+    def __init__(self, addresses, acting, probed, returned=None):
+        """Take a read of registers that always succeeds, and the bytes that it returns if these are constant."""
+        super().__init__(addresses, acting)
+        self._probed, self._returned = probed, returned
+
+    def pdu(self, rng):
+        if rng.random() < 0.8:
+            return super().pdu(rng)
+        frames = bytes((self._FEEDBACK,))
+        for _ in range(rng.choice((1, 2, 5, 30))):
+            address = rng.choice(self.addresses) if rng.random() < 0.95 else rng.randrange(0x10000)
+            number = rng.choice((1, 2, 2, 2, 4, 28, rng.randrange(256)))
+            if rng.random() < 0.5:
+                frames += struct.pack(">BHB", 0, address, number)
+            else:
+                values = b"".join(word_32(rng) for _ in range(number + 1 >> 1))[: 2 * number]
+                frames += struct.pack(">BHB", 1, address, number) + values
+        return frames[:1030]
 
     def _sealed(self, rng, pdu):
         return struct.pack(">HHHB", rng.randrange(0x10000), 0, len(pdu) + 1, rng.choice((0, 1, 255))) + pdu
@@ -191,21 +226,25 @@ class ModbusTcp(_Modbus):
     def check(self, answers):
         count = 0
         while answers:
-            if len(answers) < 9:
+            if len(answers) < 8:
                 raise MalformedError(f"cut off: {answers.hex(' ')}")
             _, protocol, length = struct.unpack_from(">HHH", answers)
-            if protocol or length != 1 + self.length(answers[7:]) or len(answers) < 6 + length:
+            expected = length - 1 if answers[7] == self._FEEDBACK else self.length(answers[7:])
+            if protocol or length != 1 + expected or len(answers) < 6 + length:
                 raise MalformedError(f"header: {answers[:16].hex(' ')}")
             answers = answers[6 + length :]
             count += 1
         return count
 
     def probe(self, rng):
-        request = self._sealed(rng, struct.pack(">BHH", 3, 55100, 2))
+        request = self._sealed(rng, self._probed)
 
         def check(answer):
-            if answer != request[:4] + b"\0\7" + request[6:7] + b"\3\4\0\x11\x22\x33":
-                raise MalformedError(f"TEST is answered by {answer.hex(' ')}")
+            size = 2 * request[-1]
+            returned = answer[9:] if self._returned is None else self._returned
+            head = request[:4] + struct.pack(">HBBB", 3 + size, request[6], 3, size)
+            if answer != head + returned or len(returned) != size:
+                raise MalformedError(f"{request.hex(' ')} is answered by {answer.hex(' ')}")
 
         return request, check
 

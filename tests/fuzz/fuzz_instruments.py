@@ -29,7 +29,7 @@ from rigs.vo2.laboratory import VO2Laboratory
 from sim_devices.instruments.dynamixel_table import ITEMS
 from sim_devices.instruments.meerstetter_table import PARAMETERS
 from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpStream
+from sim_devices.wire.modbus_tcp import FramingError
 
 MOST_KEPT = 2048
 """Bytes of unfinished frames that a server may keep."""
@@ -99,7 +99,7 @@ def check_tec(tec):
         within(f"parameter {number}", value, row.low, row.high)
         if not math.isfinite(value):
             raise FailedError(f"parameter {number}: {value}")
-    within("current", tec._load.current, -4.0, 4.0)
+    within("current", tec._load.current, -4.0 - 1e-9, 4.0 + 1e-9)
     within("plate temperature", tec._load.plate_temperature, -273.15, 1000.0)
 
 
@@ -145,13 +145,16 @@ def make(laboratory):
     return lambda clock, seed: laboratory(laboratory.Settings(), clock, seed)
 
 
-T7, SMA = ModbusTcp(T7_ADDRESSES, T7_ACTING), make(SMALaboratory)
+T7 = ModbusTcp(T7_ADDRESSES, T7_ACTING, reads(55100, 2), bytes.fromhex("00112233"))  # the register TEST
+WITNESS = ModbusTcp(range(8), [reads(0, 4)], reads(0, 4))
+SMA = make(SMALaboratory)
 # By the rig and the port of the instrument in its laboratory.
 TARGETS = {
     "vo2/tec": Target(make(VO2Laboratory), MeCom(), check_tec),
     "vo2/psd": Target(make(VO2Laboratory), T7, check_t7),
     "hybrid/tec": Target(make(HybridLaboratory), MeCom(), check_tec),
     "hybrid/t7": Target(make(HybridLaboratory), T7, check_t7),
+    "hybrid/witness": Target(make(HybridLaboratory), WITNESS, lambda _: None),
     "sma/t7": Target(SMA, T7, check_t7, change_load),
     "sma/supply": Target(SMA, SlcanCanopen(), check_supply, change_load),
     "sma/load_cell": Target(SMA, ModbusRtu(DAD_ADDRESSES, DAD_ACTING), check_cell, change_load),
@@ -248,7 +251,7 @@ def fuzz(name, frames, seed, advanced=lambda _: None):
     clock = VirtualClock()
     laboratory = target.laboratory(clock, seed)
     port = name.partition("/")[2]
-    instrument = laboratory.instruments[port]
+    instrument = laboratory.instruments.get(port)
     server, of_server = connect(laboratory, port)
     recent = []
 
@@ -287,6 +290,7 @@ def fuzz(name, frames, seed, advanced=lambda _: None):
                     clock.sleep(0.5)  # a servo that restarts does not answer for 0.3 s
                     if of_server is None:
                         # Where a frame on TCP begins can be known on a new connection only.
+                        server.close()
                         server, _ = connect(laboratory, port)
                     probe(target.dialect, rng, receive)
                     target.check_state(instrument)
@@ -317,7 +321,7 @@ def connect(laboratory, port):
     server = laboratory.servers[port]
     if isinstance(server, WireServer):
         return server, server
-    return ModbusTcpStream(laboratory.instruments[port]), None
+    return server.connect(), None
 
 
 def main():
