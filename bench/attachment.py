@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -81,7 +82,7 @@ def read_endpoints(path: Path) -> Endpoints:
 
 
 class ControlClient:
-    """A connection to the control socket of `bench emulate`; docs/reference/control-socket.md has the requests.
+    """A connection to the control socket of `bench emulate`; docs/reference/emulate.md has the requests.
 
     Parameters
     ----------
@@ -231,7 +232,12 @@ class AttachedClock(Clock):
         return self._time_alone()
 
     def sleep(self, seconds: float) -> None:
-        """Wait until the server's time is so much later, s; ends early when `interrupted`."""
+        """Wait until the server's time is so much later, s; ends early when `interrupted`.
+
+        Raises `ValueError` if `seconds` is not finite.
+        """
+        if not math.isfinite(seconds):
+            raise ValueError(f"seconds: expected a finite number, got {seconds}")
         end = self.now() + seconds
         while (now := self._last) < end and not self.interrupted():
             until = min(end, now + _LONGEST_NAP * self.factor)

@@ -40,6 +40,8 @@ READ, WRITE_ONE, WRITE, FEEDBACK = 3, 6, 16, 76
 
 _READ = struct.Struct(">BHH")  # function, address, number of registers
 _WRITE = struct.Struct(">BHHB")  # the same, and number of bytes
+_FRAME = struct.Struct(">BHB")  # of function 76: kind, address, number of registers
+_FRAME_READ, _FRAME_WRITE = 0, 1
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _TRANSACTIONS = 0x10000
 _REFUSED = 0x80
@@ -62,6 +64,16 @@ class RefusedError(Exception):
 def read_request(address: int, count: int) -> bytes:
     """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
     return _READ.pack(READ, address, count)
+
+
+def read_frame(address: int, count: int) -> bytes:
+    """Return the frame of function 76 that reads `count` registers, 1 to 255, from `address` on."""
+    return _FRAME.pack(_FRAME_READ, address, count)
+
+
+def write_frame(address: int, data: bytes) -> bytes:
+    """Return the frame of function 76 that sets registers from `address` on, two bytes each."""
+    return _FRAME.pack(_FRAME_WRITE, address, len(data) // 2) + data
 
 
 class ModbusClient(ABC):

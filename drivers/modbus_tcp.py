@@ -106,6 +106,11 @@ class Connection:
         self.ended = False
 
     @property
+    def is_new(self) -> bool:
+        """Whether one device alone uses it."""
+        return self._users == 1
+
+    @property
     def is_open(self) -> bool:
         """Whether requests can be sent."""
         return self.client.is_open

@@ -36,7 +36,7 @@ class T7HighVoltageSettings(T7InputSettings, T7LineSettings):
     channels: tuple[Channel, Channel, Channel] = Field(
         default=(0, 1, 2),
         description="analog inputs of the amplifier's voltage monitor, current monitor and status output (5 V while "
-        "it is on), 0 to 13; neighbours in ascending order are read at once",
+        "it is on), 0 to 13",
     )
     line: int = Field(
         ge=0, lt=LINES, description="digital line of the amplifier's enable input, 0 to 22, FIO0-7 are 0-7"
@@ -91,10 +91,12 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
     An LJTick-DAC has 14 bits over ±10 V, DAC0 and DAC1 have 12 over 5 V, so a gain that uses the whole range gives
     the finest steps.
 
-    `connect` switches the amplifier off, and raises `DeviceError` if it does not go off. With inputs that are
-    neighbours in ascending order, `safe` takes five requests or more. `set` takes one request; the first one, and
-    the first after the output went off, six or more, and one whose last look at the status, by any call, was 0.1 s
-    ago or more takes one more.
+    `connect` switches the amplifier off, and raises `DeviceError` if it does not go off. `safe` takes three requests
+    or more. `set` takes one request; the first one, and the first after the output went off, four or more, and one
+    whose last look at the status, by any call, was 0.1 s ago or more takes one more.
+
+    Give the enable input a strong pull-down or an interlock of its own: the line is pulled high from power-up of the
+    instrument until `connect`.
 
     When the amplifier went off by itself, the next `measure` or `glance` says so once, and so does the next `set`
     that looks at the status. The set-point is 0 then and the enable line off; `set` switches on again. Readings also

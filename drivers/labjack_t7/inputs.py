@@ -4,7 +4,7 @@ Sources: LabJack T-series datasheet 14.1.7 for averaging in the instrument, 14.3
 datasheet gives the highest scan rate of each resolution index in appendix A-1: the instrument refuses a burst at a
 higher rate, and the error says so.
 
-Assumption: one request that spans the averages of two inputs carries out both bursts, one after the other.
+Assumption: one request for the averages of several inputs carries out their bursts one after the other.
 """
 
 from __future__ import annotations
@@ -56,9 +56,7 @@ Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
 class T7InputSettings(T7ConnectionSettings):
     """How analog inputs are read; every sensor on a T7 extends it."""
 
-    channels: tuple[Channel, ...] = Field(
-        default=(0,), description="analog inputs, 0 to 13; neighbours in ascending order are read at once"
-    )
+    channels: tuple[Channel, ...] = Field(default=(0,), description="analog inputs, 0 to 13")
     range: float = Field(default=10.0, description="input range in V: 10, 1, 0.1 or 0.01, either sign")
     resolution_index: int = Field(
         default=4, ge=0, le=8, description="resolution index, 0 (instrument's default) to 8 (least noise, slowest)"
@@ -101,9 +99,8 @@ class T7InputDevice(T7Device[InputSettingsT]):
     """A device on a LabJack T7 that is read by analog inputs.
 
     `measure` has the instrument average a burst of `samples` conversions of each input, `glance` takes one
-    conversion: three requests and one, with inputs that are neighbours in ascending order, otherwise as many for
-    each input. Both raise `DeviceError` if a conversion is not valid or over the range, as clipped conversions would
-    shift the mean.
+    conversion; each is one request. Both raise `DeviceError` if a conversion is not valid or over the range, as
+    clipped conversions would shift the mean.
 
     The settings of bursts (STREAM_RESOLUTION_INDEX, STREAM_SETTLING_US) are common to all inputs of one instrument:
     give sensors on the same one the same `resolution_index` and `settling_us`.
@@ -113,9 +110,11 @@ class T7InputDevice(T7Device[InputSettingsT]):
         super().__init__(name, settings, clock, line)
         self._limit = RAIL * settings.range
         self._conversions = _spans(AIN, settings.channels)
-        self._means = _spans(AIN_EF_READ_AVERAGE, settings.channels)
-        self._maxima = _spans(AIN_EF_READ_MAXIMUM, settings.channels)
-        self._minima = _spans(AIN_EF_READ_MINIMUM, settings.channels)
+        self._averages = [
+            span
+            for register in (AIN_EF_READ_AVERAGE, AIN_EF_READ_MAXIMUM, AIN_EF_READ_MINIMUM)
+            for span in _spans(register, settings.channels)
+        ]
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
@@ -156,11 +155,12 @@ class T7InputDevice(T7Device[InputSettingsT]):
         """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
         if self._settings.samples == 1:
             return self._convert()
-        means = self._read(self._means)  # this one starts the burst and waits for its end
-        maxima = self._read(self._maxima)
-        minima = self._read(self._minima)
-        for extremes in (maxima, minima):
-            self._check(extremes)
+        # The averages come first: reading one starts the burst and waits for its end.
+        values = self._joined(self._averages)
+        count = len(self._settings.channels)
+        means, maxima, minima = (values[start : start + count] for start in range(0, 3 * count, count))
+        self._check(maxima)
+        self._check(minima)
         return self._check(means)
 
     def _convert(self) -> Sequence[float]:
@@ -170,7 +170,10 @@ class T7InputDevice(T7Device[InputSettingsT]):
     def _read(self, spans: Sequence[Span]) -> Sequence[float]:
         if len(spans) == 1:
             return self._line.read_span(spans[0])
-        return [value for span in spans for value in self._line.read_span(span)]
+        return self._joined(spans)
+
+    def _joined(self, spans: Sequence[Span]) -> list[float]:
+        return [value for values in self._line.read_spans(spans) for value in values]
 
     def _check(self, voltages: Sequence[float]) -> Sequence[float]:
         """Return one voltage for each input; raise `DeviceError` for one that is not valid or over the range."""

@@ -1,16 +1,16 @@
 """Digital lines of a LabJack T7, and the watchdog of the instrument that switches them off.
 
-Sources: LabJack T-series datasheet 13.0 for the digital lines, 23.0 for the watchdog.
+Sources: LabJack T-series datasheet 13.0 for the digital lines, 23.0 for the watchdog, 24.0 for what outlasts a
+restart.
 
-Assumptions: the settings of the watchdog outlast a restart of the instrument, as their names (..._DEFAULT) suggest;
-reading the register of a single digital line makes it an input, as the map says that it configures the direction
-too.
+Assumption: reading the register of a single digital line makes it an input, as the map says that it configures the
+direction too.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TypeVar
 
 from pydantic import Field
@@ -32,6 +32,7 @@ from drivers.labjack_t7.registers import (
     WATCHDOG_STRICT_ENABLE,
     WATCHDOG_TIMEOUT_S,
     LabJackT7,
+    Span,
 )
 
 LINES = 23
@@ -42,7 +43,10 @@ class T7LineSettings(T7ConnectionSettings):
     """Rig-file settings of a device that is switched by a digital line of a T7."""
 
     line: int = Field(
-        ge=0, lt=LINES, description="digital line, 0 to 22: FIO0-7 are 0-7, EIO0-7 8-15, CIO0-3 16-19, MIO0-2 20-22"
+        ge=0,
+        lt=LINES,
+        description="digital line, 0 to 22: FIO0-7 are 0-7, EIO0-7 8-15, CIO0-3 16-19, MIO0-2 20-22; high until the "
+        "driver connects",
     )
     active_high: bool = Field(default=True, description="whether a high level is on; false where a low one is")
     watchdog: int = Field(
@@ -71,6 +75,21 @@ class _Watchdog:
         return ~self.inhibit & _ALL_LINES if self.enabled and self.dio_enabled else 0
 
 
+_WATCHDOG_REGISTERS = (
+    WATCHDOG_ENABLE,
+    WATCHDOG_TIMEOUT_S,
+    WATCHDOG_STRICT_ENABLE,
+    WATCHDOG_DIO_ENABLE,
+    WATCHDOG_DIO_STATE,
+    WATCHDOG_DIO_DIRECTION,
+    WATCHDOG_DIO_INHIBIT,
+)
+"""In the order of the settings of `_Watchdog`."""
+
+_SETTINGS = tuple(Span.of(register) for register in _WATCHDOG_REGISTERS)
+_DIRECTION, _STATE = Span.of(DIO_DIRECTION), Span.of(DIO_STATE)
+
+
 class DigitalOutput:
     """One digital line of a T7, which the watchdog of the instrument can switch off.
 
@@ -78,8 +97,8 @@ class DigitalOutput:
 
     The instrument has one watchdog with one time. Any communication of any host feeds it, over any connection.
     When it runs out it drives the lines that are under it, and goes on. It must be switched off to change its
-    settings, which takes some milliseconds. The settings are kept in the instrument's non-volatile memory, so
-    they are written only if they differ.
+    settings, which takes some milliseconds. The settings are kept in the instrument's flash memory, which wears with
+    each write: a register is written only if it differs.
 
     Parameters
     ----------
@@ -95,6 +114,7 @@ class DigitalOutput:
         self._name = name
         self._instrument = instrument
         self._line = line
+        self._register = DIO.of(line)
         self._bit = 1 << line
         self._active_high = active_high
 
@@ -105,30 +125,40 @@ class DigitalOutput:
     @property
     def is_on(self) -> bool:
         """Whether the level of the line is the one that is on, as the instrument reports now."""
-        return bool(self._instrument.read_integer(DIO_STATE) & self._bit) == self._active_high
+        return self._level(self._instrument.read_span(_STATE)[0])
 
     def switch(self, on: bool) -> None:
         """Make the line an output with the level for on or off.
 
         Raises `DeviceError` if the instrument refuses, or if the line does not read back so.
         """
-        self._instrument.write(DIO.of(self._line), int(on == self._active_high))
-        self.check_output()
-        if self.is_on != on:
+        data = self._instrument.encode(self._register, int(on == self._active_high))
+        if self._look((self._register.address, data)) != on:
             raise DeviceError(
                 self._name,
                 f"{self} is {'off' if on else 'on'} right after it was switched {'on' if on else 'off'}; check the "
                 "wiring for a short circuit, and that no other program uses the line",
             )
 
-    def check_output(self) -> None:
-        """Raise `DeviceError` if the line is not an output."""
-        if not self._instrument.read_integer(DIO_DIRECTION) & self._bit:
+    def check_output(self) -> bool:
+        """Return whether the level of the line is the one that is on.
+
+        Raises `DeviceError` if the line is not an output.
+        """
+        return self._look()
+
+    def _look(self, *writes: tuple[int, bytes]) -> bool:
+        (direction,), (state,) = self._instrument.read_spans((_DIRECTION, _STATE), *writes)
+        if not int(direction) & self._bit:
             raise DeviceError(
                 self._name,
                 f"{self} is an input and drives nothing; is another program using the line, or has the instrument "
                 "restarted?",
             )
+        return self._level(state)
+
+    def _level(self, state: float) -> bool:
+        return bool(int(state) & self._bit) == self._active_high
 
     @property
     def watchdog(self) -> int:
@@ -173,16 +203,12 @@ class DigitalOutput:
         present = self._watchdog()
         if not present.lines & self._bit:
             return
+        if not self._others(present):
+            # The rest may stay as it is: one write to the flash memory, and one when the line is guarded again.
+            self._instrument.set({WATCHDOG_ENABLE: 0})
+            return
         lines = present.lines & ~self._bit
-        self._change(
-            present,
-            replace(
-                present,
-                enabled=int(self._others(present)),
-                dio_enabled=int(bool(lines)),
-                inhibit=~lines & _ALL_LINES,
-            ),
-        )
+        self._change(present, replace(present, dio_enabled=int(bool(lines)), inhibit=~lines & _ALL_LINES))
 
     def _others(self, watchdog: _Watchdog) -> bool:
         """Return whether something else than this line is under the watchdog."""
@@ -191,37 +217,30 @@ class DigitalOutput:
         return bool(watchdog.enabled) and any(map(self._instrument.read_integer, WATCHDOG_DAC_ENABLE))
 
     def _watchdog(self) -> _Watchdog:
-        read = self._instrument.read_integer
-        return _Watchdog(
-            read(WATCHDOG_ENABLE),
-            read(WATCHDOG_TIMEOUT_S),
-            read(WATCHDOG_STRICT_ENABLE),
-            *map(int, self._instrument.read(WATCHDOG_DIO_ENABLE, 4)),
-        )
+        return _Watchdog(*(int(value) for (value,) in self._instrument.read_spans(_SETTINGS)))
 
     def _change(self, present: _Watchdog, wanted: _Watchdog) -> None:
         if wanted == present:
             return
         instrument = self._instrument
-        instrument.set({WATCHDOG_ENABLE: 0})
+        settings = zip(_WATCHDOG_REGISTERS[1:], astuple(present)[1:], astuple(wanted)[1:], strict=True)
+        different = {register: value for register, old, value in settings if value != old}
+        # Only a watchdog that is off takes other settings.
+        enabled = present.enabled
         try:
-            instrument.set({WATCHDOG_TIMEOUT_S: wanted.seconds})
-            instrument.set({WATCHDOG_STRICT_ENABLE: wanted.strict})
-            instrument.set(
-                {
-                    WATCHDOG_DIO_ENABLE: wanted.dio_enabled,
-                    WATCHDOG_DIO_STATE: wanted.state,
-                    WATCHDOG_DIO_DIRECTION: wanted.direction,
-                    WATCHDOG_DIO_INHIBIT: wanted.inhibit,
-                }
-            )
+            if different and enabled:
+                instrument.set({WATCHDOG_ENABLE: 0})
+                enabled = 0
+            for register, value in different.items():
+                instrument.set({register: value})
         except BaseException:
             # Other outputs may depend on it, also after a refusal.
-            with suppress(DeviceError):
-                instrument.set({WATCHDOG_ENABLE: present.enabled})
+            if present.enabled:
+                with suppress(DeviceError):
+                    instrument.set({WATCHDOG_ENABLE: 1})
             raise
-        if wanted.enabled:
-            instrument.set({WATCHDOG_ENABLE: 1})
+        if wanted.enabled != enabled:
+            instrument.set({WATCHDOG_ENABLE: wanted.enabled})
 
 
 LineSettingsT = TypeVar("LineSettingsT", bound=T7LineSettings)
@@ -234,8 +253,8 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
     time. The time is the `watchdog` of the settings, or a shorter one that another output of the same instrument
     asked for (see `DigitalOutput`).
 
-    Until `connect`, and after a restart of the instrument, the line is an input that is pulled up weakly: what an
-    active high line switches needs a pull-down to be off then.
+    Until `connect`, and after a restart of the instrument, the line is an input that 100 kΩ pull up to 3.3 V: what an
+    active high line switches needs a strong pull-down, or an interlock of its own, to be off then.
     """
 
     def __init__(self, name: str, settings: LineSettingsT, clock: Clock, line: LabJackT7) -> None:

@@ -1,23 +1,23 @@
 """The registers of a LabJack T7, and a client that reads and writes them over Modbus TCP.
 
 Sources: `ljm_constants.json` (repository labjack/ljm_constants) for the register map; LabJack, Direct Modbus TCP,
-Protocol Details, for the byte order.
+Protocol Details, for the byte order and for function 76; the error table of the same repository for the details of
+refusals.
 
-Assumptions: error details 2371, 2372 and 2374 belong to the names that stand between the known 2370, 2373 and
-2375 in the error table; the instrument reads back the settings that were written.
+Assumption: the instrument reads back the settings that were written.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.modbus import RefusedError, exception_text, read_request, swapped
-from drivers.modbus_tcp import share
+from drivers.modbus import RefusedError, exception_text, read_frame, read_request, swapped, write_frame
+from drivers.modbus_tcp import Connection, share
 
 Kind = Literal["F32", "U32", "U16"]
 Access = Literal["R", "W", "RW"]
@@ -57,7 +57,11 @@ class Span(NamedTuple):
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
-    """Form of the reply: the number of bytes of the values, and the values."""
+    """Form of the reply: its function, the number of bytes of the values, and the values."""
+    frame: bytes
+    """Asks for them in function 76, among others."""
+    values: struct.Struct
+    """Form of the values alone."""
 
     @classmethod
     def of(cls, register: Register, count: int = 1) -> Span:
@@ -67,8 +71,16 @@ class Span(NamedTuple):
         """
         if "R" not in register.access:
             raise ValueError(f"{register.name} can only be written")
-        reply = struct.Struct(f">xB{count}{register.form}")
-        return cls(register.address, read_request(register.address, reply.size // 2 - 1), reply.size, reply)
+        values = struct.Struct(f">{count}{register.form}")
+        words = values.size // 2
+        return cls(
+            address=register.address,
+            request=read_request(register.address, words),
+            size=2 + values.size,
+            reply=struct.Struct(f">xB{count}{register.form}"),
+            frame=read_frame(register.address, words),
+            values=values,
+        )
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -118,6 +130,7 @@ _DETAILS = {
     2373: "AIN negative channel not allowed",
     2374: "only zero may be written",
     2375: "AIN resolution index not allowed",
+    2376: "AIN rate not possible at this resolution index",
 }
 
 
@@ -145,7 +158,7 @@ class LabJackT7:
         self._address = port
         self._timeout = timeout
         try:
-            self._connection = share(port, timeout)
+            self._connection = self._share()
         except OSError as error:
             reason = f" ({error})" if str(error) else ""
             raise DeviceConnectionError(
@@ -155,6 +168,21 @@ class LabJackT7:
         self._client = self._connection.client
         self._lock = self._connection.lock
         self._connected = True
+
+    def _share(self) -> Connection:
+        connection = share(self._address, self._timeout)
+        if connection.is_new:
+            return connection
+        # The instrument may have restarted since the other devices last used it.
+        try:
+            with connection.lock:
+                connection.client.read(TEST.address, 1)
+        except RefusedError:
+            pass  # another instrument, as `identify` will say
+        except OSError:
+            connection.end()
+            return share(self._address, self._timeout)
+        return connection
 
     def close(self) -> None:
         """Release the connection; it is closed with its last user."""
@@ -178,6 +206,24 @@ class LabJackT7:
                 raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
             raise self._failure(error, f"reading register {span.address}") from error
+        return values
+
+    def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
+        """Get the values of several spans in one request; what is to be written at addresses goes first in it."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        frames = b"".join((*(write_frame(*write) for write in writes), *(span.frame for span in spans)))
+        try:
+            with self._lock:
+                reply = self._client.feedback(frames, sum(span.values.size for span in spans))
+        except (RefusedError, OSError) as error:
+            doing = [f"writing register {address}" for address, _ in writes]
+            doing += [f"reading register {span.address}" for span in spans]
+            raise self._failure(error, ", ".join(doing)) from error
+        values, position = [], 0
+        for span in spans:
+            values.append(list(span.values.unpack_from(reply, position)))
+            position += span.values.size
         return values
 
     def read(self, register: Register, count: int = 1) -> list[float]:
@@ -213,13 +259,14 @@ class LabJackT7:
             raise self._failure(error, f"writing register {address}") from error
 
     def set(self, values: Mapping[Register, float]) -> None:
-        """Set neighbouring registers of one type in one request, and read them back.
+        """Set neighbouring registers of one type and read them back, in one request.
 
         Raises `DeviceError` if a register reads back another value.
         """
         first = next(iter(values))
-        self.write(first, *values.values())
-        for (register, value), actual in zip(values.items(), self.read(first, len(values)), strict=True):
+        data = self.encode(first, *values.values())
+        (present,) = self.read_spans((Span.of(first, len(values)),), (first.address, data))
+        for (register, value), actual in zip(values.items(), present, strict=True):
             tolerance = 1e-5 if register.kind == "F32" else 0.0
             if not math.isclose(actual, value, rel_tol=tolerance, abs_tol=0.1 * tolerance):
                 raise DeviceError(

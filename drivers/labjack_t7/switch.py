@@ -48,12 +48,13 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
         DeviceConnectionError
             If the instrument does not answer.
         """
-        self._output.check_output()
-        return self.glance()
+        return self._state(self._output.check_output())
 
     def glance(self) -> dict[str, float]:
         """Read back whether the line is on, in one request; does not check that it is driven."""
-        on = self._output.is_on
+        return self._state(self._output.is_on)
+
+    def _state(self, on: bool) -> dict[str, float]:
         if self._setpoint == 1.0 and not on:
             self._setpoint = 0.0
             raise DeviceError(

@@ -28,8 +28,7 @@ class T7ThermistorSettings(T7InputSettings):
 
     channels: tuple[Channel, Channel] = Field(
         default=(0, 1),
-        description="analog inputs of the divider and of its excitation, 0 to 13; neighbours in ascending order are "
-        "read at once",
+        description="analog inputs of the divider and of its excitation, 0 to 13",
     )
     reference_ohms: float = Field(
         default=10e3, gt=0.0, le=1e7, description="reference resistor of the divider in Ω, above 0 to 1e7"

@@ -11,8 +11,9 @@ Assumptions, where these say nothing:
   or a read of a register that can only be written, gives exception 2; a write of half a 32-bit value gives
   exception 3; changing a watchdog setting while the watchdog is enabled gives exception 4.
 - A refusal whose detail is not known leaves 0 in LAST_ERR_DETAIL.
-- Detail 2371 belongs to the settling time, as the known 2370, 2373 and 2375 stand in the order of the error
-  table with it in between.
+- What is written to AIN#_EF_READ_B and C, which the map has as writable, stays there until the next burst.
+- A register of the watchdog counts as written to the flash memory with every write, also of the value that it has.
+- A power cycle drops the connections; DAC and LJTick-DAC outputs are at 0 V after it.
 - A burst longer than the 0.18 s that the datasheet allows is refused with exception 4.
 - DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
   offset. The register of a DAC reads back what was written.
@@ -189,6 +190,11 @@ class EmulatedT7(RegisterInstrument):
     inputs : mapping of int to callable
         Voltage in V at an analog input by its number, 0 to 13; an input that is not named is grounded.
 
+    Attributes
+    ----------
+    flash_writes : int
+        How often a register of the flash memory was written, since the instrument was made.
+
     Raises
     ------
     ValueError
@@ -214,6 +220,17 @@ class EmulatedT7(RegisterInstrument):
         self._normals = normals(rng)
         self._service = _Service(self._begin, self._end)
         self._touched = False
+        self._watchdog = _Watchdog()
+        self._expired_at: float | None = None
+        self._followers: list[Callable[[], None]] = []
+        self._restart_followers: list[Callable[[], None]] = []
+        self.flash_writes = 0
+        self._start()
+        self._set_map_up(self._register_map())
+        world.add(self)
+
+    def _start(self) -> None:
+        """Set everything up that is not kept in the flash memory."""
         self._inputs = [_Input() for _ in range(CHANNELS)]
         self._stream_index = 0
         self._stream_settling = 0.0
@@ -223,12 +240,25 @@ class EmulatedT7(RegisterInstrument):
         self._dio_direction = 0
         self._dio_inhibit = 0
         self._last_error = 0
-        self._watchdog = _Watchdog()
-        self._due = math.inf
-        self._expired_at: float | None = None
-        self._followers: list[Callable[[], None]] = []
-        self._set_map_up(self._register_map())
-        world.add(self)
+        self._expired_at = None
+        self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
+
+    def power_cycle(self) -> None:
+        """Switch the instrument off and on: what is in its RAM is lost, what is in its flash memory stays.
+
+        All digital lines are inputs then, which are pulled high (datasheet 24.0); the watchdog runs again if it is
+        enabled (23.0); the connections are lost.
+        """
+        with self.world.at_present():
+            self._start()
+            self._set_map_up(self._register_map())
+            for follow in self._restart_followers:
+                follow()
+            self._lead()
+
+    def on_restart(self, follow: Callable[[], None]) -> None:
+        """Call `follow()` at each power cycle."""
+        self._restart_followers.append(follow)
 
     @property
     def identity(self) -> Identity:
@@ -337,6 +367,7 @@ class EmulatedT7(RegisterInstrument):
             raise RegisterError(DEVICE_FAILURE, "WATCHDOG_ENABLE: allowed are 0 and 1")
         if value and not self._watchdog.timeout:
             raise RegisterError(DEVICE_FAILURE, "WATCHDOG_ENABLE: WATCHDOG_TIMEOUT_S is 0")
+        self.flash_writes += 1
         self._watchdog.enabled = int(value)
         if value:
             self._feed()
@@ -449,6 +480,12 @@ class EmulatedT7(RegisterInstrument):
             raise RegisterError(DEVICE_FAILURE, f"AIN{channel}_EF_INDEX: {value:g} is not emulated")
         self._inputs[channel].feature = int(value)
 
+    def _set_maximum(self, channel: int, value: float) -> None:
+        self._inputs[channel].burst = self._inputs[channel].burst._replace(maximum=value)
+
+    def _set_minimum(self, channel: int, value: float) -> None:
+        self._inputs[channel].burst = self._inputs[channel].burst._replace(minimum=value)
+
     def _set_samples(self, channel: int, value: float) -> None:
         if not 1 <= value <= _MOST_SAMPLES:
             raise RegisterError(DEVICE_FAILURE, f"AIN{channel}_EF_CONFIG_A: 1 to {_MOST_SAMPLES} samples")
@@ -504,8 +541,8 @@ class EmulatedT7(RegisterInstrument):
             Register("STREAM_SETTLING_US", 4008, "F32", lambda: self._stream_settling, self._set_stream_settling),
             Register("STREAM_RESOLUTION_INDEX", 4010, "U32", lambda: self._stream_index, self._set_stream_resolution),
             Register("AIN#_EF_READ_A", 7000, "F32", lambda n: self.burst(n).average, None, CHANNELS),
-            Register("AIN#_EF_READ_B", 7300, "F32", lambda n: inputs[n].burst.maximum, None, CHANNELS),
-            Register("AIN#_EF_READ_C", 7600, "F32", lambda n: inputs[n].burst.minimum, None, CHANNELS),
+            Register("AIN#_EF_READ_B", 7300, "F32", lambda n: inputs[n].burst.maximum, self._set_maximum, CHANNELS),
+            Register("AIN#_EF_READ_C", 7600, "F32", lambda n: inputs[n].burst.minimum, self._set_minimum, CHANNELS),
             Register("AIN#_EF_INDEX", 9000, "U32", lambda n: inputs[n].feature, self._set_feature, CHANNELS),
             Register("AIN#_EF_CONFIG_A", 9300, "U32", lambda n: inputs[n].samples, self._set_samples, CHANNELS),
             Register("AIN#_EF_CONFIG_D", 10200, "F32", lambda n: inputs[n].scan_rate, self._set_scan_rate, CHANNELS),
@@ -543,6 +580,7 @@ class EmulatedT7(RegisterInstrument):
         def write(value: float) -> None:
             if self._watchdog.enabled:
                 raise RegisterError(DEVICE_FAILURE, "the watchdog must be disabled before its settings change")
+            self.flash_writes += 1
             setattr(self._watchdog, attribute, value)
 
         return partial(getattr, self._watchdog, attribute), write

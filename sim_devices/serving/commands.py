@@ -6,6 +6,7 @@ import ipaddress
 import json
 import os
 import secrets
+import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -98,16 +99,16 @@ def emulate(
             log = StateLog(state, state_period)
             stack.callback(log.close)
         identity = secrets.token_hex(8)
-        socket = ControlSocket(_control_listener(control), served, identity)
-        stack.callback(socket.close)
-        content = _endpoints(served, clock, socket.address, identity)
+        control_socket = ControlSocket(_control_listener(control), served, identity)
+        stack.callback(control_socket.close)
+        content = _endpoints(served, clock, control_socket.address, identity)
         if json_file is not None:
             _write_at_once(json_file, content)
             stack.callback(_remove, json_file, identity)
         if not _is_loopback(host):
             warn(f"everybody who reaches {host} can command these instruments, and nothing asks for a password")
-        _print(served, socket.address)
-        Server(served, socket, log).run(lambda: interrupts.abort_requested() or interrupts.pause_requested)
+        _print(served, control_socket.address)
+        Server(served, control_socket, log).run(lambda: interrupts.abort_requested() or interrupts.pause_requested)
         for each_served in served:
             reached = each_served.clock.factor_reached
             console.print(
@@ -150,7 +151,7 @@ def _control_listener(address: str) -> Listener:
     host, _, port = rest.removeprefix("//").rpartition(":")
     try:
         if scheme == "unix" and rest:
-            if not hasattr(os, "fork"):
+            if not hasattr(socket, "AF_UNIX"):
                 raise ConfigurationError(f"--control {address}: this system has no Unix sockets; use tcp://HOST:PORT")
             return Listener(Path(rest))
         if scheme != "tcp" or not host or not port.isdigit() or int(port) > 65535:

@@ -30,6 +30,11 @@ class _Client:
     is_over: bool = False
     ends_server: bool = False
 
+    @property
+    def takes_bytes(self) -> bool:
+        """Whether there is room for more requests; one that does not read its answers is not asked for any."""
+        return len(self.unread) < _MOST_UNREAD and len(self.received) <= _LONGEST_LINE
+
 
 class ControlSocket:
     """Serves the requests of `sim_devices.serving.requests`; never waits.
@@ -65,9 +70,9 @@ class ControlSocket:
         """Yield what to wait on, and for what."""
         yield self._listener, selectors.EVENT_READ
         for client in self._clients:
-            # A client that does not read its answers is not asked for more.
-            reads = len(client.unread) < _MOST_UNREAD
-            yield client.connection, selectors.EVENT_READ * reads | selectors.EVENT_WRITE * bool(client.unread)
+            wanted = selectors.EVENT_READ * client.takes_bytes | selectors.EVENT_WRITE * bool(client.unread)
+            if wanted:
+                yield client.connection, wanted
 
     def seconds_until_due(self) -> float:
         """Return the wall-clock time (s) until a client that waits has to be answered; infinity if none does."""
@@ -79,7 +84,7 @@ class ControlSocket:
     def serve(self, ready: Collection[Watched]) -> None:
         """Answer what has arrived."""
         for client in self._clients:
-            if client.connection in ready and len(client.unread) < _MOST_UNREAD:
+            if client.connection in ready and client.takes_bytes:
                 self._read(client)
             self._serve(client)
             self._write(client)

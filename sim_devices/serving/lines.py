@@ -124,7 +124,7 @@ class Channel:
                 self._arriving.popleft()
             try:
                 answer = self.stream.receive(piece)
-            except FramingError:
+            except (FramingError, ConnectionResetError):
                 self.is_over = True
                 break
             if answer:

@@ -1,6 +1,6 @@
 """What the control socket takes: each request is a line of JSON, and is parsed strictly.
 
-A request names itself under `do`; `docs/reference/control-socket.md` describes each.
+A request names itself under `do`; `docs/reference/emulate.md` describes each.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
 
-_LONGEST_SKIP = 86_400.0
+_LONGEST_SKIP = 3600.0
 _RIG = Field(default=None, description="which rig is meant, where several are served")
 _INSTRUMENT = Field(description="name of an instrument")
 

@@ -1,6 +1,7 @@
-"""Round trips to served instruments over pseudo-terminals, from another process, beside a server that only echoes."""
+"""Round trips to served instruments from another process, beside a server that only echoes."""
 
 import os
+import socket
 import statistics
 import subprocess
 import sys
@@ -65,13 +66,28 @@ def round_trips(path, request, length, *, before=b""):
     return times[ROUND_TRIPS // 10 :]
 
 
+def round_trips_over_tcp(url):
+    """Return those of a Modbus TCP client that reads PRODUCT_ID, ms."""
+    host, port = url.removeprefix("tcp://").rsplit(":", 1)
+    times = []
+    with socket.create_connection((host, int(port)), PATIENCE) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for _ in range(ROUND_TRIPS):
+            watch = Stopwatch()
+            connection.sendall(bytes.fromhex("0001 0000 0006 01 03 ea60 0002"))
+            answer = connection.recv(100)
+            times.append(1e3 * watch.seconds())
+            assert len(answer) == 13
+    return times[ROUND_TRIPS // 10 :]
+
+
 def said(name, times):
     median, last = statistics.median(times), statistics.quantiles(times, n=100)[98]
     return f"{name:14} median {median:6.3f} ms, 99th percentile {last:6.3f} ms"
 
 
 @pytest.mark.benchmark
-def test_round_trips_over_a_pseudo_terminal(capsys):
+def test_round_trips_between_two_processes(capsys):
     lines = []
     with echoing_terminal() as path:
         lines.append(said("echo", round_trips(path, b"x" * 20, 20)))
@@ -83,5 +99,11 @@ def test_round_trips_over_a_pseudo_terminal(capsys):
                 # The adapter is opened, and the heartbeat is off: it would stand between the answers.
                 before = b"\rC\rS4\rO\rt60182B17100000000000\r" if instrument == "supply" else b""
                 lines.append(said(instrument, round_trips(rig.port(instrument), request, length, before=before)))
+            if rig_name == "sma":
+                lines.append(said("t7 over TCP", round_trips_over_tcp(rig.port("t7"))))
     with capsys.disabled():
-        print("\nRound trips over a pseudo-terminal between two processes (goal: median of 1 ms)", *lines, sep="\n")
+        print(
+            "\nRound trips between two processes, of serial lines over a pseudo-terminal (goal: median of 1 ms)",
+            *lines,
+            sep="\n",
+        )

@@ -13,10 +13,10 @@ from bench.contracts.roles import PositionSensorContract
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7PositionSensor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 

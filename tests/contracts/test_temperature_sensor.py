@@ -12,8 +12,8 @@ from bench.contracts.roles import TemperatureSensorContract
 from bench.errors import DeviceError
 from drivers.labjack_t7 import T7Thermistor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.thermistor import Thermistor
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 CHANNELS = (4, 5)

@@ -20,14 +20,15 @@ from drivers.labjack_t7.registers import (
     AIN_NEGATIVE_CH,
     AIN_RANGE,
     AIN_RESOLUTION_INDEX,
+    TDAC,
     TEST,
     TEST_FLOAT32,
     LabJackT7,
 )
 from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
-from sim_devices.wire.modbus_tcp import ModbusTcpServer
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
@@ -345,8 +346,8 @@ def test_byte_vectors():
         ("0001 0000 0006 01 03 d73c 0002", "0001 0000 0007 01 03 04 0011 2233"),  # TEST
         ("0002 0000 0006 01 03 d754 0002", "0002 0000 0007 01 03 04 c61c 3c00"),  # TEST_FLOAT32
         ("0003 0000 0006 01 03 0000 0002", "0003 0000 0007 01 03 04 4020 0000"),  # AIN0
-        ("0004 0000 000b 01 10 9c40 0002 04 3dcc cccd", "0004 0000 0006 01 10 9c40 0002"),  # AIN0_RANGE
-        ("0005 0000 0006 01 03 9c40 0002", "0005 0000 0007 01 03 04 3dcc cccd"),
+        # AIN0_RANGE, written and read back in one packet, by LabJack's function 76
+        ("0004 0000 000e 01 4c 01 9c40 02 3dcc cccd 00 9c40 02", "0004 0000 0006 01 4c 3dcc cccd"),
     )
     with Scripted(*exchanges) as server:
         t7 = LabJackT7("psd", server.address, 2.0)
@@ -362,9 +363,10 @@ def test_byte_vectors_of_a_ratiometric_sensor():
     volts = "4020 0000 40a0 0000"  # 2.5 and 5 V
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", f"0001 0000 000b 01 03 08 {volts}"),  # AIN2, AIN3
-        ("0002 0000 0006 01 03 1b5c 0004", f"0002 0000 000b 01 03 08 {volts}"),  # AIN2_EF_READ_A ...
-        ("0003 0000 0006 01 03 1c88 0004", "0003 0000 000b 01 03 08 4024 0000 40a4 0000"),  # AIN2_EF_READ_B ...
-        ("0004 0000 0006 01 03 1db4 0004", "0004 0000 000b 01 03 08 401c 0000 409c 0000"),  # AIN2_EF_READ_C ...
+        (  # AIN2_EF_READ_A, B and C, of two inputs each
+            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
+            f"0002 0000 001a 01 4c {volts} 4024 0000 40a4 0000 401c 0000 409c 0000",
+        ),
     )
     with Scripted(*exchanges) as server:
         settings = Settings(port=server.address, **RATIOMETRIC | {"zero_position": 0.0, "position_limits": (0, 0.02)})
@@ -383,37 +385,40 @@ def test_byte_vectors_of_a_switch():
         ("0003 0000 0006 01 03 ea60 0002", "0003 0000 0007 01 03 04 40e0 0000"),  # PRODUCT_ID 7
         ("0004 0000 0006 01 03 ea64 0002", "0004 0000 0007 01 03 04 3f80 0000"),  # FIRMWARE 1
         ("0005 0000 0006 01 03 ea7c 0002", "0005 0000 0007 01 03 04 1c03 dcb9"),  # SERIAL
-        ("0006 0000 0009 01 10 07d5 0001 02 0000", "0006 0000 0006 01 10 07d5 0001"),  # DIO5 low
-        ("0007 0000 0006 01 03 0b22 0002", "0007 0000 0007 01 03 04 0000 0020"),  # DIO_DIRECTION
-        ("0008 0000 0006 01 03 0af0 0002", "0008 0000 0007 01 03 04 007f ffdf"),  # DIO_STATE
-        ("0009 0000 0006 01 03 f0a0 0002", "0009 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_ENABLE
-        ("000a 0000 0006 01 03 f0a4 0002", "000a 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_TIMEOUT_S
-        ("000b 0000 0006 01 03 f0aa 0002", "000b 0000 0007 01 03 04 0000 0000"),  # WATCHDOG_STRICT_ENABLE
+        # DIO5 low, then DIO_DIRECTION and DIO_STATE
         (
-            "000c 0000 0006 01 03 f0be 0008",  # WATCHDOG_DIO_ENABLE, _STATE, _DIRECTION, _INHIBIT
-            "000c 0000 0013 01 03 10 0000 0000 0000 0000 0000 0000 0000 0000",
+            "0006 0000 0010 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02",
+            "0006 0000 000a 01 4c 0000 0020 007f ffdf",
         ),
-        ("000d 0000 000b 01 10 f0a0 0002 04 0000 0000", "000d 0000 0006 01 10 f0a0 0002"),
-        ("000e 0000 0006 01 03 f0a0 0002", "000e 0000 0007 01 03 04 0000 0000"),
-        ("000f 0000 000b 01 10 f0a4 0002 04 0000 0003", "000f 0000 0006 01 10 f0a4 0002"),
-        ("0010 0000 0006 01 03 f0a4 0002", "0010 0000 0007 01 03 04 0000 0003"),
-        ("0011 0000 000b 01 10 f0aa 0002 04 0000 0000", "0011 0000 0006 01 10 f0aa 0002"),
-        ("0012 0000 0006 01 03 f0aa 0002", "0012 0000 0007 01 03 04 0000 0000"),
+        (  # WATCHDOG_ENABLE, _TIMEOUT_S, _STRICT_ENABLE, _DIO_ENABLE, _STATE, _DIRECTION, _INHIBIT
+            "0007 0000 001e 01 4c 00 f0a0 02 00 f0a4 02 00 f0aa 02 00 f0be 02 00 f0c0 02 00 f0c2 02 00 f0c4 02",
+            "0007 0000 001e 01 4c" + 14 * " 0000",
+        ),
+        # Only what differs; it is off, so that it need not be switched off.
         (
-            "0013 0000 0017 01 10 f0be 0008 10 0000 0001 0000 0000 0000 0020 007f ffdf",
-            "0013 0000 0006 01 10 f0be 0008",
-        ),
+            "0008 0000 000e 01 4c 01 f0a4 02 0000 0003 00 f0a4 02",
+            "0008 0000 0006 01 4c 0000 0003",
+        ),  # WATCHDOG_TIMEOUT_S
         (
-            "0014 0000 0006 01 03 f0be 0008",
-            "0014 0000 0013 01 03 10 0000 0001 0000 0000 0000 0020 007f ffdf",
+            "0009 0000 000e 01 4c 01 f0be 02 0000 0001 00 f0be 02",
+            "0009 0000 0006 01 4c 0000 0001",
+        ),  # WATCHDOG_DIO_ENABLE
+        (
+            "000a 0000 000e 01 4c 01 f0c2 02 0000 0020 00 f0c2 02",
+            "000a 0000 0006 01 4c 0000 0020",
+        ),  # WATCHDOG_DIO_DIRECTION
+        (
+            "000b 0000 000e 01 4c 01 f0c4 02 007f ffdf 00 f0c4 02",
+            "000b 0000 0006 01 4c 007f ffdf",
+        ),  # _DIO_INHIBIT
+        ("000c 0000 000e 01 4c 01 f0a0 02 0000 0001 00 f0a0 02", "000c 0000 0006 01 4c 0000 0001"),  # WATCHDOG_ENABLE
+        # DIO5 high
+        (
+            "000d 0000 0010 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02",
+            "000d 0000 000a 01 4c 0000 0020 007f ffff",
         ),
-        ("0015 0000 000b 01 10 f0a0 0002 04 0000 0001", "0015 0000 0006 01 10 f0a0 0002"),
-        ("0016 0000 0006 01 03 f0a0 0002", "0016 0000 0007 01 03 04 0000 0001"),
-        ("0017 0000 0009 01 10 07d5 0001 02 0001", "0017 0000 0006 01 10 07d5 0001"),  # DIO5 high
-        ("0018 0000 0006 01 03 0b22 0002", "0018 0000 0007 01 03 04 0000 0020"),
-        ("0019 0000 0006 01 03 0af0 0002", "0019 0000 0007 01 03 04 007f ffff"),
-        ("001a 0000 0006 01 03 0af0 0002", "001a 0000 0007 01 03 04 007f ffff"),  # glance
-        ("001b 0000 0006 01 03 0af0 0002", "001b 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+        ("000e 0000 0006 01 03 0af0 0002", "000e 0000 0007 01 03 04 007f ffff"),  # glance
+        ("000f 0000 0006 01 03 0af0 0002", "000f 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
     )
     with Scripted(*exchanges) as server:
         settings = SwitchSettings(port=server.address, line=5, watchdog=3)
@@ -427,9 +432,10 @@ def test_byte_vectors_of_a_switch():
 def test_byte_vectors_of_a_thermistor():
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", "0001 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2 1.25 V, AIN3 2.5 V
-        ("0002 0000 0006 01 03 1b5c 0004", "0002 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2_EF_READ_A ...
-        ("0003 0000 0006 01 03 1c88 0004", "0003 0000 000b 01 03 08 3fb0 0000 4024 0000"),  # AIN2_EF_READ_B ...
-        ("0004 0000 0006 01 03 1db4 0004", "0004 0000 000b 01 03 08 3f90 0000 401c 0000"),  # AIN2_EF_READ_C ...
+        (  # AIN2_EF_READ_A, B and C, of two inputs each
+            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
+            "0002 0000 001a 01 4c 3fa0 0000 4020 0000 3fb0 0000 4024 0000 3f90 0000 401c 0000",
+        ),
     )
     with Scripted(*exchanges) as server:
         settings = ThermistorSettings(port=server.address, channels=(2, 3))
@@ -445,19 +451,23 @@ def test_byte_vectors_of_a_high_voltage_supply():
     off, on = "0000 0000 0000 0000 0000 0000", "3f80 0000 3f00 0000 40a0 0000"  # 0, 0, 0 V and 1, 0.5, 5 V
     exchanges = (
         ("0001 0000 000b 01 10 7530 0002 04 0000 0000", "0001 0000 0006 01 10 7530 0002"),  # TDAC0 0 V
-        ("0002 0000 0009 01 10 07d5 0001 02 0001", "0002 0000 0006 01 10 07d5 0001"),  # DIO5 high
-        ("0003 0000 0006 01 03 0b22 0002", "0003 0000 0007 01 03 04 0000 0020"),  # DIO_DIRECTION
-        ("0004 0000 0006 01 03 0af0 0002", "0004 0000 0007 01 03 04 007f ffff"),  # DIO_STATE
-        ("0005 0000 0006 01 03 0000 0006", f"0005 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
-        ("0006 0000 000b 01 10 7530 0002 04 3f80 0000", "0006 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
-        ("0007 0000 000b 01 10 7530 0002 04 bf80 0000", "0007 0000 0006 01 10 7530 0002"),  # TDAC0 -1 V
-        ("0008 0000 0006 01 03 0000 0006", f"0008 0000 000f 01 03 0c {on}"),  # glance
-        ("0009 0000 000b 01 10 7530 0002 04 0000 0000", "0009 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
-        ("000a 0000 0009 01 10 07d5 0001 02 0000", "000a 0000 0006 01 10 07d5 0001"),  # DIO5 low
-        ("000b 0000 0006 01 03 0b22 0002", "000b 0000 0007 01 03 04 0000 0020"),
-        ("000c 0000 0006 01 03 0af0 0002", "000c 0000 0007 01 03 04 007f ffdf"),
-        ("000d 0000 0006 01 03 0000 0006", f"000d 0000 000f 01 03 0c {off}"),
-        ("000e 0000 0006 01 03 0af0 0002", "000e 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+        # DIO5 high, then DIO_DIRECTION and DIO_STATE
+        (
+            "0002 0000 0010 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02",
+            "0002 0000 000a 01 4c 0000 0020 007f ffff",
+        ),
+        ("0003 0000 0006 01 03 0000 0006", f"0003 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
+        ("0004 0000 000b 01 10 7530 0002 04 3f80 0000", "0004 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
+        ("0005 0000 000b 01 10 7530 0002 04 bf80 0000", "0005 0000 0006 01 10 7530 0002"),  # TDAC0 -1 V
+        ("0006 0000 0006 01 03 0000 0006", f"0006 0000 000f 01 03 0c {on}"),  # glance
+        ("0007 0000 000b 01 10 7530 0002 04 0000 0000", "0007 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
+        # DIO5 low
+        (
+            "0008 0000 0010 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02",
+            "0008 0000 000a 01 4c 0000 0020 007f ffdf",
+        ),
+        ("0009 0000 0006 01 03 0000 0006", f"0009 0000 000f 01 03 0c {off}"),
+        ("000a 0000 0006 01 03 0af0 0002", "000a 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
     )
     with Scripted(*exchanges) as server:
         settings = SupplySettings(port=server.address, line=5)
@@ -480,6 +490,36 @@ def test_byte_vectors_of_dac1():
         supply._send(20.0)
         t7.close()
     assert len(server.received) == len(exchanges)
+
+
+@pytest.mark.parametrize(
+    ("use", "words"),
+    [
+        (lambda t7: t7.write(AIN, 1.0), "AIN# can only be read"),
+        (lambda t7: t7.set({TEST: 1}), "TEST can only be read"),
+        (lambda t7: t7.read(TDAC.of(3)), "TDAC3 can only be written"),
+    ],
+)
+def test_what_the_map_does_not_allow_is_an_error_of_the_program(bench, use, words):
+    t7 = LabJackT7("psd", bench.server.address, 1.0)
+    with pytest.raises(ValueError, match=words):
+        use(t7)
+    t7.close()
+
+
+def test_devices_of_one_instrument_share_a_connection(bench):
+    sensor, switch, other = bench.sensor(), bench.switch(), bench.sensor()
+    with socket.create_connection(("127.0.0.1", bench.server.port), timeout=60) as second:
+        second.sendall(bytes.fromhex("0001 0000 0006 01 03 d73c 0002"))
+        assert second.recv(100) == bytes.fromhex("0001 0000 0007 01 03 04 0011 2233")
+    bench.volts[0] = 1.0
+    for device in (sensor, switch):
+        device.close()
+        assert other.measure()["psd_position"] == pytest.approx(10e-6, abs=1e-8)
+    other.close()
+    with pytest.raises(DeviceConnectionError, match="closed"):
+        other.measure()
+    assert bench.sensor().measure()
 
 
 # Setting up
@@ -1196,6 +1236,50 @@ def test_a_watchdog_that_is_set_up_already_is_not_written(bench):
         switch.close()
 
 
+def test_connecting_twice_writes_the_flash_memory_once(bench):
+    bench.switch(line=5, watchdog=7)
+    assert bench.t7.flash_writes == 5  # time, lines, direction, inhibit; then on
+    bench.switch(line=5, watchdog=7)
+    assert bench.t7.flash_writes == 5
+    bench.t7.power_cycle()
+    assert bench.t7.read_value(61604) == 7
+    assert bench.guarded() == 1 << 5
+    bench.switch(line=5, watchdog=7)
+    assert bench.t7.flash_writes == 5
+
+
+def test_a_watchdog_is_off_while_its_settings_change_and_each_is_written_by_itself(bench):
+    bench.switch(line=5, watchdog=7)
+    recorded = Recorded(bench.t7)
+    with ModbusTcpServer(recorded) as server:
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5, watchdog=9), bench.clock)
+        writes = [entry for entry in recorded.requests if entry[0] == "write" and entry[1] >= 61600]
+        assert writes == [("write", 61600, 2), ("write", 61604, 2), ("write", 61600, 2)]
+        switch.close()
+    assert bench.t7.read_value(61604) == 9
+
+
+def test_closing_and_connecting_again_switches_the_watchdog_off_and_on(bench):
+    bench.switch(line=5, watchdog=7).close()
+    before = bench.t7.flash_writes
+    bench.switch(line=5, watchdog=7).close()
+    assert bench.t7.flash_writes == before + 2
+
+
+def test_after_a_power_cycle_every_device_has_to_connect_again(bench):
+    switch, sensor = bench.switch(), bench.sensor()
+    switch.set(1.0)
+    bench.t7.power_cycle()
+    assert bench.t7.dio_level(5)  # an input that is pulled high: what it enables needs a pull-down
+    assert not bench.t7.dio_level(5, pulled_down=True)
+    with pytest.raises(DeviceConnectionError, match=r"fan: .*connect again"):
+        switch.measure()
+    with pytest.raises(DeviceConnectionError, match=r"psd: the connection to .* is closed; connect again, so that"):
+        sensor.measure()
+    assert bench.sensor().measure()
+    assert bench.switch().measure() == {"fan_state": 0.0}
+
+
 def test_a_strict_watchdog_is_refused(bench):
     for address, value in ((61604, 10), (61610, 1), (61612, 77), (61600, 1)):
         bench.t7.write_value(address, value)
@@ -1208,11 +1292,11 @@ def test_a_setting_of_the_watchdog_that_is_not_taken_leaves_it_running_for_other
     bench.switch(line=1, watchdog=30)
 
     def alter(address: int, words: list[int]) -> list[int]:
-        return [0, 0, 0, 0, 0, 0, 0, 0] if address == 61630 and bench.t7.read_value(61600) == 0 else words
+        return [0, 0] if address == 61636 and bench.t7.read_value(61600) == 0 else words
 
     with (
         ModbusTcpServer(Altered(bench.t7, alter)) as server,
-        pytest.raises(DeviceError, match="fan: WATCHDOG_DIO_ENABLE_DEFAULT reads back 0 after 1"),
+        pytest.raises(DeviceError, match="fan: WATCHDOG_DIO_INHIBIT_DEFAULT reads back 0 after 8"),
     ):
         T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
     assert bench.guarded() & 0b10

@@ -17,13 +17,14 @@ from pymodbus.client import ModbusTcpClient
 
 from bench.clock import VirtualClock
 from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, EmulatedT7
+from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import STEINHART_HART, Thermistor
 from sim_devices.wire.modbus import RegisterError, answer
-from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpServer, ModbusTcpStream
+from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpStream
 from sim_devices.world import World
 
 LSB = 2 * RAIL * 10 / 65536

@@ -16,13 +16,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from magnetostrictive_rod.plant import MagnetostrictiveRod
+from sim_devices.wire import WireServer
 from sim_devices.world import World
 
 GAUGE_FACTOR, EXCITATION = 2.1, 5.0
 """Of the strain gauges, each in a quarter bridge: a voltage of EXCITATION * GAUGE_FACTOR * strain / 4."""
 
 
-class AsciiInstrument:
+class AsciiInstrument(WireServer):
     """The serial side of an instrument: what goes in and out of its line."""
 
     def __init__(self, identity: str, world: World, commands: Mapping[str, Callable[..., str]]) -> None:

@@ -9,7 +9,7 @@ from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from magnetostrictive_rod.instruments import EmulatedCoilSource, EmulatedStrainBridge
 from magnetostrictive_rod.plant import MagnetostrictiveRod, RodParameters
-from sim_devices.laboratory import EmulatedLaboratory
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.world import World
 
 
@@ -25,7 +25,15 @@ class RodLaboratory(EmulatedLaboratory):
         # One stream an instrument: how often one is read must not change the readings of the other.
         coil_stream, bridge_stream = np.random.default_rng(seed).spawn(2)
         self.rod = MagnetostrictiveRod(RodParameters())
-        world = World(self.rod, clock)
-        self.coil = EmulatedCoilSource(world, self.rod, coil_stream)
-        self.bridge = EmulatedStrainBridge(world, self.rod, settings.noise, bridge_stream)
+        self.world = World(self.rod, clock)
+        self.coil = EmulatedCoilSource(self.world, self.rod, coil_stream)
+        self.bridge = EmulatedStrainBridge(self.world, self.rod, settings.noise, bridge_stream)
         super().__init__("rod laboratory", {"coil": self.coil, "bridge": self.bridge}, clock)
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the state of the rod and of the coil source, for `bench emulate`."""
+        return {
+            "coil_current": TrueValue(self.rod.current, "A"),
+            "coil_output": TrueValue(self.coil.on, is_output=True),
+            "strain": TrueValue(sum(self.rod.strains) / 2),
+        }

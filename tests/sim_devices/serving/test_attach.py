@@ -1,10 +1,13 @@
 """`bench run --attach`: a protocol against served instruments gives what it gives in process."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+from bench.attachment import ControlClient
 from bench.results.run_folder import RunFolder
 
 CREEP = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=10"]
@@ -50,6 +53,24 @@ def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
         assert (code, err) == (0, "")
         run = RunFolder(next((tmp_path / "runs").iterdir()))
         assert np.mean(run.readings["load_cell_force"]) == pytest.approx(4.9, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
+    with emulate("vo2", "--clock", "x10") as (server, endpoints):
+        command = [sys.executable, "-P", "-m", "bench", "run", "creep", "--rig", "vo2", "--set", "duration=3000",
+                   "--attach", str(tmp_path / "endpoints.json"), "--out", str(tmp_path / "runs")]  # fmt: skip
+        run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        with ControlClient(endpoints["control"]) as control:
+            while not control.state()["tec_output"]:
+                control.wait(control.time() + 1.0)
+        server.kill()
+        _, err = run.communicate(timeout=120)
+    # Nothing answers any more, so that the safe state cannot be confirmed.
+    assert run.returncode == 7
+    assert "tec is NOT in its safe state" in err
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert RunFolder(folder).status == "failed"
 
 
 @pytest.mark.parametrize(

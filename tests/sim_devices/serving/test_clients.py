@@ -81,8 +81,8 @@ def test_requests_may_be_sent_before_their_answers_are_read(vo2, sma, opened, co
 def test_two_connections_are_served_in_turn_and_a_third_is_turned_away(vo2, connect):
     first, second = connect(vo2.port("psd")), connect(vo2.port("psd"))
     assert product(first) == product(second) == product(first, 2) == 7.0
-    third = connect(vo2.port("psd"))
     with suppress(ConnectionError):
+        third = connect(vo2.port("psd"))
         third.sendall(request(1))
         assert third.recv(100) == b""
     assert product(first, 3) == product(second, 3) == 7.0
@@ -147,7 +147,7 @@ def test_a_client_that_floods_and_reads_nothing_is_not_read_any_further(vo2, con
     flooding.settimeout(2.0)
     # More than any buffers of the system hold.
     with pytest.raises(TimeoutError):
-        flooding.sendall(10_000_000 * request(3))
+        flooding.sendall(3_000_000 * request(3))
     assert product(keeper) == 7.0
     assert vo2.control.time() > 0.0
 
@@ -185,9 +185,8 @@ def test_raw_bytes_on_tcp_have_one_client_at_a_time(emulate, opened, connect):
         assert address.startswith("socket://127.0.0.1:")
         line = opened(address)
         assert identity(line).startswith(IDENTITY)
-        second = connect(address)
         with suppress(ConnectionError):
-            assert second.recv(10) == b""
+            assert connect(address).recv(10) == b""
         assert identity(line).startswith(IDENTITY)
         line.close()
         assert identity(opened(address)).startswith(IDENTITY)

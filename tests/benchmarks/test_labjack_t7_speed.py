@@ -1,0 +1,72 @@
+"""The CPU time of the T7 in process: a request, a loop at 20 kHz, and a glance of the whole rig. Asserts no time."""
+
+import time
+from statistics import median
+
+import pytest
+
+from bench.clock import VirtualClock
+from bench.rig import Rig
+from bench.rig_file import load_rig
+from drivers.labjack_t7.registers import AIN, TEST, LabJackT7, Span
+
+pytestmark = pytest.mark.benchmark
+
+RATE = 20e3
+
+
+def microseconds(call, count=2000, repeats=9):
+    """Return the CPU time of a call, µs: the median of some blocks."""
+    blocks = []
+    for _ in range(repeats):
+        start = time.process_time()
+        for _ in range(count):
+            call()
+        blocks.append((time.process_time() - start) / count)
+    return 1e6 * median(blocks)
+
+
+@pytest.fixture
+def rig():
+    with Rig(load_rig("hybrid"), VirtualClock(), 1) as rig:
+        yield rig
+
+
+def test_a_request(rig, capsys):
+    instrument = LabJackT7("t7", rig.devices["displacement"]._settings.port, 1.0)
+    test, conversion, two = Span.of(TEST), Span.of(AIN), (Span.of(TEST), Span.of(AIN))
+    assert instrument.read_span(test) == [0x00112233]
+    found = {
+        "a constant": microseconds(lambda: instrument.read_span(test)),
+        "a conversion": microseconds(lambda: instrument.read_span(conversion)),
+        "both by function 76": microseconds(lambda: instrument.read_spans(two)),
+        "a set-point": microseconds(lambda: rig.devices["piezo"]._send(0.0)),
+    }
+    instrument.close()
+    with capsys.disabled():
+        print("\nT7 in process, µs a request: ", ", ".join(f"{name} {value:.1f}" for name, value in found.items()))
+
+
+def test_twenty_kilohertz(rig, capsys):
+    sensor, supply, clock = rig.devices["displacement"], rig.devices["piezo"], rig.clock
+    supply.set(0.0)
+    count, start = 0, clock.now()
+
+    def sample():
+        nonlocal count
+        count += 1
+        clock.sleep_until(start + count / RATE)
+        supply.set(1e5 * sensor.glance()["displacement_position"])
+
+    cost = microseconds(sample)
+    assert supply.setpoint != 0.0
+    with capsys.disabled():
+        print(f"\nreading and writing at 20 kHz: {cost:.1f} µs a sample, {1e6 / RATE / cost:.1f} times real time")
+
+
+def test_a_glance_of_the_whole_rig(rig, capsys):
+    parts = {name: microseconds(device.glance, 500) for name, device in rig.devices.items()}
+    whole = microseconds(rig.glance, 500)
+    assert set(rig.glance()) == {signal.name for signal in rig.signals}
+    with capsys.disabled():
+        print(f"\nglance of hybrid: {whole:.0f} µs;", ", ".join(f"{name} {cost:.0f}" for name, cost in parts.items()))
