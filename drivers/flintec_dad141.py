@@ -1,11 +1,13 @@
 """The Flintec DAD 141.1, the amplifier of a strain-gauge load cell, by Modbus RTU.
 
 Sources: Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3, for the registers; Flintec DAD 141.1
-Technical Manual, Rev 2.5, 10.1 (identity), 10.4 (filters) and 10.5 (taring); MODBUS over Serial Line,
-Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
+Technical Manual, Rev 2.5, 10.1 (identity), 10.2 (zero tracking), 10.4 (filters) and 10.5 (taring); MODBUS over
+Serial Line, Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
 
 The instrument is calibrated at its own keys, for a weight in a unit that the user chose; the settings convert it to
-newtons. Nothing is saved in its EEPROM: a power cycle restores the previous filter and tare.
+newtons. Nothing is saved in its EEPROM: a power cycle restores the filter that was saved, and forgets the tare. Zero
+tracking takes loads that change slowly for a drift of the zero, so it has to be off (ZT = 0). It belongs to the
+calibration, which is sealed by a counter (TAC); so the driver refuses an instrument that tracks, and changes nothing.
 
 Assumptions: register 0x202C holds the 1410 that the command ID returns, as a number or digit by digit; the first
 byte of the firmware register is the higher one, and holds the minor version; an integer weight has the digits of
@@ -16,34 +18,45 @@ was; characters have 8 bits and one stop bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, ClassVar, Literal, NamedTuple
+import struct
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
 
 from pydantic import Field, field_validator
-from pymodbus.client import ModbusSerialClient
-from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
-from pymodbus.pdu import ModbusPDU
 
 from bench.clock import Clock
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
 from bench.roles import LoadCell
 from drivers.device import LineDevice, Slope
-from drivers.modbus import exception_text, pack, swapped, unpack
+from drivers.modbus import (
+    EMULATED,
+    NoReplyError,
+    RefusedError,
+    RtuClient,
+    UnexpectedReplyError,
+    exception_text,
+    swapped,
+    unpack,
+)
+from drivers.pymodbus_client import SerialClient
 from drivers.serial_line import SerialSettings, lost_line, open_port
 
-CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
+P = ParamSpec("P")
+T = TypeVar("T")
+
+CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
 """3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
 
-_INTEGER_GROSS = 0x2020
 _ADC_SAMPLE = 0x202A
 _DEVICE_ID = 0x202C
 _FIRMWARE = 0x202E
 _SERIAL_NUMBER = 0x2034
 _COMMAND = 0x2061
+_PEAK = 0x2080
 _FILTER = 0x2106
 _FILTER_MODE = 0x2110
+_ZERO_TRACKING = 0x2122
 _COMBINED = 0x3500
 
 _RESET_TARE = 0x04
@@ -56,16 +69,12 @@ _TARE_SET = 0x0020
 
 _IIR = 0
 _MOST_DECIMALS = 5
-_ORDER_TRIALS = 5  # a load that moves may change between two reads
 _TARE_TIMEOUT = 1.0  # s that the instrument is given to show a change of tare
 _POLL = 0.05
 
-_READ = 3  # function code
 _RESENDS = 1
-_SHORTEST_REPLY = 5  # address, function, one byte, CRC
-_WRITE_REPLY = 8
-_LONGEST_REPLY = 256
-_MOST_STRAY = 4096  # bytes
+_BLOCK = struct.Struct(">ffH")
+_READING_BLOCK = f"reading register 0x{_COMBINED:04X}"
 _STALE_LOOKS = 10
 _FAST_LINE = 19200  # Bd above which the pause between frames does not get shorter
 _FAST_PAUSE = 1.75e-3  # s
@@ -91,7 +100,10 @@ class DAD141Settings(SerialSettings):
         description="silence before a request, s: 0 to 1; unless given, 3.5 characters, or 1.75 ms above 19200 Bd",
     )
     filter: int = Field(
-        default=3, ge=0, le=7, description="low-pass filter (FL): 0 for none, 1 to 7 for 18, 8, 4, 3, 2, 1, 0.5 Hz"
+        default=3,
+        ge=0,
+        le=8,
+        description="low-pass filter (FL): 0 for none, 1 to 8 for 18, 8, 4, 3, 2, 1, 0.5, 0.25 Hz",
     )
     samples: int = Field(default=5, ge=1, le=1000, description="readings averaged in one measurement, 1 to 1000")
     interval: float | None = Field(
@@ -133,82 +145,6 @@ class DAD141Settings(SerialSettings):
         return value
 
 
-class _Client(ModbusSerialClient):
-    """pymodbus's client of a serial line, with a receiver that waits for bytes instead of looking for them.
-
-    pymodbus looks whether bytes have come, sleeps for a millisecond or more, and looks again whether more have:
-    two naps for each reply. The head of a reply says how long it is, so that the port itself can wait for
-    exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
-    """
-
-    def __init__(self, name: str, settings: DAD141Settings) -> None:
-        # Sending again is left to the caller, which lets late replies pass first.
-        super().__init__(
-            settings.port, baudrate=settings.baudrate, parity=settings.parity, timeout=settings.timeout, retries=0
-        )
-        self.socket: Any = open_port(name, settings, parity=settings.parity, exclusive=True)
-        self._received = 0
-
-    def connect(self) -> bool:
-        """Return whether the line is open; a line that was lost stays closed."""
-        return self.socket is not None
-
-    def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:  # noqa: ARG002 - pymodbus's form
-        """Send a request, and discard what came before it."""
-        with self._line_errors():
-            self._discard()
-            self._received = 0
-            sent: int = self.socket.write(request)
-        return sent
-
-    def recv(self, size: int | None) -> bytes:  # noqa: ARG002 - pymodbus's form
-        """Wait for a reply, up to the timeout, and return what has come of it."""
-        if self._received > _LONGEST_REPLY:
-            return b""  # it never becomes a reply
-        with self._line_errors():
-            reply: bytes = self.socket.read(_SHORTEST_REPLY)
-            if len(reply) == _SHORTEST_REPLY and (missing := _reply_length(reply) - _SHORTEST_REPLY) > 0:
-                reply += self.socket.read(missing)
-        self._received += len(reply)
-        return reply
-
-    def drain(self) -> None:
-        """Discard what still arrives, until nothing has come for a timeout."""
-        with self._line_errors():
-            for _ in range(_MOST_STRAY // _LONGEST_REPLY):
-                if not self.socket.read(_LONGEST_REPLY):
-                    return
-        raise ConnectionException("the line does not fall silent")
-
-    def _discard(self) -> None:
-        # A socket says only that something is waiting, not how much; hence byte by byte at worst.
-        for _ in range(_MOST_STRAY):
-            if not (waiting := self.socket.in_waiting):
-                return
-            self.socket.read(waiting)
-
-    @contextmanager
-    def _line_errors(self) -> Iterator[None]:
-        """Turn what the port raises into what pymodbus raises."""
-        if self.socket is None:
-            raise ConnectionException("the line is closed")
-        try:
-            yield
-        except OSError as error:
-            self.close()  # type: ignore[no-untyped-call]
-            raise ConnectionException(str(error)) from error
-
-
-def _reply_length(head: bytes) -> int:
-    """Return the bytes of the reply that begins so; those at hand if it is none."""
-    function = head[1]
-    if function in (3, 4):
-        return _SHORTEST_REPLY + head[2]
-    if function in (6, 16):
-        return _WRITE_REPLY
-    return len(head)
-
-
 class _Block(NamedTuple):
     """The combined registers, in the unit of weight."""
 
@@ -230,26 +166,22 @@ class _Line:
         self._clock = clock
         self._pause = _frame_pause(settings)
         self._silent_since = clock.now()
-        self._client = _Client(name, settings)
+        self._client: RtuClient | SerialClient
+        if settings.port.startswith(EMULATED):
+            self._client = RtuClient(open_port(name, settings), settings.address)
+        else:
+            self._client = SerialClient(name, settings, settings.address, settings.parity)
+        self._is_open = True
 
     def close(self) -> None:
         """Release the line."""
-        self._client.close()  # type: ignore[no-untyped-call]
+        self._is_open = False
+        self._client.close()
 
     def read(self, address: int, count: int) -> list[int]:
         """Get `count` registers from `address` on, each 0 to 65535."""
-        unit = self._settings.address
-        response = self._exchange(
-            lambda: self._client.read_holding_registers(address, count=count, device_id=unit),
-            f"reading register 0x{address:04X}",
-        )
-        if response.function_code != _READ or len(response.registers) != count:
-            raise DeviceError(
-                self._name,
-                f"sent {len(response.registers)} registers by function {response.function_code} where {count} by "
-                f"function {_READ} were asked for; check that no other master is on the line",
-            )
-        return list(response.registers)
+        data = self._exchange(f"reading register 0x{address:04X}", self._client.read, address, count)
+        return list(struct.unpack(f">{count}H", data))
 
     def read_integer(self, address: int) -> int:
         """Get a 32-bit integer."""
@@ -257,15 +189,12 @@ class _Line:
 
     def read_block(self) -> _Block:
         """Get the combined registers."""
-        return _Block(*unpack("ffH", self.read(_COMBINED, 5)))
+        return _Block(*_BLOCK.unpack(self._exchange(_READING_BLOCK, self._client.read, _COMBINED, 5)))
 
     def set_integer(self, title: str, address: int, value: int) -> None:
         """Set a 32-bit integer and read it back; `title` is its name for messages."""
-        words = pack("i", value)
-        unit = self._settings.address
-        self._exchange(
-            lambda: self._client.write_registers(address, words, device_id=unit), f"writing register 0x{address:04X}"
-        )
+        data = struct.pack(">i", value)
+        self._exchange(f"writing register 0x{address:04X}", self._client.write, address, data)
         actual = self.read_integer(address)
         if actual != value:
             raise DeviceError(
@@ -275,38 +204,40 @@ class _Line:
 
     def command(self, value: int) -> None:
         """Give a command of register 0x2061."""
-        unit = self._settings.address
-        self._exchange(lambda: self._client.write_register(_COMMAND, value, device_id=unit), f"command 0x{value:02X}")
+        self._exchange(f"command 0x{value:02X}", self._client.write_one, _COMMAND, value)
 
-    def _exchange(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
-        if not self._client.connect():
+    def _exchange(self, doing: str, request: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+        if not self._is_open:
             raise DeviceConnectionError(
                 self._name, f"the line {self._settings.port} is closed; connect again, so that the set-up is checked"
             )
         try:
             for _ in range(_RESENDS):
                 try:
-                    return self._once(request, doing)
-                except ModbusIOException:
+                    return self._once(request, *arguments, **options)
+                except NoReplyError:
                     self._client.drain()
-            return self._once(request, doing)
-        except ModbusException as error:
+            return self._once(request, *arguments, **options)
+        except RefusedError as error:
+            raise _RefusalError(self._name, error.code, doing) from error
+        except UnexpectedReplyError as error:
+            raise DeviceError(self._name, f"{error}; check that no other master is on the line") from error
+        except OSError as error:
             raise self._lost(error) from error
 
-    def _once(self, request: Callable[[], ModbusPDU], doing: str) -> ModbusPDU:
+    def _once(self, request: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
         self._clock.sleep_until(self._silent_since + self._pause)
-        response = request()
-        self._silent_since = self._clock.now()
-        if response.isError():
-            raise _RefusedError(self._name, response.exception_code, doing)
-        return response
+        try:
+            return request(*arguments, **options)
+        finally:
+            self._silent_since = self._clock.now()
 
-    def _lost(self, error: Exception) -> DeviceConnectionError:
+    def _lost(self, error: OSError) -> DeviceConnectionError:
         # An instrument that was off has lost its set-up, so the line ends here.
         settings = self._settings
         self.close()
-        if isinstance(error, ConnectionException):
-            return lost_line(self._name, settings, error.string, ", then connect again")
+        if not isinstance(error, NoReplyError):
+            return lost_line(self._name, settings, error, ", then connect again")
         return DeviceConnectionError(
             self._name,
             f"no good reply within {settings.timeout:g} s at {settings.port}, address {settings.address}, after "
@@ -315,7 +246,7 @@ class _Line:
         )
 
 
-class _RefusedError(DeviceError):
+class _RefusalError(DeviceError):
     """The instrument answered with a Modbus exception."""
 
     def __init__(self, device: str, code: int, doing: str) -> None:
@@ -330,7 +261,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     that was set or lost without the bench is an error, as the force would jump by it. `measure` averages
     `samples` readings, `glance` takes one.
 
-    `connect` checks the order of words in the instrument's values, and sets filter and tare.
+    `connect` checks the order of words in the instrument's values and that zero tracking is off, and sets filter and
+    tare.
     """
 
     Settings: ClassVar[type[DAD141Settings]] = DAD141Settings
@@ -352,6 +284,12 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
     def _start(self) -> None:
         settings, line = self._settings, self._line
+        if (tracking := line.read_integer(_ZERO_TRACKING)) != 0:
+            raise DeviceError(
+                self.name,
+                f"zero tracking is on (ZT = {tracking}): it would take slow changes of a small load for drift; "
+                "switch it off by the commands CE, ZT 0 and CS of the instrument, then connect again",
+            )
         line.set_integer("filter mode", _FILTER_MODE, _IIR)
         line.set_integer("filter", _FILTER, settings.filter)
         self._tared = settings.keep_tare and bool(line.read_block().qualifier & _TARE_SET)
@@ -433,24 +371,23 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 )
             serial_number = line.read_integer(_SERIAL_NUMBER)
             self._check_order()
-        except _RefusedError as error:
+        except _RefusalError as error:
             reason = str(error).removeprefix(f"{self.name}: ")
             raise self._wrong(f"is not a DAD 141.1: {reason}; check the address") from error
         minor, major = low >> 8, low & 0xFF
         return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
 
     def _check_order(self) -> None:
-        """Raise unless the same weight as floating-point number and as integer has the same digits."""
-        for _ in range(_ORDER_TRIALS):
-            block = self._line.read_block()
-            digits = self._line.read_integer(_INTEGER_GROSS)
-            # Out of range the weight may be anything; the identity has shown the order already.
-            if block.qualifier & (_UNDER_RANGE | _OVER_RANGE) or _agree(block.gross, digits):
-                return
-        raise self._wrong(
-            f"gives the same weight as {block.gross:g} and, as an integer, {digits}; is there a gateway in between "
-            "that changes the order of words or bytes?"
-        )
+        """Raise unless the peak weight as floating-point number and as integer has the same digits.
+
+        Both are read in one request, and the peak stands still between two new ones.
+        """
+        weight, digits = unpack("fi", self._line.read(_PEAK, 4))
+        if not _agree(weight, digits):
+            raise self._wrong(
+                f"gives the same weight as {weight:g} and, as an integer, {digits}; is there a gateway in between "
+                "that changes the order of words or bytes?"
+            )
 
     def _wrong(self, what: str) -> DeviceConnectionError:
         return DeviceConnectionError(
@@ -529,8 +466,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
 
 def _agree(weight: float, digits: int) -> bool:
-    """Return whether an integer has the digits of a weight, give or take some motion."""
-    tolerance = 2.5 + 0.02 * abs(digits)
+    """Return whether an integer has the digits of a weight of single precision."""
+    tolerance = 0.5 + 1e-6 * abs(digits)
     return any(abs(weight * 10.0**decimals - digits) <= tolerance for decimals in range(_MOST_DECIMALS + 1))
 
 

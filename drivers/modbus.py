@@ -13,6 +13,7 @@ import logging
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 # The drivers raise everything that pymodbus logs as an error, with the name of the device.
@@ -203,8 +204,53 @@ def crc16(data: bytes) -> bytes:
     return crc.to_bytes(2, "little")
 
 
+class NoReplyError(OSError):
+    """No good reply came; the line itself works."""
+
+
+class UnexpectedReplyError(OSError):
+    """A good reply came, of another form than the request asks for."""
+
+    def __init__(self, request: bytes, expected: int, function: int, length: int) -> None:
+        super().__init__(
+            f"the answer has {length} bytes where {expected} were expected (function {request[0]} was asked for, "
+            f"{function} answered)"
+        )
+
+
+SHORTEST_REPLY = 5
+"""Bytes of the shortest reply on a serial line: address, function, one byte, CRC."""
+LONGEST_REPLY = 256
+"""Bytes of the longest reply on a serial line (2.5.1.1)."""
+MOST_STRAY = 4096
+"""Bytes that may come unasked before a serial line counts as unusable."""
+
+_WRITE_REPLY = 8
+_KNOWN_FRAMES = 64
+
+
+def reply_length(head: bytes) -> int:
+    """Return the bytes of the reply on a serial line whose first 5 are known; 5 if it is none."""
+    function = head[1]
+    if function == READ:
+        return SHORTEST_REPLY + head[2]
+    if function in (WRITE_ONE, WRITE):
+        return _WRITE_REPLY
+    return SHORTEST_REPLY
+
+
+@lru_cache(_KNOWN_FRAMES)
+def _framed(unit: int, request: bytes) -> bytes:
+    # A host asks the same few again and again.
+    frame = bytes((unit,)) + request
+    return frame + crc16(frame)
+
+
 class RtuClient(_PortClient):
-    """Modbus RTU over a port of pyserial, for `emulated://` addresses, on which no echo and no noise comes.
+    """Modbus RTU over a port of pyserial, for `emulated://` addresses.
+
+    A reply does not say which request it belongs to. So after a request without a good reply, `drain` lets a late one
+    pass before anything else is sent.
 
     Parameters
     ----------
@@ -219,20 +265,40 @@ class RtuClient(_PortClient):
         self._unit = unit
 
     def request(self, request: bytes, expected: int) -> bytes:
-        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
-        frame = bytes((self._unit,)) + request
-        self._port.write(frame + crc16(frame))
-        reply = self._receive(self._port.read_all(), 5)  # a refusal: address, function, code, CRC
-        refused = reply[1] == request[0] | _REFUSED
-        if not refused:
-            reply = self._receive(reply, expected + 3)
-        if crc16(reply[:-2]) != reply[-2:]:
-            raise OSError(f"the answer {reply.hex(' ')} has a wrong checksum")
-        if reply[0] != self._unit or reply[1] & ~_REFUSED != request[0]:
-            raise OSError(f"the answer {reply.hex(' ')} belongs to another request")
-        if refused:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes.
+
+        Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
+        """
+        port = self._port
+        if port.in_waiting:
+            port.reset_input_buffer()
+        port.write(_framed(self._unit, request))
+        reply: bytes = port.read_all()
+        if len(reply) < SHORTEST_REPLY:
+            reply += port.read(SHORTEST_REPLY - len(reply))
+        if len(reply) >= SHORTEST_REPLY:
+            length = reply_length(reply)
+            if len(reply) < length:
+                reply += port.read(length - len(reply))
+            reply = reply[:length]
+        if len(reply) < SHORTEST_REPLY or reply[0] != self._unit or crc16(reply[:-2]) != reply[-2:]:
+            raise NoReplyError(f"{len(reply)} bytes that are no good reply")
+        if reply[1] == request[0] | _REFUSED:
             raise RefusedError(reply[2])
-        return reply[1:-2]
+        content = reply[1:-2]
+        if content[0] != request[0] or len(content) != expected:
+            raise UnexpectedReplyError(request, expected, content[0], len(content))
+        return content
+
+    def drain(self) -> None:
+        """Discard what still arrives, until nothing has come for a timeout.
+
+        Raises `OSError` if the line does not fall silent.
+        """
+        for _ in range(MOST_STRAY // LONGEST_REPLY):
+            if not self._port.read(LONGEST_REPLY):
+                return
+        raise OSError("the line does not fall silent")
 
 
 def exception_text(code: int, doing: str) -> str:

@@ -10,25 +10,12 @@ from typing import Any
 
 import serial
 from pymodbus.client import ModbusTcpClient
-from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
-from drivers.modbus import EMULATED, FEEDBACK, ModbusClient, RefusedError, TcpClient
+from drivers.modbus import EMULATED, FEEDBACK, ModbusClient, TcpClient
+from drivers.pymodbus_client import PymodbusClient
 
 _UNIT = 1  # LabJack takes any
-
-
-class _Request(ModbusPDU):
-    """Any request, for pymodbus to frame and send."""
-
-    def __init__(self, request: bytes) -> None:
-        super().__init__(dev_id=_UNIT)
-        self.function_code = request[0]
-        self._body = request[1:]
-
-    def encode(self) -> bytes:
-        """Return what follows the function."""
-        return self._body
 
 
 class _Feedback(ModbusPDU):
@@ -46,45 +33,17 @@ class _Feedback(ModbusPDU):
         self.values = data
 
 
-class _PymodbusClient(ModbusClient):
-    """pymodbus's client of Modbus TCP, for real lines."""
-
-    def __init__(self, port: str, timeout: float) -> None:
-        host, _, number = port.removeprefix("tcp://").rpartition(":")
-        # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
-        self._client = ModbusTcpClient(host.strip("[]"), port=int(number), timeout=timeout, retries=0)
-        self._client.register(_Feedback)
-        if not self._client.connect():  # type: ignore[no-untyped-call]
-            raise ConnectionError
-
-    def request(self, request: bytes, expected: int) -> bytes:
-        """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
-        try:
-            response = self._client.execute(False, _Request(request))
-        except ModbusException as error:
-            raise ConnectionError(str(error)) from error
-        if response.isError():
-            raise RefusedError(response.exception_code)
-        reply = bytes((response.function_code,)) + response.encode()
-        if reply[0] != request[0] or len(reply) != expected:
-            raise ConnectionError(f"the answer has {len(reply)} bytes where {expected} were expected")
-        return reply
-
-    def close(self) -> None:
-        """Release the line; may be called again."""
-        self._client.close()  # type: ignore[no-untyped-call]
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the line can be used."""
-        return self._client.is_socket_open()
-
-
 def _open_client(port: str, timeout: float) -> ModbusClient:
     if port.startswith(EMULATED):
         line: Any = serial.serial_for_url(port, timeout=timeout)
         return TcpClient(line, _UNIT)
-    return _PymodbusClient(port, timeout)
+    host, _, number = port.removeprefix("tcp://").rpartition(":")
+    # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
+    client = ModbusTcpClient(host.strip("[]"), port=int(number), timeout=timeout, retries=0)
+    client.register(_Feedback)
+    if not client.connect():  # type: ignore[no-untyped-call]
+        raise ConnectionError
+    return PymodbusClient(client, _UNIT)
 
 
 class Connection:

@@ -49,11 +49,18 @@ def lost_line(device: str, settings: SerialSettings, error: object, advice: str 
 
 
 def no_answer(
-    device: str, settings: SerialSettings, problem: str, node: str, number: int, found: str = "", speed: str = ""
+    device: str,
+    settings: SerialSettings,
+    problem: str,
+    node: str,
+    number: int,
+    found: str = "",
+    speed: str = "",
+    resends: int = RESENDS,
 ) -> DeviceConnectionError:
     """Return the error for a request without a good answer; `node` is the instrument's word for its address."""
     return DeviceConnectionError(
         device,
-        f"{problem} at {settings.port}, {node} {number}, after {1 + RESENDS} requests{found}; "
+        f"{problem} at {settings.port}, {node} {number}, after {1 + resends} request{'s' if resends else ''}{found}; "
         f"check power, cable, {node} and speed ({speed or f'{settings.baudrate} Bd'})",
     )

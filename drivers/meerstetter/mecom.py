@@ -1,6 +1,7 @@
 """The MeCom protocol on a serial line: frames, their CRC and sequence numbers, and parameters.
 
-Source: Meerstetter 5117 (MeCom protocol specification: frames, CRC, server errors).
+Sources: Meerstetter 5117C (MeCom protocol specification: frames, CRC, server errors, sending again); Meerstetter's
+MeComAPI for .NET 5205F, `BulkParRead` (`?VX`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, o
 _MOST_STALE_ANSWERS = 8
 _ACKNOWLEDGE_LENGTH = 12  # !, address, sequence, CRC, carriage return
 _ERROR_LENGTH = 15  # the same and + with two digits
-_LONGEST_NONSENSE = 64  # characters without an end; the longest answer has 32
+_LONGEST_NONSENSE = 256  # characters without an end; the longest answer has 52, and two may have lost their end
 
 SERVER_ERRORS: Mapping[int, str] = {
     1: "the command is not available",
@@ -67,7 +68,8 @@ class TECLine:
     """The serial line to one device: frames, their CRC and sequence numbers, and sending again.
 
     A request that brings no answer, or a damaged one, is sent again with its own sequence number, twice at
-    most. An answer with another sequence number is a late one to an earlier request, and is skipped.
+    most (5117C). The device may carry it out again, so an order that must not be repeated is sent once. An answer
+    with another sequence number is a late one to an earlier request, and is skipped.
     """
 
     def __init__(self, device: str, settings: TECLineSettings) -> None:
@@ -94,18 +96,18 @@ class TECLine:
         """
         return self._exchange(request, digits).decode("ascii", "replace")
 
-    def order(self, request: str) -> None:
+    def order(self, request: str, *, resends: int = RESENDS) -> None:
         """Send a command that the device only acknowledges; errors are those of `ask`."""
-        self._exchange(request, 0)
+        self._exchange(request, 0, resends)
 
-    def _exchange(self, request: str, digits: int) -> bytes:
+    def _exchange(self, request: str, digits: int, resends: int = RESENDS) -> bytes:
         self._sequence = (self._sequence + 1) & 0xFFFF
         head = b"%02X%04X" % (self._settings.address, self._sequence)
         body = b"#" + head + request.encode("ascii")
         crc = b"%04X" % crc_hqx(body, 0)
         frame = body + crc + b"\r"
         try:
-            for _ in range(1 + RESENDS):
+            for _ in range(1 + resends):
                 self._port.write(frame)
                 problem, content = self._answer(b"!" + head, crc, digits)
                 if problem == "":
@@ -118,7 +120,7 @@ class TECLine:
                     self._port.reset_input_buffer()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
-        raise no_answer(self._device, self._settings, problem, "address", self._settings.address)
+        raise no_answer(self._device, self._settings, problem, "address", self._settings.address, resends=resends)
 
     def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything, and its payload."""
@@ -169,6 +171,34 @@ def encode(parameter: Parameter, value: float) -> str:
     if parameter.real:
         return struct.pack(">f", value).hex().upper()
     return f"{int(value) & 0xFFFFFFFF:08X}"
+
+
+class Block:
+    """Parameters that are read by one request, `?VX`.
+
+    Parameters
+    ----------
+    channel : int
+        The instance of those that belong to a channel.
+    """
+
+    def __init__(self, channel: int, *parameters: Parameter) -> None:
+        self.parameters = parameters
+        self.request = f"?VX{len(parameters):02X}" + "".join(selector(each, channel) for each in parameters)
+        self.digits = 8 * len(parameters)
+        self._form = struct.Struct(">" + "".join("f" if each.real else "i" for each in parameters))
+
+    def decode(self, device: str, digits: str) -> tuple[float, ...]:
+        """Return the values of an answer, in order."""
+        try:
+            return self._form.unpack(bytes.fromhex(digits))
+        except (ValueError, struct.error):
+            raise DeviceError(device, f"answered {digits!r} for {len(self.parameters)} parameters at once") from None
+
+
+def selector(parameter: Parameter, channel: int) -> str:
+    """Return number and instance of a parameter as 6 hex digits."""
+    return f"{parameter.number:04X}{channel if parameter.of_channel else 1:02X}"
 
 
 def decode(device: str, parameter: Parameter, digits: str) -> float:

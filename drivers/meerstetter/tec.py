@@ -1,6 +1,7 @@
 """The Meerstetter TEC controllers (TEC-1089, TEC-1091 and their family).
 
-Source: Meerstetter 5136 (TEC controller communication protocol: parameters and commands).
+Sources: Meerstetter 5136AL (TEC controller communication protocol: parameters and commands); Meerstetter 5216G
+(TEC-family user manual: table 32, communication watchdog); release notes of firmware 6.32 (the family).
 
 The driver writes to the device's RAM only: saving to the flash is switched off first (parameter 108), as the
 flash endures about 100 000 writes, and set-points go to the live parameters (50000 and up), which are zero again
@@ -24,7 +25,17 @@ from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
-from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, TECLineSettings, decode, encode, single
+from drivers.meerstetter.mecom import (
+    Block,
+    Parameter,
+    RefusedError,
+    TECLine,
+    TECLineSettings,
+    decode,
+    encode,
+    selector,
+    single,
+)
 
 _START_TIMEOUT = 5.0
 _RESET_DELAY = 0.3  # the device restarts 0.2 s after the command
@@ -35,8 +46,7 @@ _LIVE_INPUT, _CONTROLLER_INPUT = 1, 2  # values of the output stage input select
 _STABLE = 2  # value of "temperature is stable"
 
 FAMILY = frozenset({1089, 1090, 1091, 1092, 1122, 1123, 1161, 1162, 1163, 1166, 1167})
-"""Device types (parameter 100) that count as TEC controllers. Meerstetter 5136 covers 1089 to 1123; that
-the 116x obey the same parameters is an assumption."""
+"""Device types (parameter 100) that count as TEC controllers: one firmware serves them all."""
 
 
 class _State(IntEnum):
@@ -126,11 +136,14 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     settings that the device does not allow is refused before anything is written.
 
     While the output is on, the device watches its host (`watchdog` of the settings, 5 s by default): if the host is
-    silent for that long, the device switches its output off by itself and stays in error 183. That any exchange
-    feeds the watchdog, a reading as well as a write, is an assumption; the manual does not say. So ask for a reading
-    (`glance`) more often than that while a set-point is held: the longest pause between two ticks of the bench is
-    2 s, hence the default. The watchdog is armed just before the output is switched on and disarmed once it is
-    confirmed to be off, so that a device at rest does not end in an error.
+    silent for that long, the device switches its output off by itself and stays in error 183, as the automatic
+    restart after an error (6310) is switched off. Any valid package feeds the watchdog, a reading as well as a write;
+    so ask for a reading (`glance`) more often than that while a set-point is held: the longest pause between two
+    ticks of the bench is 2 s, hence the default. The watchdog is armed just before the output is switched on and
+    disarmed once it is confirmed to be off, so that a device at rest does not end in an error.
+
+    A measurement is one request for all its values and the status (`?VX`), so that they are of one instant. A device
+    whose firmware does not know it is asked for one value after the other; `connect` finds out which.
 
     The device reports current and voltage by its own sign; whether a positive current heats is parameter
     3034, which the driver reads once and takes into account, as the role counts heating as positive. That
@@ -143,6 +156,9 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         super().__init__(name, settings, clock, line)
         self._mode = settings.mode
         self._polarity = 1
+        self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
+        self._reads_blocks = False
+        self._names = tuple(signal.name for signal in self.signals)
 
     @classmethod
     def _open_line(cls, name: str, settings: TECSettings, clock: Clock) -> TECLine:  # noqa: ARG003
@@ -199,17 +215,13 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
     def measure(self) -> dict[str, float]:
         """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V)."""
-        values = (
-            self._read(_OBJECT_TEMPERATURE),
-            self._read(_SINK_TEMPERATURE),
-            self._polarity * self._read(_CURRENT),
-            self._polarity * self._read(_VOLTAGE),
-        )
-        # Read last: an error that comes up while the values are read invalidates them, too.
-        self._check()
+        # The status comes last: an error that comes up while the values are read invalidates them, too.
+        measured, sink, current, voltage, status = self._read_block(self._measured)
+        self._judge(status)
+        values = (measured, sink, self._polarity * current, self._polarity * voltage)
         if not all(map(math.isfinite, values)):
             raise DeviceError(self.name, "reports a value that is not a number; check the sensors")
-        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+        return dict(zip(self._names, values, strict=True))
 
     def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
         """Hold the present temperature as the set-point; in current mode the current stays as it is."""
@@ -245,7 +257,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         """
         # The acknowledge may be lost in the restart; whether the device comes back is what counts.
         with suppress(DeviceConnectionError, RefusedError):
-            self._line.order("RS")
+            self._line.order("RS", resends=0)
         self._clock.sleep(_RESET_DELAY)
         self._start()
 
@@ -271,10 +283,28 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def _start(self) -> None:
         self._wait_until(lambda: self._state() not in (_State.INIT, _State.RESET_PENDING), _START_TIMEOUT)
         self._check()
+        self._choose_reading()
         self._configure()
 
     def _restart(self) -> None:
         self.reset()
+
+    def _choose_reading(self) -> None:
+        """Find out whether the device reads several parameters at once, and whether it has the channel."""
+        block = Block(self._settings.channel, _SINK_TEMPERATURE, _STATUS)
+        try:
+            self._line.ask(block.request, block.digits)
+        except RefusedError:
+            self._reads_blocks = False
+        else:
+            self._reads_blocks = True
+        if math.isnan(self._read_block(block)[0]):
+            channel = self._settings.channel
+            raise DeviceError(
+                self.name,
+                f"channel {channel} reports no sink temperature: the {self._identity.model} has no such channel, or "
+                "its sink sensor is missing; check `channel` and the sensor",
+            )
 
     def _configure(self) -> None:
         settings = self._settings
@@ -337,15 +367,21 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return False
 
     def _state(self) -> _State:
-        value = int(self._read(_STATUS))
+        return self._named_state(self._read(_STATUS))
+
+    def _named_state(self, value: float) -> _State:
         try:
-            return _State(value)
+            return _State(int(value))
         except ValueError:
-            raise DeviceError(self.name, f"reports a device status {value} that the protocol lacks") from None
+            raise DeviceError(self.name, f"reports a device status {value:g} that the protocol lacks") from None
 
     def _check(self) -> _State:
         """Return the state if it is ready or run; raise what is wrong otherwise."""
-        state = self._state()
+        return self._judge(self._read(_STATUS))
+
+    def _judge(self, status: float) -> _State:
+        """Return the state that a device status means if it is ready or run; raise what is wrong otherwise."""
+        state = self._named_state(status)
         if state is _State.ERROR:
             raise self._fault()
         if state not in (_State.READY, _State.RUN):
@@ -369,13 +405,23 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         answer = self._ask("?VR", parameter, 8)
         return decode(self.name, parameter, answer)
 
+    def _read_block(self, block: Block) -> tuple[float, ...]:
+        """Read parameters, at once if the device can."""
+        if not self._reads_blocks:
+            return tuple(self._read(parameter) for parameter in block.parameters)
+        try:
+            return block.decode(self.name, self._line.ask(block.request, block.digits))
+        except RefusedError as error:
+            titles = ", ".join(parameter.title for parameter in block.parameters)
+            raise DeviceError(self.name, f"refused to report its {titles}: {error}") from None
+
     def _range(self, parameter: Parameter) -> tuple[float, float]:
         answer = self._ask("?VL", parameter, 18)
         return decode(self.name, parameter, answer[2:10]), decode(self.name, parameter, answer[10:])
 
     def _ask(self, command: str, parameter: Parameter, digits: int) -> str:
         try:
-            return self._line.ask(f"{command}{self._selector(parameter)}", digits)
+            return self._line.ask(command + selector(parameter, self._settings.channel), digits)
         except RefusedError as error:
             raise DeviceError(
                 self.name, f"refused to report its {parameter.title} (parameter {parameter.number}): {error}"
@@ -383,7 +429,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
     def _write(self, parameter: Parameter, value: float) -> None:
         try:
-            self._line.order(f"VS{self._selector(parameter)}{encode(parameter, value)}")
+            self._line.order(f"VS{selector(parameter, self._settings.channel)}{encode(parameter, value)}")
         except RefusedError as error:
             allowed = ""
             if error.code == _OUT_OF_RANGE:
@@ -393,7 +439,3 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 self.name,
                 f"refused {value:g} as its {parameter.title} (parameter {parameter.number}): {error}{allowed}",
             ) from None
-
-    def _selector(self, parameter: Parameter) -> str:
-        instance = self._settings.channel if parameter.of_channel else 1
-        return f"{parameter.number:04X}{instance:02X}"

@@ -214,6 +214,7 @@ class MuscleLaboratory(EmulatedLaboratory):
             self._sensed_force,
             rng=cell,
             weight_limits=(-5.0, 50.0),
+            zero_tracking=0,
             noise=settings.force_noise,
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)

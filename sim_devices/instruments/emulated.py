@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.devices import Device, Identity
 from bench.errors import DeviceConnectionError
+from sim_devices.noise import normals
 from sim_devices.world import World
 
 
@@ -34,7 +35,7 @@ class EmulatedDevice(Device):
     Parameters
     ----------
     rng : numpy.random.Generator, optional
-        Noise of the readings; without it they are free of noise.
+        Noise of the readings, from a stream that nothing else draws from; without it they are free of noise.
     """
 
     _identity: Identity
@@ -42,7 +43,7 @@ class EmulatedDevice(Device):
     def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
         super().__init__(name, world.clock)
         self.world = world
-        self._rng = rng
+        self._normals = None if rng is None else normals(rng)
         self._setpoint = math.nan
 
     @property
@@ -60,7 +61,7 @@ class EmulatedDevice(Device):
 
     def _draw(self, deviation: float) -> float:
         """Draw from a normal distribution of a standard deviation."""
-        return 0.0 if self._rng is None else deviation * float(self._rng.standard_normal())
+        return 0.0 if self._normals is None else deviation * next(self._normals)
 
 
 class EmulatedInstrument(EmulatedDevice):

@@ -16,20 +16,24 @@ Assumptions, where these say nothing:
   24 bits.
 - The range bits say that the gross weight is beyond the largest or the smallest value to be displayed; the
   converter itself saturates at 1.2 times these.
+- Zero tracking follows the filtered weight, noise included, where this stands within its band after a step of at
+  most 0.4 d a second; while it is on, the instrument is looked at every 0.1 s. It is set by the command CE with the
+  present access code (TAC), then ZT, then CS; a refused one of these gives exception 4.
 - The signal is still when the weight has stayed within the no-motion range around one of its values for the
   no-motion time. Setting tare or zero while it is not still is refused with Modbus exception 4, as the command
   language has ERR for it; so is a zero that is more than 2 % of the largest weight away from the calibrated one.
 - An address that is not emulated, or a read of what can only be written, gives exception 2; half a 32-bit value
   or a value that is not allowed gives exception 3.
 - The device identity reads as 1410 and the device status as the decimal number that the command IS returns.
-- A power cycle brings back what was saved of filter and motion detection, and forgets zero and tare.
+- A power cycle brings back what was saved of filter and motion detection (WP) and of zero tracking (CS), and forgets
+  zero and tare.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,12 +42,12 @@ from bench.devices import Identity
 from bench.errors import DeviceError
 from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice
-from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.instruments.registers import Register, RegisterInstrument, Service
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
 
-CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5)
-"""3 dB cut-off by filter setting 0 to 7 (Technical Manual, 10.4.2, IIR filter)."""
+CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
+"""3 dB cut-off by filter setting 0 to 8 (Technical Manual, 10.4.2, IIR filter)."""
 
 UNDER_RANGE = 0x0001
 OVER_RANGE = 0x0002
@@ -59,23 +63,30 @@ TRIGGER_HOLD = 0x20
 
 DEVICE_ID = 1410
 ADC_BITS = 24
+_FULL_SCALE = 2 ** (ADC_BITS - 1)
 
 _SATURATION = 1.2
 _ZERO_SHARE = 0.02
 _LAGS_CUTOFF = math.sqrt(math.sqrt(2.0) - 1.0)  # cut-off of two equal lags over that of one
 _MEMORY_LAGS = 16.0  # time constants after which two lags have forgotten, to 2e-6
+_MOST_TRACKING = 255
 _FINE_LAGS = 0.5  # time constants between two looks at the force
 _LEAST_LAGS = 1e-6  # and less than which nothing changes
 _COARSE = 0.05  # s between two looks for the motion detection
 _STILL_POLL = 0.05
 _STILL_TIMEOUT = 10.0
 _COMMANDS = RESET_ZERO | SET_ZERO | RESET_TARE | SET_TARE | RESET_MAXIMUM | TRIGGER_HOLD
+_SAVE_CALIBRATION = 0x0002
 _SAVE_SET_UP = 0x0004
-_SAVES = 0x0001 | 0x0002 | _SAVE_SET_UP | 0x0010
+_SAVES = 0x0001 | _SAVE_CALIBRATION | _SAVE_SET_UP | 0x0010
+_TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
+_TRACKING_RATE = 0.4  # d in a second
+_TRACKING_LOOK = 0.1  # s
+_FIRST_ACCESS_CODE = 17
 
 
 def time_constant(setting: int) -> float:
-    """Return the time constant in s of either lag of a filter setting, 0 to 7."""
+    """Return the time constant in s of either lag of a filter setting, 0 to 8."""
     return _LAGS_CUTOFF / (2 * math.pi * CUTOFF_HZ[setting])
 
 
@@ -114,6 +125,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         Digits after the decimal point of the display (DP), 0 to 5.
     step : int
         Step of the last digit (DS): 1, 2, 5, 10, 20, 50, 100, 200 or 500.
+    zero_tracking : int
+        Zero tracking as it was calibrated (ZT), 0 (off) to 255; 1 as delivered: within ±0.5 d.
     noise : float
         Noise in N rms as filter setting 0 lets it through; zero or positive. Less in proportion to the root of
         the cut-off at other settings: 0.49 times at setting 3.
@@ -140,6 +153,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         weight_limits: tuple[float, float] = (-60.0, 60.0),
         decimals: int = 3,
         step: int = 1,
+        zero_tracking: int = 1,
         noise: float = 5e-4,
         samples: int = 5,
         serial_number: int = 1410237,
@@ -155,6 +169,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         low, high = (round(limit * int(10**decimals)) for limit in weight_limits)
         if not -999_999 <= low <= 0 < high <= 999_999:
             raise ValueError(f"weight_limits: allowed are -999999 to 0 and 1 to 999999 digits, got {low} and {high}")
+        if not 0 <= zero_tracking <= _MOST_TRACKING:
+            raise ValueError(f"zero_tracking: allowed are 0 to {_MOST_TRACKING}, got {zero_tracking}")
         if not noise >= 0:
             raise ValueError(f"noise: expected zero or a positive number, got {noise}")
         if samples < 1:
@@ -173,7 +189,11 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._noise = noise / abs(newtons_per_unit)
         self._samples = samples
         self._saved = _SetUp()
-        self._zero = self._tare = self._hold = self._peak = 0
+        self._saved_tracking = zero_tracking
+        self._access_code = _FIRST_ACCESS_CODE
+        self._span = _SATURATION * max(self._highest, -self._lowest) / self._scale
+        self._peak = 0
+        self._service = Service(self._begin, self._end)
         self._set_map_up(self._register_map())
         self.power_cycle()
         world.add(self)
@@ -183,8 +203,11 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
     def power_cycle(self) -> None:
         """Switch the instrument off and on again."""
         with self.world.at_present():
-            self._set_up = self._saved
-            self._zero = self._tare = self._hold = 0
+            self._use(self._saved)
+            self._tracking = self._saved_tracking
+            self._calibrating = False
+            self._zero = 0.0
+            self._tare = self._hold = 0
             self._tare_set = False
             self._settle()
             self._peak = self._gross
@@ -195,9 +218,11 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         """Return when the filter has to look at the force next, in laboratory seconds, if it is asked by now."""
         if self.frozen:
             return math.inf
+        if self._tracking:
+            return self._converted + _TRACKING_LOOK
         now = self.world.clock.now()
         waiting = now - self._converted
-        tau = time_constant(self._set_up.filter)
+        tau = self._lag
         # The margins of one coarse step keep a clock that runs on from drawing these instants along with it.
         if waiting > self._memory() + _COARSE:
             return now - self._memory()
@@ -211,13 +236,19 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _memory(self) -> float:
         """Return how long before a reading the force matters to it, s."""
-        return _MEMORY_LAGS * time_constant(self._set_up.filter) + self._set_up.motion_time / 1000 + 2 * _COARSE
+        return _MEMORY_LAGS * self._lag + self._motion_time + 2 * _COARSE
 
     def _signal(self) -> float:
         """Return the weight at this instant, in units, as far as the converter goes."""
         weight = (self._force() - self._zero_newtons) / self._newtons_per_unit
-        limit = _SATURATION * max(self._highest, -self._lowest) / self._scale
+        limit = self._span
         return min(max(weight, -limit), limit)
+
+    def _use(self, set_up: _SetUp) -> None:
+        self._set_up = set_up
+        self._lag = time_constant(set_up.filter)
+        self._spread = self._noise * math.sqrt(time_constant(0) / self._lag)
+        self._motion_time = set_up.motion_time / 1000
 
     def _settle(self) -> None:
         """Begin with a filter that has settled, at this instant."""
@@ -225,7 +256,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._input = self._first = self._second = self._signal()
         # The noise behind the first lag has twice the variance of that behind the second, and a covariance with
         # it that equals the latter.
-        spread = self._noise * math.sqrt(time_constant(0) / time_constant(self._set_up.filter))
+        spread = self._spread
         self._noise_second = self._draw(spread)
         self._noise_first = self._noise_second + self._draw(spread)
         self._display()
@@ -233,8 +264,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _convert(self) -> None:
         """Bring the filter from the last conversion to this instant."""
-        tau = time_constant(self._set_up.filter)
-        lags = (self.world.time - self._converted) / tau
+        lags = (self.world.time - self._converted) / self._lag
         if self.frozen or lags < _LEAST_LAGS:
             return
         decay = math.exp(-lags)
@@ -246,8 +276,11 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._first = signal - trail + first * decay
         self._second = signal - 2 * trail + (second + first * lags) * decay
         self._input = signal
+        elapsed = self.world.time - self._converted
         self._converted = self.world.time
         self._wander(lags, decay)
+        if self._tracking:
+            self._track(elapsed)
         self._display()
         if abs(self._digits - self._reference) > self._set_up.motion_range:
             self._reference = self._digits
@@ -255,7 +288,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _wander(self, lags: float, decay: float) -> None:
         """Bring the noise behind both lags to this instant, exactly for white noise before them."""
-        spread = self._noise * math.sqrt(time_constant(0) / time_constant(self._set_up.filter))
+        spread = self._spread
         # The stationary covariance is 2, 1, 1 in units of the output's variance. What the known values still say
         # of it fades by `known`; the rest is new.
         known = decay * decay
@@ -268,17 +301,30 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._noise_second = decay * (self._noise_second + lags * self._noise_first) + along * fresh + across * other
         self._noise_first = decay * self._noise_first + math.sqrt(first) * fresh
 
+    def _track(self, elapsed: float) -> None:
+        """Move the zero towards the weight, if that is near enough (10.2.8)."""
+        offset = (self._second + self._noise_second) * self._scale - self._zero
+        limit = _TRACKING_RATE * self._step * elapsed
+        shift = min(max(offset, -limit), limit)
+        zero = self._zero + shift
+        near = abs(offset - shift) <= _TRACKING_BAND * self._tracking * self._step
+        if near and abs(zero) <= _ZERO_SHARE * self._highest:
+            self._zero = zero
+
     def _display(self) -> None:
         weight = self._second + self._noise_second
-        span = _SATURATION * max(self._highest, -self._lowest) / self._scale
-        full = 2 ** (ADC_BITS - 1)
-        self._adc = min(max(round(weight / span * full), -full), full - 1)
+        self._adc = min(max(round(weight / self._span * _FULL_SCALE), -_FULL_SCALE), _FULL_SCALE - 1)
         self._digits = round(weight * self._scale / self._step) * self._step
+        self._weigh()
         self._peak = max(self._peak, self._gross)
 
-    @property
-    def _gross(self) -> int:
-        return self._digits - self._zero
+    def _weigh(self) -> None:
+        """Count the gross weight from the zero."""
+        if self._zero.is_integer():
+            self._gross = self._digits - int(self._zero)
+        else:
+            weight = (self._second + self._noise_second) * self._scale - self._zero
+            self._gross = round(weight / self._step) * self._step
 
     @property
     def _net(self) -> int:
@@ -286,7 +332,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     @property
     def _still(self) -> bool:
-        return self._converted - self._still_since >= self._set_up.motion_time / 1000
+        return self._converted - self._still_since >= self._motion_time
 
     @property
     def _qualifier(self) -> int:
@@ -303,11 +349,20 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     # The registers.
 
-    @contextmanager
-    def _request(self) -> Iterator[None]:
-        with self.world.at_present():
+    def _request(self) -> AbstractContextManager[None]:
+        return self._service
+
+    def _begin(self) -> None:
+        self.world.lock.acquire()
+        try:
+            self.world.advance()
             self._convert()
-            yield
+        except BaseException:
+            self.world.lock.release()
+            raise
+
+    def _end(self, error: BaseException | None) -> None:  # noqa: ARG002
+        self.world.lock.release()
 
     def _check_write(self, register: Register, whole: bool) -> None:
         # Here a register that can only be read is refused as such, also where half of it is written.
@@ -336,6 +391,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
             self._set_up_register("filter_mode", 0x2110, 0, 1),
             self._set_up_register("motion_range", 0x2112, 1, 65535),
             self._set_up_register("motion_time", 0x2114, 1, 65535),
+            Register("zero tracking", 0x2122, "I32", lambda: self._tracking, self._set_tracking),
+            Register("access code", 0x2204, "I32", lambda: self._access_code, self._open_calibration),
             Register("tare digits", 0x2118, "I32", lambda: self._tare),
             Register("largest weight", 0x220C, "I32", lambda: self._highest),
             Register("smallest weight", 0x220E, "I32", lambda: self._lowest),
@@ -355,7 +412,7 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
                 raise RegisterError(ILLEGAL_VALUE, f"{field}: allowed are {low} to {high}, got {value}")
             changed = replace(self._set_up, **{field: value})
             if changed != self._set_up:
-                self._set_up = changed
+                self._use(changed)
                 self._settle()
 
         return Register(field, address, "I32", lambda: getattr(self._set_up, field), write)
@@ -366,12 +423,14 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         if not value or value & ~_COMMANDS:
             raise RegisterError(ILLEGAL_VALUE, f"command 0x{value:04X} does not exist")
         if value & RESET_ZERO:
-            self._zero = 0
+            self._zero = 0.0
+            self._weigh()
         if value & SET_ZERO:
             self._check_still("set zero")
             if abs(self._digits) > _ZERO_SHARE * self._highest:
                 raise RegisterError(DEVICE_FAILURE, "set zero: too far from the calibrated zero")
-            self._zero = self._digits
+            self._zero = float(self._digits)
+            self._weigh()
         if value & RESET_TARE:
             self._tare, self._tare_set = 0, False
         if value & SET_TARE:
@@ -391,6 +450,26 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
             raise RegisterError(ILLEGAL_VALUE, f"saving 0x{value:04X} is not emulated")
         if value & _SAVE_SET_UP:
             self._saved = self._set_up
+        if value & _SAVE_CALIBRATION:
+            self._check_calibrating("save calibration")
+            self._saved_tracking = self._tracking
+            self._access_code += 1
+            self._calibrating = False
+
+    def _open_calibration(self, value: float) -> None:
+        if value != self._access_code:
+            raise RegisterError(DEVICE_FAILURE, f"calibration: the access code is not {value:g}")
+        self._calibrating = True
+
+    def _set_tracking(self, value: float) -> None:
+        self._check_calibrating("zero tracking")
+        if not 0 <= value <= _MOST_TRACKING:
+            raise RegisterError(ILLEGAL_VALUE, f"zero tracking: allowed are 0 to {_MOST_TRACKING}, got {value:g}")
+        self._tracking = int(value)
+
+    def _check_calibrating(self, command: str) -> None:
+        if not self._calibrating:
+            raise RegisterError(DEVICE_FAILURE, f"{command}: no calibration is open")
 
     # The role.
 

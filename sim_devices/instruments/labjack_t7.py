@@ -31,13 +31,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.devices import Identity
-from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.instruments.registers import Register, RegisterInstrument, Service
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
@@ -142,22 +141,6 @@ class _Watchdog:
     dac1: float = 0.0
 
 
-class _Service:
-    """The time in which an instrument serves a request, to be entered again and again."""
-
-    def __init__(self, begin: Callable[[], None], end: Callable[[BaseException | None], None]) -> None:
-        self._begin = begin
-        self._end = end
-
-    def __enter__(self) -> None:
-        self._begin()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end(error)
-
-
 class _Scale(NamedTuple):
     """What a reading of the converter is made of, V."""
 
@@ -218,7 +201,7 @@ class EmulatedT7(RegisterInstrument):
         self.firmware = firmware
         self._sources = dict(inputs)
         self._normals = normals(rng)
-        self._service = _Service(self._begin, self._end)
+        self._service = Service(self._begin, self._end)
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None

@@ -1,21 +1,27 @@
 """Emulated Meerstetter TEC-1091: a thermoelectric cooler's amplifier and temperature controller.
 
 The instrument is its parameter table, its state machine and its protections; the plant behind it is the
-physics. The error numbers are those of Meerstetter 5216 (TEC-family user manual).
+physics. Sources: Meerstetter 5216G (TEC-family user manual) for the error numbers and the communication watchdog,
+which any valid package feeds (table 32); Meerstetter 5136AL for the live parameters (50000 and up), which a reset
+alone brings back to zero, so that an error that resets itself (6310) brings the output back as it was; the output of
+JulienKluge/pyMeComTEC with a TEC-1091 for the channel that is not there and for the parameter that an emergency
+stop names.
 
-Assumptions, where the manuals are silent or were not at hand:
+Assumptions, where these are silent:
 
-- Every request that is addressed to the device and arrives whole feeds the communication watchdog. When
-  it expires the output goes off at that instant and the live parameters (50000 and up) go back to zero.
-- Initialising takes no time: after a reset the device is ready at once.
+- A package to another address does not feed the watchdog. When it expires the output goes off at that instant.
+- A channel that is not there keeps what is written to it; its measured temperatures are not a number, its other
+  readings zero.
+- Initialising takes no time: after a reset the device is ready at once, and 6310 counts at once, not 20 s later.
 - `Output stage enable` 3 (hardware enable) leaves the output off: nothing is wired to the input.
 - The stability window (4040) is the allowed distance to either side of the target.
 - The first error stays until a reset; a later one does not replace it.
 
 Kept in the table without effect: the temperature ramp (3003, so 1011 is the target itself), the proximity
 width and the PID parameters (3002, 3010 to 3013: the closed loop belongs to the plant), the operating mode
-(2040), baud rate and response delay (2050, 2052), and the voltage limitation (2031), as the plants take a
-current. The error thresholds of current and voltage act.
+(2040), baud rate and response delay (2050, 2052), the digital lines (6100 to 6103, 52100 to 52103), the source of the
+object temperature (6300, 6302, 52200), and the voltage limitation (2031), as the plants take a current. The error
+thresholds of current and voltage act.
 """
 
 from __future__ import annotations
@@ -37,9 +43,11 @@ from sim_devices.instruments.meerstetter_table import (
     ENABLE_ON,
     LIVE,
     PARAMETERS,
+    SENSOR_READINGS,
     DeviceStatus,
     Parameter,
     ServerError,
+    find_parameter,
     stored,
 )
 from sim_devices.world import World
@@ -60,6 +68,8 @@ _OBJECT_RESOLUTION = 128.0 / 2**23  # K: a converter of 23 bits, with the range 
 _SINK_RESOLUTION = 128.0 / 2**12  # K: 12 bits
 _OUTPUT_RESOLUTION = 1e-3  # A and V
 _DEVICE_TEMPERATURE = 35.0
+_IDENTIFICATION = "8065-TEC SW G01     "  # of the firmware, which the whole family shares (Meerstetter 5117C)
+_STOP_PARAMETER = 464  # which error 11 names
 _DEVICE_TYPE = 1091
 _HARDWARE_VERSION = 120
 
@@ -119,7 +129,11 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._identity = Identity(
             "Meerstetter Engineering", f"TEC-{_DEVICE_TYPE}", str(serial_number), f"{firmware / 100:.2f}"
         )
-        self._saved = {number: stored(row, row.default) for number, row in PARAMETERS.items()}
+        self._saved = {
+            _key(number, instance): stored(row, row.default)
+            for number, row in PARAMETERS.items()
+            for instance in range(1, row.instances + 1)
+        }
         self._values = dict(self._saved)
         self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 102: serial_number, 103: firmware}
         self._readings: dict[int, Callable[[], float]] = {
@@ -143,7 +157,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._status = DeviceStatus.READY
         self._error = self._error_instance = self._error_parameter = 0
         self._output: tuple[str, float, float] | None = None
-        self._watchdog_due = self._restart_due = self._supervision_due = math.inf
+        self._watchdog_due = self._restart_due = self._recovery_due = self._supervision_due = math.inf
         self._supervised_at = world.time
         self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
         self._started_at = self._in_window_since = self._saturated_since = math.nan
@@ -158,8 +172,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     @property
     def identification(self) -> str:
-        """The identification string, 20 characters; the wording is an assumption."""
-        return f"{self._identity.model} v{self._identity.firmware}".ljust(20)
+        """The identification string, 20 characters."""
+        return _IDENTIFICATION
 
     @property
     def status(self) -> DeviceStatus:
@@ -168,75 +182,89 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             return self._status
 
     def attend(self) -> None:
-        """Come up to the clock's present time and feed the watchdog: a request has arrived."""
-        with self.world.at_present():
+        """Come up to the clock's present time and feed the watchdog: a valid package has arrived."""
+        with self.world.lock:
+            self.world.advance()
             now = self.world.time
             if now > self._supervised_at:
                 self._supervise(now)
             self._feed(now)
 
-    def parameter(self, number: int, instance: int = 1) -> Parameter:
-        """Return the row of the parameter table.
-
-        Raises `RequestRefusedError` if there is no such parameter or no such instance of it; this device has one
-        channel.
-        """
-        row = PARAMETERS.get(number)
-        if row is None:
-            raise RequestRefusedError(ServerError.PARAMETER_NOT_AVAILABLE)
-        if instance != 1:
-            raise RequestRefusedError(ServerError.INSTANCE_NOT_AVAILABLE)
-        return row
-
     def read_parameter(self, number: int, instance: int = 1) -> float:
-        """Return the value of a parameter, in the unit of the table.
+        """Return the value of a parameter, in the unit of the table, as one request would.
 
         Raises `RequestRefusedError` if there is no such parameter or instance.
         """
         with self.world.lock:
-            self.parameter(number, instance)
+            row = find_parameter(number, instance)
             self.attend()
-            return self._read(number)
+            return stored(row, self.value(number, instance))
 
     def write_parameter(self, number: int, value: float, instance: int = 1) -> None:
-        """Set a parameter; it goes to the flash as well unless saving is off (parameter 108).
+        """Set a parameter as one request would; it goes to the flash as well unless saving is off (parameter 108).
 
         Raises `RequestRefusedError` if there is no such parameter or instance, it is read-only, or the value is out
         of its range.
         """
         with self.world.lock:
-            row = self.parameter(number, instance)
+            row = find_parameter(number, instance)
             self.attend()
-            if not row.writable:
-                raise RequestRefusedError(ServerError.READ_ONLY)
-            kept = stored(row, value)
-            inside = stored(row, row.low) <= kept <= stored(row, row.high)
-            if not inside or (number == 2060 and 0.0 < value < 0.1):
-                raise RequestRefusedError(ServerError.OUT_OF_RANGE)
-            self._values[number] = kept
-            if not row.volatile and not self._values[108]:
-                self._saved[number] = kept
-                self.flash_writes += 1
-            if number == 2060:
-                self._feed(self.world.time)
-            self._apply()
+            self.assign(row, value, instance)
+
+    def value(self, number: int, instance: int = 1) -> float:
+        """Return the value of a parameter that exists, after `attend`; not yet in the precision of the table."""
+        if instance == 1:
+            reading = self._readings.get(number)
+            return self._values[number] if reading is None else reading()
+        return math.nan if number in SENSOR_READINGS else self._values[_key(number, instance)]
+
+    def assign(self, row: Parameter, value: float, instance: int = 1) -> None:
+        """Set a parameter that exists, after `attend`; raises `RequestRefusedError` as `write_parameter` does."""
+        number = row.number
+        if not row.writable:
+            raise RequestRefusedError(ServerError.READ_ONLY)
+        kept = stored(row, value)
+        inside = stored(row, row.low) <= kept <= stored(row, row.high)
+        if not inside or (number == 2060 and 0.0 < value < 0.1):
+            raise RequestRefusedError(ServerError.OUT_OF_RANGE)
+        key = _key(number, instance)
+        self._values[key] = kept
+        if not row.volatile and not self._values[108]:
+            self._save(key)
+        if number == 2060:
+            self._feed(self.world.time)
+        self._apply()
+
+    def save(self) -> None:
+        """Write what differs from the flash to it, also where saving is off (command `SP`)."""
+        with self.world.lock:
+            self.attend()
+            for number, row in PARAMETERS.items():
+                if row.writable and not row.volatile:
+                    for key in (_key(number, instance) for instance in range(1, row.instances + 1)):
+                        if self._values[key] != self._saved[key]:
+                            self._save(key)
 
     def emergency_stop(self) -> None:
         """Switch the output off and stay in error 11 (command `ES`)."""
         with self.world.lock:
             self.attend()
-            self._trip(11)
+            self._trip(11, _STOP_PARAMETER)
 
     def reset(self) -> None:
         """Restart from the flash after 0.2 s (command `RS`); the output goes off at once."""
         with self.world.lock:
             self.attend()
-            self._status = DeviceStatus.RESET_PENDING
-            self._watchdog_due = math.inf
+            self._shut_down()
             self._restart_due = self.world.time + RESET_DELAY
-            self._apply()
 
     # Faults.
+
+    def power_cycle(self) -> None:
+        """Switch the supply off and on again: what is in RAM is lost, what is in the flash stays."""
+        with self.world.at_present():
+            self._shut_down()
+            self._restart()
 
     def trip(self, error_number: int, *, parameter: int = 0) -> None:
         """Put the device into its error state.
@@ -254,8 +282,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     # Timed events.
 
     def deadline(self) -> float:
-        """Return when the watchdog, a restart or the next check of the protections is due (s)."""
-        return min(self._watchdog_due, self._restart_due, self._supervision_due)
+        """Return when the watchdog, a restart, the reset of an error or a check of the protections is due (s)."""
+        return min(self._watchdog_due, self._restart_due, self._recovery_due, self._supervision_due)
 
     def expire(self) -> None:
         """Carry out what is due."""
@@ -265,6 +293,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
             self._trip(183, 2060)
         if now >= self._restart_due:
             self._restart()
+        if now >= self._recovery_due:
+            self._recover()
         if now >= self._supervision_due:
             self._supervision_due = now + SUPERVISION_INTERVAL
             self._supervise(now)
@@ -362,9 +392,11 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         return 1 if self._values[3034] else -1
 
     def _read(self, number: int) -> float:
-        reading = self._readings.get(number)
-        value = self._values[number] if reading is None else reading()
-        return stored(PARAMETERS[number], value)
+        return stored(PARAMETERS[number], self.value(number))
+
+    def _save(self, key: int) -> None:
+        self._saved[key] = self._values[key]
+        self.flash_writes += 1
 
     def _object_temperature(self) -> float:
         return _rounded(self._load.plate_temperature + self._draw(OBJECT_NOISE), _OBJECT_RESOLUTION)
@@ -388,18 +420,26 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._status = DeviceStatus.ERROR
         self._error, self._error_instance, self._error_parameter = error_number, 1, parameter
         self._watchdog_due = math.inf
-        if error_number == 183:
-            for number, row in PARAMETERS.items():
-                if row.volatile and number >= 50000:
-                    self._values[number] = stored(row, row.default)
         if self._values[6310] > 0.0:
             # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
-            self._restart_due = self.world.time + max(self._values[6310], RESET_DELAY)
+            self._recovery_due = self.world.time + max(self._values[6310], RESET_DELAY)
+        self._apply()
+
+    def _shut_down(self) -> None:
+        self._status = DeviceStatus.RESET_PENDING
+        self._watchdog_due = self._recovery_due = math.inf
         self._apply()
 
     def _restart(self) -> None:
+        """Begin with what is in the flash."""
         self._restart_due = math.inf
-        self._values |= {number: self._saved[number] for number, row in PARAMETERS.items() if row.writable}
+        writable = {number for number, row in PARAMETERS.items() if row.writable}
+        self._values |= {key: value for key, value in self._saved.items() if key & 0xFFFF in writable}
+        self._recover()
+
+    def _recover(self) -> None:
+        """Clear the error; the output returns if it is still asked for."""
+        self._recovery_due = math.inf
         self._error = self._error_instance = self._error_parameter = 0
         self._status = DeviceStatus.READY
         self._feed(self.world.time)
@@ -491,3 +531,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
 def _rounded(value: float, resolution: float) -> float:
     return round(value / resolution) * resolution
+
+
+def _key(number: int, instance: int) -> int:
+    """Return where the value of an instance of a parameter is kept; the first one under the number itself."""
+    return number | (instance - 1) << 16

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
+from types import TracebackType
 from typing import Literal, NamedTuple
 
 from sim_devices.wire.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
@@ -92,6 +93,22 @@ def _integer(read: Callable[[], float]) -> int:
 def _joint(registers: Iterable[Register]) -> struct.Struct:
     """Return the form of the values of neighbouring registers."""
     return struct.Struct(">" + "".join(_FORMATS[register.kind][1:] for register in registers))
+
+
+class Service:
+    """The time in which an instrument serves a request, to be entered again and again."""
+
+    def __init__(self, begin: Callable[[], None], end: Callable[[BaseException | None], None]) -> None:
+        self._begin = begin
+        self._end = end
+
+    def __enter__(self) -> None:
+        self._begin()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end(error)
 
 
 class RegisterInstrument(ABC):

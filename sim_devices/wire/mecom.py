@@ -5,14 +5,16 @@ answer begins with `!` and repeats address and sequence number. All hex digits a
 (polynomial 0x1021, initial value 0) is over every character before it. An acknowledge has no payload and
 carries the CRC of its request, not its own.
 
-Assumptions, as the specification's text was not at hand:
+The sequence number is only sent back: a frame that comes again is carried out again, as nothing in the specification
+says that a device remembers the last one.
+
+Assumptions:
 
 - A frame with a wrong CRC or header is dropped without an answer, as nothing in it can be trusted, the
   address included; the host times out and sends it again. A frame that is whole but whose
   payload makes no sense is answered with server error 04.
-- The same frame again, sequence number included, is a repetition: it is answered as before and not acted
-  on again. Only the last request is remembered.
 - An answer to the broadcast address 0 repeats that address, which the maker's client software checks.
+- Big data (`?VB`, `VB`) are served for every parameter as the one element that it has here.
 """
 
 from __future__ import annotations
@@ -21,9 +23,12 @@ import math
 import re
 import struct
 from binascii import crc_hqx
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 
 from sim_devices.instruments.emulated import RequestRefusedError
-from sim_devices.instruments.meerstetter_table import Parameter, ServerError
+from sim_devices.instruments.meerstetter_table import Parameter, ServerError, find_parameter
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire import WireServer
 
@@ -32,15 +37,29 @@ LONGEST_FRAME = 512
 
 _BROADCAST = 0
 _SILENT = 255
-_FRAME = re.compile(rb"#([0-9A-F]{2})([0-9A-F]{4})(.*)([0-9A-F]{4})", re.DOTALL)
+_SHORTEST_FRAME = 11
+_PREAMBLE = re.compile(rb"#[0-9A-F]{6}")
 _HEX = re.compile(r"[0-9A-F]*")
+_PARSED = 256  # payloads that are kept as parsed; a client that measures sends a few over and over
+
+
+@dataclass(frozen=True)
+class _Selection:
+    """Parameters that a payload names, and how their values are coded one behind the other."""
+
+    keys: tuple[tuple[int, int], ...]
+    form: struct.Struct
+
+    def encode(self, values: list[float]) -> str:
+        return self.form.pack(*values).hex().upper()
 
 
 class MeComServer(WireServer):
     """The serial side of an emulated Meerstetter device.
 
-    Answers `?VR`, `VS`, `?VL`, `?VM`, `?IF`, `ES`, `RS` and `CS`; a change of speed is acknowledged and has
-    no effect, as an emulated line has no speed of its own.
+    Answers `?VR`, `VS`, `?VL`, `?VM`, `?VX` (several parameters at once), `?VB` and `VB` (big data), `?IF`, `ES`,
+    `RS`, `SP` (save in the flash) and `CS`; a change of speed is acknowledged and has no effect, as an emulated line
+    has no speed of its own.
     """
 
     protocol = "MeCom"
@@ -48,8 +67,20 @@ class MeComServer(WireServer):
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
         self._received = b""
-        self._last_request = b""
-        self._last_answer = b""
+        self._commands: dict[str, Callable[[str], str]] = {
+            "?VR": self._read,
+            "VS": self._write,
+            "?VL": self._limits,
+            "?VM": self._metadata,
+            "?VX": self._read_several,
+            "?VB": self._read_big,
+            "VB": self._write_big,
+            "?IF": self._identify,
+            "ES": self._order(device.emergency_stop),
+            "RS": self._order(device.reset),
+            "SP": self._order(device.save),
+            "CS": self._change_speed,
+        }
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the device sends."""
@@ -58,98 +89,147 @@ class MeComServer(WireServer):
             # A new start sign begins a new frame.
             start = rest.rfind(b"#")
             self._received = rest[start:] if start >= 0 and len(rest) - start <= LONGEST_FRAME else b""
-            return b"".join(self._serve(frame) for frame in frames)
+            return b"".join([self._serve(frame) for frame in frames])
 
     def _serve(self, frame: bytes) -> bytes:
+        device = self._device
         frame = frame[max(frame.rfind(b"#"), 0) :]
-        match = _FRAME.fullmatch(frame)
-        if match is None or len(frame) > LONGEST_FRAME or not self._device.plugged_in:
+        if not _SHORTEST_FRAME <= len(frame) <= LONGEST_FRAME or not device.plugged_in:
             return b""
-        address, sequence, payload, crc = match.groups()
-        if crc != _crc(frame[:-4]):
+        body, crc = frame[:-4], frame[-4:]
+        if crc != b"%04X" % crc_hqx(body, 0) or not _PREAMBLE.match(body):
             return b""
-        number = int(address, 16)
-        if number not in (_BROADCAST, _SILENT, self._device.address):
+        number = int(body[1:3], 16)
+        if number not in (_BROADCAST, _SILENT, device.address):
             return b""
-        self._device.attend()
-        if frame != self._last_request:
-            self._last_request = frame
-            self._last_answer = self._answer(b"!" + address + sequence, payload, crc)
-        return b"" if number == _SILENT else self._device.transmit(self._last_answer)
-
-    def _answer(self, header: bytes, payload: bytes, crc: bytes) -> bytes:
+        device.attend()
+        head = b"!" + body[1:7]
         try:
-            content = self._act(payload.decode("ascii", "replace"))
+            content = self._act(body[7:].decode("ascii", "replace"))
         except RequestRefusedError as error:
             content = f"+{error.reason:02X}"
-        if content == "":
-            return header + crc + b"\r"
-        body = header + content.encode("ascii")
-        return body + _crc(body) + b"\r"
+        if number == _SILENT:
+            return b""
+        answer = head + content.encode("ascii")
+        # An acknowledge carries the CRC of its request.
+        return device.transmit(answer + (b"%04X\r" % crc_hqx(answer, 0) if content else crc + b"\r"))
 
     def _act(self, payload: str) -> str:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
-        device = self._device
         command = payload[:3] if payload.startswith("?") else payload[:2]
-        operand = payload[len(command) :]
-        if command == "?VR":
-            row, instance = self._row(operand, 6)
-            return _encode(row, device.read_parameter(row.number, instance))
-        if command == "VS":
-            row, instance = self._row(operand, 14)
-            device.write_parameter(row.number, _decode(row, operand[6:]), instance)
-            return ""
-        if command == "?VL":
-            row, _ = self._row(operand, 6)
-            return f"{_type_code(row):02X}{_encode(row, row.low)}{_encode(row, row.high)}"
-        if command == "?VM":
-            row, instance = self._row(operand, 6)
-            value = device.read_parameter(row.number, instance)
-            # Type, flags (1 readable, 2 writable), instances, elements; then range and present value.
-            head = f"{_type_code(row):02X}{3 if row.writable else 1:02X}{1:02X}{1:08X}"
-            return head + "".join(_encode(row, each) for each in (row.low, row.high, value))
-        if command == "CS":
-            _operand(operand, 8)
-            return ""
-        if command in ("?IF", "ES", "RS"):
-            _operand(operand, 0)
-            if command == "?IF":
-                return device.identification
-            if command == "ES":
-                device.emergency_stop()
-            else:
-                device.reset()
-            return ""
-        raise RequestRefusedError(ServerError.COMMAND_NOT_AVAILABLE)
+        try:
+            carry_out = self._commands[command]
+        except KeyError:
+            raise RequestRefusedError(ServerError.COMMAND_NOT_AVAILABLE) from None
+        return carry_out(payload[len(command) :])
 
-    def _row(self, operand: str, digits: int) -> tuple[Parameter, int]:
-        _operand(operand, digits)
-        instance = int(operand[4:6], 16)
-        return self._device.parameter(int(operand[:4], 16), instance), instance
+    def _read(self, operand: str) -> str:
+        _check_digits(operand, 6)
+        return self._values(operand)
+
+    def _read_several(self, operand: str) -> str:
+        count = _digits(operand, 0, 2)
+        _check_digits(operand, 2 + 6 * count)
+        return self._values(operand[2:])
+
+    def _values(self, names: str) -> str:
+        selection = _selection(names)
+        value = self._device.value
+        return selection.encode([value(number, instance) for number, instance in selection.keys])
+
+    def _write(self, operand: str) -> str:
+        _check_digits(operand, 14)
+        row, instance = _row(operand)
+        self._device.assign(row, _decode(row, operand[6:]), instance)
+        return ""
+
+    def _limits(self, operand: str) -> str:
+        _check_digits(operand, 6)
+        row, _ = _row(operand)
+        return f"{_type_code(row):02X}{_encode(row, row.low, row.high)}"
+
+    def _metadata(self, operand: str) -> str:
+        _check_digits(operand, 6)
+        row, instance = _row(operand)
+        # Type, flags (1 readable, 2 writable), instances, elements; then range and present value.
+        head = f"{_type_code(row):02X}{3 if row.writable else 1:02X}{row.instances:02X}{1:08X}"
+        return head + _encode(row, row.low, row.high, self._device.value(row.number, instance))
+
+    def _read_big(self, operand: str) -> str:
+        """Parameter, instance, first element (8 digits), most elements (4); answered by count, rest and data."""
+        _check_digits(operand, 18)
+        row, instance = _row(operand)
+        if _digits(operand, 6, 8) or not _digits(operand, 14, 4):
+            return f"{0:04X}{0:02X}"
+        return f"{1:04X}{0:02X}" + _encode(row, self._device.value(row.number, instance))
+
+    def _write_big(self, operand: str) -> str:
+        """Parameter, instance, first element (8 digits), count (4), whether it is the last package (2), and data."""
+        count = _digits(operand, 14, 4)
+        _check_digits(operand, 20 + 8 * count)
+        row, instance = _row(operand)
+        if _digits(operand, 6, 8) or count != 1:
+            raise RequestRefusedError(ServerError.OUT_OF_RANGE)
+        self._device.assign(row, _decode(row, operand[20:]), instance)
+        return ""
+
+    def _identify(self, operand: str) -> str:
+        _check_digits(operand, 0)
+        return self._device.identification
+
+    def _order(self, carry_out: Callable[[], None]) -> Callable[[str], str]:
+        def act(operand: str) -> str:
+            _check_digits(operand, 0)
+            carry_out()
+            return ""
+
+        return act
+
+    def _change_speed(self, operand: str) -> str:
+        _check_digits(operand, 8)
+        return ""
 
 
-def _operand(operand: str, digits: int) -> None:
+def _row(operand: str) -> tuple[Parameter, int]:
+    """Return the row of the parameter that an operand begins with, and the instance."""
+    instance = int(operand[4:6], 16)
+    return find_parameter(int(operand[:4], 16), instance), instance
+
+
+def _check_digits(operand: str, digits: int) -> None:
     if len(operand) != digits or _HEX.fullmatch(operand) is None:
         raise RequestRefusedError(ServerError.FORMAT)
 
 
-def _crc(data: bytes) -> bytes:
-    return b"%04X" % crc_hqx(data, 0)
+def _digits(operand: str, start: int, digits: int) -> int:
+    """Return the number in some digits of an operand."""
+    part = operand[start : start + digits]
+    _check_digits(part, digits)
+    return int(part, 16)
+
+
+@lru_cache(_PARSED)
+def _selection(names: str) -> _Selection:
+    """Parse parameters and instances, 6 digits each; raise `RequestRefusedError` if one does not exist."""
+    keys = tuple((int(names[at : at + 4], 16), int(names[at + 4 : at + 6], 16)) for at in range(0, len(names), 6))
+    rows = [find_parameter(*key) for key in keys]
+    return _Selection(keys, struct.Struct(">" + "".join(_form(row) for row in rows)))
+
+
+def _form(row: Parameter) -> str:
+    return "i" if row.kind == "INT32" else "f"
 
 
 def _type_code(row: Parameter) -> int:
     return 1 if row.kind == "INT32" else 0
 
 
-def _encode(row: Parameter, value: float) -> str:
-    if row.kind == "INT32":
-        return f"{int(value) & 0xFFFFFFFF:08X}"
-    return struct.pack(">f", value).hex().upper()
+def _encode(row: Parameter, *values: float) -> str:
+    return struct.pack(f">{len(values)}{_form(row)}", *values).hex().upper()
 
 
 def _decode(row: Parameter, digits: str) -> float:
-    raw = bytes.fromhex(digits)
-    value: float = struct.unpack(">i" if row.kind == "INT32" else ">f", raw)[0]
+    value: float = struct.unpack(f">{_form(row)}", bytes.fromhex(digits))[0]
     if math.isnan(value):
         raise RequestRefusedError(ServerError.OUT_OF_RANGE)
     return value

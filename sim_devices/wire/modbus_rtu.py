@@ -90,6 +90,9 @@ class ModbusRtuServer(WireServer):
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the line, in pieces of any size; return the replies to whole requests."""
+        if not self._received and self._is_request(data):
+            # The usual case: a client that sends one request and waits.
+            return self._serve(data)
         self._received += data
         replies = bytearray()
         received = memoryview(bytes(self._received))
@@ -102,6 +105,15 @@ class ModbusRtuServer(WireServer):
         # What a frame can still become the beginning of is shorter than the longest frame.
         del self._received[: max(len(self._received) - LONGEST_FRAME + 1, 0)]
         return bytes(replies)
+
+    def _is_request(self, data: bytes) -> bool:
+        """Return whether these bytes are one whole request to this instrument."""
+        return (
+            len(data) >= _SHORTEST_FRAME
+            and data[0] == self._address
+            and _length(data) == len(data)
+            and data[-2:] == crc16(data[:-2])
+        )
 
     def _find(self, received: memoryview) -> tuple[int, int] | None:
         """Return where the first whole request begins and ends."""
@@ -125,7 +137,7 @@ class ModbusRtuServer(WireServer):
         return b"" if address == BROADCAST else reply + crc16(reply)
 
 
-def _length(received: memoryview) -> int | None:
+def _length(received: bytes | memoryview) -> int | None:
     """Return the length of the request that begins here; None if it is none, or too little has come."""
     function = received[1]
     if function in _FIXED:

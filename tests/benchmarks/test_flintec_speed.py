@@ -33,7 +33,9 @@ def served() -> tuple[ModbusRtuServer, VirtualClock]:
     """Return an instrument whose own time does not pass, so that it costs all clients the same."""
     clock = VirtualClock()
     world = World(Still(), clock)
-    instrument = EmulatedDAD141("load", world, lambda: FORCE, rng=np.random.default_rng(1), noise=0.0)
+    instrument = EmulatedDAD141(
+        "load", world, lambda: FORCE, rng=np.random.default_rng(1), noise=0.0, zero_tracking=0
+    )
     return ModbusRtuServer(instrument), clock
 
 

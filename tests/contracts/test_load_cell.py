@@ -30,7 +30,12 @@ class CellBench(Bench):
 def connected(kind, stack, seed=1, **options):
     specimen, clock = Given(), VirtualClock()
     instrument = EmulatedDAD141(
-        "load", World(specimen, clock), lambda: specimen.value, rng=np.random.default_rng(seed), **options
+        "load",
+        World(specimen, clock),
+        lambda: specimen.value,
+        rng=np.random.default_rng(seed),
+        zero_tracking=0,
+        **options,
     )
     cell = instrument
     if kind == "driver":

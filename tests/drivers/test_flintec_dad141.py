@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from bench.clock import VirtualClock, WallClock
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.flintec_dad141 import FlintecDAD141
+from drivers.pymodbus_client import SerialClient
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.wire import WireServer
@@ -76,8 +77,7 @@ class Bench:
             "load",
             self.world,
             lambda: self.force,
-            rng=np.random.default_rng(3),
-            **{"noise": 0.0, **options},
+            **{"rng": np.random.default_rng(3), "noise": 0.0, "zero_tracking": 0, **options},
         )
         self.bank = Bank(self.instrument)
         self.tap = Tap(ModbusRtuServer(self.bank))
@@ -95,12 +95,21 @@ class Bench:
         self.force = force
         self.clock.sleep(5.0)
 
+    @staticmethod
+    def line(cell: FlintecDAD141):
+        """Return the port of a driver."""
+        client = cell._line._client
+        return client._line.socket if isinstance(client, SerialClient) else client._port
+
     def word(self, address: int) -> int:
         return self.instrument.read_registers(address, 2)[1]
 
 
-@pytest.fixture
-def bench() -> Iterator[Bench]:
+@pytest.fixture(params=["ours", "pymodbus"])
+def bench(request, monkeypatch) -> Iterator[Bench]:
+    """Return a bench for either client: that of emulated lines, and that of real ones."""
+    if request.param == "pymodbus":
+        monkeypatch.setattr("drivers.flintec_dad141.EMULATED", "nothing://")
     bench = Bench()
     yield bench
     for cell in bench.cells:
@@ -124,7 +133,7 @@ def bench() -> Iterator[Bench]:
         {"timeout": math.nan},
         {"pause": -1.0},
         {"filter": -1},
-        {"filter": 8},
+        {"filter": 9},
         {"samples": 0},
         {"interval": -0.1},
         {"newtons_per_unit": 0.0},
@@ -311,10 +320,11 @@ def only(register: int, words: list[int]) -> Callable[[int, list[int]], list[int
         (only(0x202C, [0, 7210]), "is not a DAD 141.1: its identity is 7210, not 1410 or 5136; .*device_ids"),
         (only(0x202E, [0x0A01, 0]), "0x0A010000 for its firmware"),
         (only(0x202E, [0, 0]), "0x00000000 for its firmware"),
-        (only(0x2020, [12000, 0]), "same weight as 12 and, as an integer, 786432000"),
-        (only(0x2020, [0, 13000]), "same weight as 12 and, as an integer, 13000"),
-        (only(0x3500, [0, 0x4140, 0, 0x4140, 0x10]), "same weight as .*e-41 and, as an integer, 12000"),
-        (only(0x3500, [0x7FC0, 0, 0x7FC0, 0, 0x10]), "same weight as nan"),
+        (only(0x2080, [0x4140, 0, 12000, 0]), "same weight as 12 and, as an integer, 786432000"),
+        (only(0x2080, [0x4140, 0, 0, 13000]), "same weight as 12 and, as an integer, 13000"),
+        (only(0x2080, [0x4140, 0, 0, 12001]), "same weight as 12 and, as an integer, 12001"),
+        (only(0x2080, [0, 0x4140, 0, 12000]), "same weight as .*e-41 and, as an integer, 12000"),
+        (only(0x2080, [0x7FC0, 0, 0, 12000]), "same weight as nan"),
     ],
 )
 def test_a_wrong_device_is_refused(bench, alter, message):
@@ -357,9 +367,32 @@ def test_any_decimal_point_agrees(decimals, force):
 
 def test_a_load_that_moves_does_not_make_a_wrong_device(bench):
     bench.put(10.0)
-    bench.instrument._force = lambda: 10.0 + 0.2 * math.sin(30 * bench.world.time)
+    bench.instrument._force = lambda: 10.0 + 8.0 * math.sin(30 * bench.world.time)
     bench.clock.sleep(1.0)
-    bench.cell()
+    for _ in range(20):
+        bench.cell().close()
+
+
+def test_a_noisy_cell_does_not_make_a_wrong_device():
+    for seed in range(50):
+        bench = Bench(noise=0.5, decimals=3, rng=np.random.default_rng(seed))
+        bench.cell().close()
+        protocol_emulated.unregister("load")
+
+
+@pytest.mark.parametrize("tracking", [1, 100])
+def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
+    bench = Bench(zero_tracking=tracking)
+    try:
+        with pytest.raises(DeviceError, match=rf"zero tracking is on \(ZT = {tracking}\).*CE, ZT 0 and CS"):
+            bench.cell()
+        assert all(frame[1] == 3 for frame in bench.tap.sent)
+        bench.instrument.write_registers(0x2204, [0, 17])
+        bench.instrument.write_registers(0x2122, [0, 0])
+        bench.instrument.write_registers(0x2066, [0x0002])
+        bench.cell().close()
+    finally:
+        protocol_emulated.unregister("load")
 
 
 def test_connecting_to_an_overloaded_cell(bench):
@@ -504,13 +537,13 @@ def test_stray_bytes_before_a_request_are_forgotten(bench):
     cell = bench.cell()
     bench.put(2.0)
     stray = sealed("01 03 0A 00 00 00 00 00 00 00 00 00 10")
-    cell._line._client.socket._received += stray
+    bench.line(cell)._received += stray
     assert cell.glance() == {"load_force": 2.0}
 
 
 def test_a_line_that_does_not_fall_silent(bench):
     cell = bench.cell()
-    port = cell._line._client.socket
+    port = bench.line(cell)
     port.read = lambda size: b"\xa5" * size
     with pytest.raises(DeviceConnectionError, match="does not fall silent"):
         cell.glance()
@@ -519,7 +552,7 @@ def test_a_line_that_does_not_fall_silent(bench):
 def test_too_few_registers_are_noticed(bench):
     cell = bench.cell()
     bench.tap.alter = lambda _: sealed("01 03 04 00 00 00 00")
-    with pytest.raises(DeviceError, match="2 registers by function 3 where 5"):
+    with pytest.raises(DeviceError, match=r"6 bytes where 12 were expected .*no other master"):
         cell.glance()
 
 
@@ -628,6 +661,7 @@ def test_taring_does_not_wait_for_ever(bench):
 
 def test_a_converter_that_stands_still(bench):
     bench.instrument._noise = 2e-4
+    bench.instrument.power_cycle()
     cell = bench.cell(stale_after=10.0, samples=1)
     bench.instrument.frozen = True
     begin = bench.clock.now()
@@ -650,6 +684,7 @@ def test_a_converter_that_stands_still(bench):
 
 def test_a_quiet_load_is_not_stale(bench):
     bench.instrument._noise = 2e-5  # far below a digit, though not below a step of the converter
+    bench.instrument.power_cycle()
     cell = bench.cell(stale_after=1.0)
     bench.put(5.0)
     readings = []

@@ -47,6 +47,7 @@ class Script(WireServer):
         self.instead = []
         self.refusals = {}
         self.silent = False
+        self.knows_blocks = True
         self.on_order = lambda _payload: None
 
     def receive(self, data):
@@ -68,6 +69,12 @@ class Script(WireServer):
         for start, code in self.refusals.items():
             if text.startswith(start):
                 return answer(head + b"+%02X" % code)
+        if text.startswith("?VX"):
+            if not self.knows_blocks:
+                return answer(head + b"+01")
+            names = [int(text[at : at + 4], 16) for at in range(5, len(text), 6)]
+            assert len(names) == int(text[3:5], 16)
+            return answer(head + b"".join(bits(number, self.values.get(number, 0)) for number in names))
         if text.startswith("?VR"):
             number = int(text[3:7], 16)
             return answer(head + bits(number, self.values.get(number, 0)))
@@ -118,8 +125,15 @@ def tec(script, clock):
 @pytest.mark.parametrize(
     ("sequence", "request_text", "digits", "sent", "replied", "content"),
     [
+        # Meerstetter 5136AL, chapter 5, captured with a TEC-1089.
+        (0x15AA, "?IF", 20, b"#0015AA?IF62AE\r", b"!0015AA8065-TEC SW G01     7199\r", "8065-TEC SW G01     "),
+        (0x15AB, "?VR006401", 8, b"#0015AB?VR0064018000\r", b"!0015AB000004411DBD\r", "00000441"),
+        (0x15AC, "?VR006601", 8, b"#0015AC?VR0066018125\r", b"!0015AC000000706F2C\r", "00000070"),
+        (0x15AE, "VS07DA0100000002", 0, b"#0015AEVS07DA01000000028F97\r", b"!0015AE8F97\r", ""),
         (0x15AB, "?VR03E801", 8, b"#0015AB?VR03E801C21A\r", b"!0015AB41CD2F28D5C2\r", "41CD2F28"),
         (0x15B0, "VS0BB80141AE0000", 0, b"#0015B0VS0BB80141AE0000C482\r", b"!0015B0C482\r", ""),
+        # Meerstetter 5117C.
+        (0xBDE2, "RS", 0, b"#00BDE2RS9780\r", b"!00BDE29780\r", ""),
     ],
 )
 def test_sequences_of_the_maker(script, line, sequence, request_text, digits, sent, replied, content):
@@ -136,6 +150,33 @@ def test_server_error_of_the_maker(script, line):
         line.ask("?VR04D201", 8)
     assert caught.value.code == 5
     assert script.received == [b"#0015AC?VR04D2017BFE\r"]
+
+
+def test_answers_of_the_maker_at_address_1(script):
+    line = TECLine("tec", make_settings())
+    line._sequence = 0x15A9
+    script.instead = [b"!0115AA8065-TEC SW G01     342D\r", None, b"!0115AC+057509\r"]
+    assert line.ask("?IF", 20) == "8065-TEC SW G01     "
+    assert script.received == [b"#0115AA?IF257D\r"]
+    line.ask("?VR006801", 8)
+    with pytest.raises(RefusedError, match="parameter is not available"):
+        line.ask("?VR04D201", 8)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "request_text", "sent"),
+    [
+        # Sent to real devices at address 2 by programs that work (Arduino and Go); the answers are not published.
+        (0x15CA, "?IF", b"#0215CA?IFA98B\r"),
+        (0x15CB, "?VR03E801", b"#0215CB?VR03E801946B\r"),
+        (0x0003, "?VR03E801", b"#020003?VR03E801AC05\r"),
+    ],
+)
+def test_requests_of_other_programs(script, sequence, request_text, sent):
+    line = TECLine("tec", make_settings(address=2))
+    line._sequence = sequence - 1
+    line.ask(request_text, 20 if request_text == "?IF" else 8)
+    assert script.received == [sent]
 
 
 def test_values_of_the_maker():
@@ -187,6 +228,15 @@ def test_channel_selects_the_instance_of_what_belongs_to_a_channel(script, clock
     tec = connect(clock, channel=2)
     script.received.clear()
     tec.measure()
+    assert [data[7:-5] for data in script.received] == [b"?VX0503E80203E90203FC0203FD02006801"]
+
+
+def test_firmware_that_does_not_read_blocks_is_asked_one_by_one(script, clock):
+    script.knows_blocks = False
+    tec = connect(clock, channel=2)
+    script.received.clear()
+    script.values[1021] = 1.75
+    assert list(tec.measure().values()) == [25.5, 24.0, 0.25, 1.75]
     assert [data[7:-5] for data in script.received] == [
         b"?VR03E802",
         b"?VR03E902",
@@ -194,6 +244,30 @@ def test_channel_selects_the_instance_of_what_belongs_to_a_channel(script, clock
         b"?VR03FD02",
         b"?VR006801",
     ]
+    script.received.clear()
+    tec.set(40.0)
+    tec.measure()
+    assert not any(data[7:10] == b"?VX" for data in script.received)  # found out once
+    script.values |= {104: 3, 105: 138}
+    with pytest.raises(DeviceError, match="error 138"):
+        tec.measure()
+
+
+def test_channel_that_the_device_does_not_have(script, clock):
+    for knows_blocks in (True, False):
+        script.knows_blocks = knows_blocks
+        script.values[1001] = math.nan
+        with pytest.raises(DeviceError, match="channel 2 reports no sink temperature: the TEC-1091 has no such"):
+            connect(clock, channel=2)
+        assert script.orders() == []
+
+
+def test_automatic_restart_after_an_error_is_switched_off(script, clock):
+    script.values[6310] = 20.0
+    connect(clock)
+    orders = script.orders()
+    assert script.values[6310] == 0.0
+    assert orders.index("VS006C0100000001") < orders.index("VS18A60100000000")  # in the RAM alone
 
 
 def test_temperature_set_point_is_live_and_guarded_by_the_watchdog(script, tec):
@@ -306,9 +380,13 @@ def test_every_server_error_is_told(script, tec, code):
 
 
 def test_refused_reading(script, tec):
-    script.refusals["?VR03E8"] = 8
-    with pytest.raises(DeviceError, match=r"object temperature \(parameter 1000\): the instance is not"):
+    script.refusals["?VX"] = 8
+    with pytest.raises(DeviceError, match=r"refused to report its object temperature, .*: the instance is not"):
         tec.measure()
+    script.refusals = {"?VR03E8": 8}
+    tec.set(40.0)
+    with pytest.raises(DeviceError, match=r"object temperature \(parameter 1000\): the instance is not"):
+        tec.stop()
 
 
 @pytest.mark.parametrize(("state", "title"), [(0, "init"), (4, "bootloader"), (5, "reset pending")])
@@ -328,9 +406,12 @@ def test_status_beyond_the_protocol_and_values_that_are_no_numbers(script, tec):
 
 
 def test_value_that_is_no_hex_number(script, tec):
-    script.instead = [lambda _sent, right: answer(right[:7] + b"zzzzzzzz")]
-    with pytest.raises(DeviceError, match="answered 'zzzzzzzz' for its object temperature"):
+    script.instead = [lambda _sent, right: answer(right[:7] + 5 * b"zzzzzzzz")]
+    with pytest.raises(DeviceError, match=r"answered 'z{40}' for 5 parameters at once"):
         tec.measure()
+    script.instead = [lambda _sent, right: answer(right[:7] + b"zzzzzzzz")]
+    with pytest.raises(DeviceError, match="answered 'zzzzzzzz' for its device status"):
+        _ = tec.output_enabled
 
 
 @pytest.mark.parametrize(
@@ -367,14 +448,17 @@ def test_acknowledge_must_carry_the_crc_of_the_request(script, tec):
 def test_late_answers_are_passed_over(script, tec):
     late = answer(b"!01000142C80000")
     script.instead = [lambda _sent, right: late + right, lambda _sent, right: late * 3 + right]
-    values = tec.measure()
-    assert (values["tec_temperature"], values["tec_sink_temperature"]) == (25.5, 24.0)
-    assert len(script.received) == 5
+    for _ in range(2):
+        values = tec.measure()
+        assert (values["tec_temperature"], values["tec_sink_temperature"]) == (25.5, 24.0)
+    assert len(script.received) == 2
 
 
 def test_an_answer_that_comes_after_its_resend_is_not_taken_for_the_next(script, tec):
     script.instead = [b"", lambda _sent, right: right + right]
     assert tec.measure()["tec_sink_temperature"] == 24.0
+    script.values[1001] = 23.0
+    assert tec.measure()["tec_sink_temperature"] == 23.0
 
 
 def test_endless_nonsense_ends(script, tec):
@@ -459,6 +543,18 @@ def test_device_with_an_error_is_refused_and_recovered_on_request(script, clock)
     tec = MeerstetterTEC.recover("tec", make_settings(), clock)
     assert script.orders()[:2] == ["RS", "VS006C0100000001"]
     assert tec.measure()["tec_temperature"] == 25.5
+
+
+def test_reset_is_sent_once_and_what_is_safe_to_repeat_again(script, tec):
+    script.instead = [b""]
+    tec.reset()
+    assert [data[7:-5] for data in script.received].count(b"RS") == 1
+    script.received.clear()
+    script.instead = [b"", b""]
+    script.refusals = {"VSC350": 2}
+    script.on_order = lambda text: script.values.update({104: 3, 105: 11} if text == "ES" else {})
+    tec.safe()
+    assert len({data for data in script.received if data[7:9] == b"ES"}) == 1
 
 
 def test_device_that_does_not_come_back_from_a_reset(script, tec):

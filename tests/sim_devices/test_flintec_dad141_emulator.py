@@ -45,7 +45,12 @@ class Cell(EmulatedDAD141):
         self.clock = clock or VirtualClock()
         world = World(self.load, self.clock)
         super().__init__(
-            "load", world, lambda: self.load.force, rng=np.random.default_rng(seed), noise=noise, **options
+            "load",
+            world,
+            lambda: self.load.force,
+            rng=np.random.default_rng(seed),
+            noise=noise,
+            **{"zero_tracking": 0, **options},
         )
 
     def floats(self, address: int, count: int = 1) -> list[float]:
@@ -115,7 +120,7 @@ def test_read_only_write_only_and_half_values():
 
 @pytest.mark.parametrize(
     ("address", "values"),
-    [(0x2106, [0, 8]), (0x2106, [0xFFFF, 0xFFFF]), (0x2110, [0, 2]), (0x2112, [0, 0]), (0x2114, [1, 0])]
+    [(0x2106, [0, 9]), (0x2106, [0xFFFF, 0xFFFF]), (0x2110, [0, 2]), (0x2112, [0, 0]), (0x2114, [1, 0])]
     + [(0x2061, [each]) for each in (0x00, 0x40, 0x100)]
     + [(0x2066, [each]) for each in (0x00, 0x8000)],
 )
@@ -132,6 +137,8 @@ def test_values_that_are_not_allowed(address, values):
         {"step": 3},
         {"weight_limits": (-1000.0, 1000.0)},
         {"weight_limits": (1.0, 2.0)},
+        {"zero_tracking": -1},
+        {"zero_tracking": 256},
         {"noise": -1.0},
         {"noise": math.nan},
         {"samples": 0},
@@ -221,6 +228,79 @@ def test_a_power_cycle_forgets_what_was_not_saved():
     assert cell.integer(0x2106) == 6
 
 
+# Zero tracking
+
+
+def delivered(force: float = 0.0, **options) -> Cell:
+    """Return an instrument as it is delivered: it tracks the zero within ±0.5 d."""
+    return Cell(force, **{"zero_tracking": 1, **options})
+
+
+def test_as_delivered_it_tracks_the_zero_and_forgets_it_with_the_power():
+    cell = EmulatedDAD141("load", World(Load(), VirtualClock()), lambda: 0.0, rng=np.random.default_rng(1))
+    assert cell.read_value(0x2122) == 1
+    cell = delivered()
+    cell.rest(0.0004)  # 0.4 d
+    cell.load.force = 0.0
+    cell.power_cycle()
+    assert cell.integer(0x2030) == 0
+
+
+def test_a_load_that_grows_slowly_is_tracked_away():
+    cell, plain = delivered(), Cell()
+    for step in range(1, 201):
+        for each in (cell, plain):
+            each.load.force = 0.0003 * step  # 0.3 d a second
+            each.clock.sleep(1.0)
+            each.qualifier()
+    assert plain.integer(0x2020) == 60
+    assert cell.integer(0x2020) == 0
+    assert cell.floats(0x2000) == [0.0]
+    assert cell.integer(0x2030) & 2000
+
+
+def test_a_load_that_grows_fast_or_comes_at_once_is_not():
+    cell = delivered()
+    for step in range(1, 201):
+        cell.load.force = 0.002 * step  # 2 d a second
+        cell.clock.sleep(1.0)
+        cell.qualifier()
+    assert cell.integer(0x2020) == pytest.approx(400, abs=1)
+    cell = delivered()
+    cell.rest(0.01)
+    cell.clock.sleep(3600.0)
+    assert cell.integer(0x2020) == 10
+
+
+def test_the_zero_moves_at_its_rate_within_its_band_and_range():
+    cell = delivered(zero_tracking=100, decimals=3, weight_limits=(-1.0, 1.0))
+    cell.rest(0.0)
+    cell.load.force = 0.03  # 30 d of 50 d that are tracked
+    cell.clock.sleep(1.0)
+    before = cell.integer(0x2020)
+    cell.clock.sleep(10.0)
+    assert before - cell.integer(0x2020) == pytest.approx(4, abs=1)
+    cell.clock.sleep(3600.0)
+    assert cell.integer(0x2020) == 10  # 2 % of the largest weight
+
+
+def test_zero_tracking_belongs_to_the_calibration():
+    cell = delivered()
+    refused(4, lambda: cell.write_registers(0x2122, [0, 0]))
+    refused(4, lambda: cell.write_registers(0x2066, [0x0002]))
+    refused(4, lambda: cell.write_registers(0x2204, [0, 16]))
+    cell.write_registers(0x2204, [0, cell.integer(0x2204)])
+    refused(3, lambda: cell.write_registers(0x2122, [0, 256]))
+    cell.write_registers(0x2122, [0, 0])
+    cell.power_cycle()
+    assert (cell.integer(0x2122), cell.integer(0x2204)) == (1, 17)
+    cell.write_registers(0x2204, [0, 17])
+    cell.write_registers(0x2122, [0, 0])
+    cell.write_registers(0x2066, [0x0002])
+    cell.power_cycle()
+    assert (cell.integer(0x2122), cell.integer(0x2204)) == (0, 18)
+
+
 def test_a_frozen_converter_stands_still():
     cell = Cell(5.0, noise=1e-3)
     cell.clock.sleep(1.0)
@@ -235,7 +315,7 @@ def test_a_frozen_converter_stands_still():
 
 # The filter
 
-SETTLING_MS = {1: 55, 2: 122, 3: 242, 4: 322, 5: 482, 6: 963, 7: 1923}
+SETTLING_MS = {1: 55, 2: 122, 3: 242, 4: 322, 5: 482, 6: 963, 7: 1923, 8: 3847}
 """To 0.1 %, by setting (Technical Manual, 10.4.2, IIR filter)."""
 
 
@@ -258,7 +338,7 @@ def test_settles_in_the_time_of_the_manual(setting, watch):
     assert 1000 * (cell.clock.now() - start) == pytest.approx(SETTLING_MS[setting], rel=0.06, abs=1000 * watch)
 
 
-@pytest.mark.parametrize("setting", range(8))
+@pytest.mark.parametrize("setting", range(9))
 def test_cut_off(setting):
     """The response to a sine wave at the cut-off, by the plant's own clock."""
     cell = filtered(setting)
@@ -287,7 +367,7 @@ def test_how_often_it_is_asked_does_not_matter():
     assert response([0.3, 1.7, 5.0]) == pytest.approx(often, abs=5e-4)
 
 
-@pytest.mark.parametrize("setting", range(8))
+@pytest.mark.parametrize("setting", range(9))
 def test_a_long_silence_costs_no_more_than_a_short_one(setting):
     cell = filtered(setting)
     cell.load.splits = 0

@@ -67,22 +67,69 @@ def content(answer):
 @pytest.mark.parametrize(
     ("sent", "replied"),
     [
-        # Meerstetter 5117: a value, an acknowledge, a server error.
+        # Meerstetter 5136AL, chapter 5, captured with a TEC-1089: identification, acknowledges, a value, an error.
+        (b"#0015AA?IF62AE\r", b"!0015AA8065-TEC SW G01     7199\r"),
+        (b"#0015AEVS07DA01000000028F97\r", b"!0015AE8F97\r"),
         (b"#0015AB?VR03E801C21A\r", b"!0015AB41CD2F28D5C2\r"),
         (b"#0015B0VS0BB80141AE0000C482\r", b"!0015B0C482\r"),
         (b"#0015AC?VR04D2017BFE\r", b"!0015AC+0532DA\r"),
-        (b"#010001VS07E401BF000000E796\r", b"!010001E796\r"),
+        # Meerstetter 5117C: reset, and identification at address 1.
+        (b"#00BDE2RS9780\r", b"!00BDE29780\r"),
+        (b"#0115AA?IF257D\r", b"!0115AA8065-TEC SW G01     342D\r"),
     ],
 )
 def test_sequences_of_the_maker(server, sent, replied):
     assert server.receive(sent) == replied
 
 
+def test_error_of_the_maker_at_address_1(server):
+    # The request is ours: 5117C prints the answer only.
+    assert server.receive(frame(b"?VR04D201", sequence=0x15AC)) == b"!0115AC+057509\r"
+
+
 def test_values_of_the_maker_arrive(pair):
     server, device = pair
-    server.receive(b"#0015B0VS0BB80141AE0000C482\r#010001VS07E401BF000000E796\r")
+    server.receive(b"#0015B0VS0BB80141AE0000C482\r#0015AEVS07DA01000000028F97\r")
+    server.receive(b"#010001VS07E401BF000000E796\r")  # computed by ourselves
     assert device.read_parameter(3000) == 21.75
+    assert device.read_parameter(2010) == 2
     assert device.read_parameter(2020) == -0.5
+
+
+def test_several_parameters_at_once(pair):
+    server, device = pair
+    values = content(server.receive(frame(b"?VX0503E80103E90103FC0103FD01006801")))
+    temperature, sink, current, voltage, status = struct.unpack(">ffffi", bytes.fromhex(values.decode()))
+    assert (sink, current, voltage, status) == (22.0, -0.5, -1.25, 1)
+    assert temperature == device.read_parameter(1000)
+    assert values[:8] == b"41CD2F28"
+    assert server.receive(frame(b"?VX00")) == b"!010001" + frame(b"?VX00")[-5:]
+    many = content(server.receive(frame(b"?VX20" + 32 * b"0BB801")))
+    assert many == 32 * b"41C80000"
+
+
+def test_a_channel_that_is_not_there_reads_as_no_number(server):
+    assert content(server.receive(frame(b"?VR03E802"))) == b"7FC00000"
+    assert content(server.receive(frame(b"?VX0303E80103E80203FD02"))) == b"41CD2F28" + b"7FC00000" + b"00000000"
+
+
+def test_big_data_are_the_one_element_of_a_parameter(pair):
+    server, device = pair
+    assert content(server.receive(frame(b"?VB0BB80100000000FFFF"))) == b"000100" + b"41C80000"
+    assert content(server.receive(frame(b"?VB0BB80100000001FFFF"))) == b"000000"
+    write = frame(b"VB0BB8010000000000010141AE0000")
+    assert server.receive(write) == b"!010001" + write[-5:]
+    assert device.read_parameter(3000) == 21.75
+
+
+def test_saving_is_acknowledged_and_outlasts_a_power_cycle(pair):
+    server, device = pair
+    device.write_parameter(108, 1)
+    device.write_parameter(3000, 31.0)
+    save = frame(b"SP")
+    assert server.receive(save) == b"!010001" + save[-5:]
+    device.power_cycle()
+    assert device.read_parameter(3000) == 31.0
 
 
 def test_integers_are_twos_complement(pair):
@@ -96,15 +143,11 @@ def test_limits_and_metadata(server):
     real = [struct.pack(">f", value).hex().upper().encode() for value in (0.0, 4.0)]
     assert content(server.receive(frame(b"?VL07EE01"))) == b"00" + real[0] + real[1]
     assert content(server.receive(frame(b"?VM07EE01", sequence=2))) == (
-        b"00" + b"03" + b"01" + b"00000001" + real[0] + real[1] + real[1]
+        b"00" + b"03" + b"02" + b"00000001" + real[0] + real[1] + real[1]
     )
     assert content(server.receive(frame(b"?VM006801", sequence=3))) == (
         b"01" + b"01" + b"01" + b"00000001" + b"00000000" + b"7FFFFFFF" + b"00000001"
     )
-
-
-def test_identification_is_twenty_characters(server):
-    assert content(server.receive(frame(b"?IF"))) == b"TEC-1091 v4.10".ljust(20)
 
 
 def test_emergency_stop_and_reset(pair):
@@ -145,8 +188,19 @@ def test_change_of_speed_is_acknowledged(server):
         (b"VS0BB8017F800000", b"+07"),
         (b"VS07DA0100000004", b"+07"),
         (b"VS080C013D4CCCCD", b"+07"),
-        (b"?VR03E802", b"+08"),
+        (b"?VR03E803", b"+08"),
         (b"?VR03E800", b"+08"),
+        (b"?VR006802", b"+08"),
+        (b"?VR17D409", b"+08"),
+        (b"VS080C023F800000", b"+08"),
+        (b"?VX", b"+04"),
+        (b"?VX0203E801", b"+04"),
+        (b"?VX0103E80103E901", b"+04"),
+        (b"?VX0203E80104D201", b"+05"),
+        (b"?VB0BB801", b"+04"),
+        (b"VB0BB80100000000000101", b"+04"),
+        (b"VB0BB801000000010001" + b"01" + b"41AE0000", b"+07"),
+        (b"SP1", b"+04"),
         (b"?VR\xff\xfe3E801", b"+04"),
     ],
 )
@@ -189,24 +243,25 @@ def test_a_new_start_sign_begins_a_new_frame(server):
     assert server.receive(b"noise" + frame(b"?VR006801", sequence=2))[7:15] == b"00000001"
 
 
-def test_the_same_request_again_is_answered_and_not_acted_on(pair):
+def test_the_same_request_again_is_carried_out_again(pair):
     server, device = pair
     first = server.receive(frame(b"VS0BB80141F00000"))
     device.write_parameter(3000, 50.0)
     assert server.receive(frame(b"VS0BB80141F00000")) == first
-    assert device.read_parameter(3000) == 50.0
-    server.receive(frame(b"VS0BB80141F00000", sequence=2))
     assert device.read_parameter(3000) == 30.0
+    before = server.receive(frame(b"?VR006801"))
+    device.trip(138)
+    assert server.receive(frame(b"?VR006801")) != before
 
 
-def test_the_watchdog_is_fed_by_requests_to_the_device_alone():
+def test_the_watchdog_is_fed_by_any_valid_package_to_the_device():
     block, clock = Block(), VirtualClock()
     device = EmulatedTEC("tec", World(block, clock), block)
     server = MeComServer(device)
     device.write_parameter(2060, 1.0)
-    for _ in range(3):
+    for payload in (b"?VR006801", b"?VR04D201", b"?XX"):
         clock.sleep(0.8)
-        server.receive(frame(b"?VR006801"))
+        server.receive(frame(payload))
     assert device.status is DeviceStatus.READY
     for _ in range(3):
         clock.sleep(0.8)
@@ -234,18 +289,20 @@ def test_faults_of_the_line(pair):
 def test_every_parameter_goes_over_the_wire_and_back(pair):
     server, device = pair
     device.write_parameter(108, 1)
-    for sequence, (number, row) in enumerate(PARAMETERS.items(), start=1):
-        answer = content(server.receive(frame(b"?VR%04X01" % number, sequence=2 * sequence)))
-        kind = ">i" if row.kind == "INT32" else ">f"
-        assert struct.unpack(kind, bytes.fromhex(answer.decode()))[0] == device.read_parameter(number)
-        if row.writable and number != 2051:
-            write = frame(b"VS%04X01" % number + answer, sequence=2 * sequence + 1)
-            assert server.receive(write) == b"!" + write[1:7] + write[-5:]
+    for number, row in PARAMETERS.items():
+        for instance in range(1, row.instances + 1):
+            answer = content(server.receive(frame(b"?VR%04X%02X" % (number, instance))))
+            kind = ">i" if row.kind == "INT32" else ">f"
+            value = struct.unpack(kind, bytes.fromhex(answer.decode()))[0]
+            assert value == pytest.approx(device.read_parameter(number, instance), abs=0, nan_ok=True)
+            if row.writable and number != 2051:
+                write = frame(b"VS%04X%02X" % (number, instance) + answer)
+                assert server.receive(write) == b"!" + write[1:7] + write[-5:]
 
 
 payloads = st.one_of(
     st.binary(max_size=40),
-    st.from_regex(rb"(\?V[RLMBX]|VS|ES|RS|CS|\?IF)[0-9A-F+-]{0,20}", fullmatch=True),
+    st.from_regex(rb"(\?V[RLMBX]|V[SB]|ES|RS|SP|CS|\?IF)[0-9A-F+-]{0,32}", fullmatch=True),
     st.builds(
         lambda number, bits: b"VS%04X01%08X" % (number, bits),
         st.sampled_from(sorted(PARAMETERS)),

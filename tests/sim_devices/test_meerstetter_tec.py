@@ -104,7 +104,8 @@ def test_every_writable_parameter_takes_its_bounds_and_nothing_beyond(tec):
 
 def test_unknown_parameter_instance_and_numbers_that_are_none(tec):
     assert refusal(lambda: tec.read_parameter(1234)) is ServerError.PARAMETER_NOT_AVAILABLE
-    assert refusal(lambda: tec.read_parameter(1000, 2)) is ServerError.INSTANCE_NOT_AVAILABLE
+    for number, instance in ((1000, 3), (1000, 0), (104, 2), (6100, 9)):
+        assert refusal(lambda n=number, i=instance: tec.read_parameter(n, i)) is ServerError.INSTANCE_NOT_AVAILABLE
     assert refusal(lambda: tec.write_parameter(3000, math.nan)) is ServerError.OUT_OF_RANGE
     assert refusal(lambda: tec.write_parameter(3000, 1e300)) is ServerError.OUT_OF_RANGE
     assert refusal(lambda: tec.write_parameter(2060, 0.05)) is ServerError.OUT_OF_RANGE
@@ -120,6 +121,32 @@ def test_identity_is_what_the_parameters_say(tec):
     assert tec.identity.model == "TEC-1091"
     assert tec.identity.firmware == "4.10"
     assert len(tec.identification) == 20
+
+
+def test_a_channel_that_is_not_there_keeps_settings_and_measures_nothing(tec, plate):
+    assert math.isnan(tec.read_parameter(1000, 2))
+    assert math.isnan(tec.read_parameter(1001, 2))
+    assert tec.read_parameter(1021, 2) == 0.0
+    for number, value in ((50012, 60.0), (50011, 1), (2010, 2), (50000, 1)):
+        tec.write_parameter(number, value, 2)
+        assert tec.read_parameter(number, 2) == value
+    assert tec.status is DeviceStatus.READY
+    assert plate.calls == []
+    assert tec.read_parameter(50012) == 0.0
+
+
+def test_ranges_of_the_makers_documents(tec):
+    tec.write_parameter(2052, 1_000_000)
+    assert refusal(lambda: tec.write_parameter(2052, 1_000_001)) is ServerError.OUT_OF_RANGE
+    for value, taken in ((0.0, True), (0.0999, False), (0.1, True), (600.0, True), (600.1, False)):
+        if taken:
+            tec.write_parameter(2060, value)
+        else:
+            assert refusal(lambda v=value: tec.write_parameter(2060, v)) is ServerError.OUT_OF_RANGE
+    assert refusal(lambda: tec.write_parameter(52103, 1)) is ServerError.READ_ONLY
+    for line in range(1, 9):
+        tec.write_parameter(6100, 13 + line, line)
+    assert [tec.read_parameter(6100, line) for line in range(1, 9)] == list(range(14, 22))
 
 
 def test_runs_ready_run_and_back(tec, clock, plate):
@@ -204,7 +231,7 @@ def test_watchdog_expires_at_its_own_instant(tec, clock, plate):
     assert tec.status is DeviceStatus.ERROR
     assert plate.calls[-1] == (pytest.approx(2.5, abs=1e-9), "release")
     assert [tec.read_parameter(number) for number in (105, 106, 107)] == [183, 1, 2060]
-    assert [tec.read_parameter(number) for number in (50000, 50011, 50012)] == [0, 0, 0]
+    assert [tec.read_parameter(number) for number in (50000, 50011, 50012)] == [1, 1, 40.0]
     assert plate.plate_temperature == pytest.approx(AMBIENT, abs=0.01)
 
 
@@ -244,6 +271,45 @@ def test_reset_restores_the_flash_after_200_ms(tec, clock):
     assert [tec.read_parameter(number) for number in (105, 108, 3000, 50000)] == [0, 0, 30.0, 0]
 
 
+def test_a_power_cycle_loses_what_is_in_ram_and_switches_off(tec, clock, plate):
+    tec.write_parameter(3000, 30.0)
+    tec.write_parameter(108, 1)
+    tec.write_parameter(3000, 35.0)
+    tec.write_parameter(2030, 1.5)
+    tec.write_parameter(2060, 1.0)
+    run(tec)
+    clock.sleep(0.5)
+    tec.power_cycle()
+    assert tec.status is DeviceStatus.READY
+    assert plate.calls[-1] == (0.5, "release")
+    assert [tec.read_parameter(number) for number in (108, 3000, 2030, 2060, 2010, 50000)] == [0, 30.0, 4.0, 0, 0, 0]
+    tec.trip(138)
+    tec.power_cycle()
+    assert (tec.status, tec.read_parameter(105)) == (DeviceStatus.READY, 0)
+
+
+def test_a_power_cycle_of_an_output_that_the_flash_switches_on_interrupts_it(tec, plate):
+    tec.write_parameter(2010, 1)
+    tec.power_cycle()
+    assert [call[1] for call in plate.calls] == ["regulate", "release", "regulate"]
+    assert tec.status is DeviceStatus.RUN
+
+
+def test_saving_writes_to_the_flash_what_differs(tec):
+    tec.write_parameter(108, 1)
+    tec.write_parameter(3000, 31.0)
+    tec.write_parameter(3000, 32.0, 2)
+    tec.write_parameter(50012, 33.0)
+    assert tec.flash_writes == 0
+    tec.save()
+    assert tec.flash_writes == 2
+    tec.save()
+    assert tec.flash_writes == 2
+    tec.power_cycle()
+    assert [tec.read_parameter(3000, each) for each in (1, 2)] == [31.0, 32.0]
+    assert tec.read_parameter(50012) == 0.0
+
+
 def test_flash_writes_are_counted_while_saving_is_on(tec):
     tec.write_parameter(3000, 30.0)
     tec.write_parameter(50012, 30.0)
@@ -256,7 +322,8 @@ def test_flash_writes_are_counted_while_saving_is_on(tec):
 def test_emergency_stop_is_error_11_and_stays(tec, clock, plate):
     run(tec)
     tec.emergency_stop()
-    assert (tec.status, tec.read_parameter(105)) == (DeviceStatus.ERROR, 11)
+    assert tec.status is DeviceStatus.ERROR
+    assert [tec.read_parameter(number) for number in (105, 106, 107)] == [11, 1, 464]
     assert plate.calls[-1][1] == "release"
     run(tec)
     clock.sleep(10.0)
@@ -270,14 +337,17 @@ def test_first_error_stays(tec):
     assert tec.read_parameter(105) == 60
 
 
-def test_automatic_restart_after_its_delay(tec, clock):
+def test_an_error_that_resets_itself_brings_the_output_back(tec, clock, plate):
     tec.write_parameter(6310, 3.0)
     run(tec)
     tec.trip(138)
+    assert plate.calls[-1][1] == "release"
     clock.sleep(2.9)
     assert tec.status is DeviceStatus.ERROR
     clock.sleep(0.2)
-    assert tec.status is DeviceStatus.READY
+    assert tec.status is DeviceStatus.RUN
+    assert plate.calls[-1] == (pytest.approx(3.0), "regulate", 40.0, 4.0)
+    assert tec.read_parameter(105) == 0
 
 
 def test_an_automatic_restart_takes_time_while_its_cause_stays(tec, clock):

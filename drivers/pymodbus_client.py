@@ -1,0 +1,181 @@
+"""pymodbus behind the calls of `drivers.modbus.ModbusClient`, for real lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pymodbus.client import ModbusSerialClient
+from pymodbus.client.base import ModbusBaseSyncClient
+from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
+from pymodbus.pdu import ModbusPDU
+
+from drivers.modbus import (
+    LONGEST_REPLY,
+    MOST_STRAY,
+    SHORTEST_REPLY,
+    ModbusClient,
+    NoReplyError,
+    RefusedError,
+    UnexpectedReplyError,
+    reply_length,
+)
+from drivers.serial_line import SerialSettings, open_port
+
+
+class _Request(ModbusPDU):
+    """Any request, for pymodbus to frame and send."""
+
+    def __init__(self, request: bytes, unit: int) -> None:
+        super().__init__(dev_id=unit)
+        self.function_code = request[0]
+        self._body = request[1:]
+
+    def encode(self) -> bytes:
+        """Return what follows the function."""
+        return self._body
+
+
+class PymodbusClient(ModbusClient):
+    """A client of pymodbus that is connected.
+
+    Parameters
+    ----------
+    client : pymodbus.client.base.ModbusBaseSyncClient
+        The client; it must not repeat requests.
+    unit : int
+        Unit identifier or address of the instrument.
+    """
+
+    def __init__(self, client: ModbusBaseSyncClient, unit: int) -> None:
+        self._client = client
+        self._unit = unit
+
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply, of an `expected` number of bytes.
+
+        Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
+        """
+        try:
+            response = self._client.execute(False, _Request(request, self._unit))
+        except ModbusIOException as error:
+            raise NoReplyError(str(error)) from error
+        except ModbusException as error:
+            raise ConnectionError(error.string) from error
+        if response.isError():
+            raise RefusedError(response.exception_code)
+        function = response.function_code
+        # What another function answers may not be written again as it was read.
+        reply = request[:1] + response.encode() if function == request[0] else b""
+        if len(reply) != expected:
+            raise UnexpectedReplyError(request, expected, function, len(reply))
+        return reply
+
+    def close(self) -> None:
+        """Release the line; may be called again."""
+        self._client.close()  # type: ignore[no-untyped-call]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the line can be used."""
+        return self._client.is_socket_open()
+
+
+class SerialClient(PymodbusClient):
+    """pymodbus's client of a serial line to one instrument.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+        Port, speed and timeout.
+    unit : int
+        Address of the instrument, 1 to 247.
+    parity : str
+        N, E or O.
+
+    Raises
+    ------
+    DeviceConnectionError
+        If the port cannot be opened.
+    """
+
+    def __init__(self, device: str, settings: SerialSettings, unit: int, parity: str) -> None:
+        self._line = _BlockingClient(device, settings, parity)
+        super().__init__(self._line, unit)
+
+    def drain(self) -> None:
+        """Discard what still arrives, until nothing has come for a timeout.
+
+        Raises `OSError` if the line is lost or does not fall silent.
+        """
+        try:
+            self._line.drain()
+        except ConnectionException as error:
+            raise ConnectionError(error.string) from error
+
+
+class _BlockingClient(ModbusSerialClient):
+    """pymodbus's client of a serial line, with a receiver that waits for bytes instead of looking for them.
+
+    pymodbus looks whether bytes have come, sleeps for a millisecond or more, and looks again whether more have:
+    two naps for each reply. The head of a reply says how long it is, so that the port itself can wait for
+    exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
+    """
+
+    def __init__(self, device: str, settings: SerialSettings, parity: str) -> None:
+        # Sending again is left to the caller, which lets late replies pass first.
+        super().__init__(
+            settings.port, baudrate=settings.baudrate, parity=parity, timeout=settings.timeout, retries=0
+        )
+        self.socket: Any = open_port(device, settings, parity=parity, exclusive=True)
+        self._received = 0
+
+    def connect(self) -> bool:
+        """Return whether the line is open; a line that was lost stays closed."""
+        return self.socket is not None
+
+    def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:  # noqa: ARG002 - pymodbus's form
+        """Send a request, and discard what came before it."""
+        with self._line_errors():
+            self._discard()
+            self._received = 0
+            sent: int = self.socket.write(request)
+        return sent
+
+    def recv(self, size: int | None) -> bytes:  # noqa: ARG002 - pymodbus's form
+        """Wait for a reply, up to the timeout, and return what has come of it."""
+        if self._received > LONGEST_REPLY:
+            return b""  # it never becomes a reply
+        with self._line_errors():
+            reply: bytes = self.socket.read(SHORTEST_REPLY)
+            if len(reply) == SHORTEST_REPLY and (missing := reply_length(reply) - SHORTEST_REPLY) > 0:
+                reply += self.socket.read(missing)
+        self._received += len(reply)
+        return reply
+
+    def drain(self) -> None:
+        """Discard what still arrives, until nothing has come for a timeout."""
+        with self._line_errors():
+            for _ in range(MOST_STRAY // LONGEST_REPLY):
+                if not self.socket.read(LONGEST_REPLY):
+                    return
+        raise ConnectionException("the line does not fall silent")
+
+    def _discard(self) -> None:
+        # A socket says only that something is waiting, not how much; hence byte by byte at worst.
+        for _ in range(MOST_STRAY):
+            if not (waiting := self.socket.in_waiting):
+                return
+            self.socket.read(waiting)
+
+    @contextmanager
+    def _line_errors(self) -> Iterator[None]:
+        """Turn what the port raises into what pymodbus raises."""
+        if self.socket is None:
+            raise ConnectionException("the line is closed")
+        try:
+            yield
+        except OSError as error:
+            self.close()  # type: ignore[no-untyped-call]
+            raise ConnectionException(str(error)) from error
