@@ -49,7 +49,7 @@ def test_an_exception_is_noticed(monkeypatch):
     def fail(*_):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr(EmulatedTEC, "read_parameter", fail)
+    monkeypatch.setattr(EmulatedTEC, "attend", fail)
     with pytest.raises(RuntimeError, match="a defect") as raised:
         fuzz("vo2/tec", 200, seed=0)
     assert "vo2/tec, seed 0, frame" in raised.value.__notes__[0]
@@ -82,12 +82,12 @@ def test_a_buffer_that_grows_is_noticed(monkeypatch):
 
 
 def test_a_state_beyond_its_range_is_noticed(monkeypatch):
-    original = EmulatedTEC.write_parameter
+    original = EmulatedTEC.attend
 
-    def write(tec, number, value, instance=1):
-        original(tec, number, value, instance)
+    def attend(tec):
+        original(tec)
         tec._values[2030] = 9.0
 
-    monkeypatch.setattr(EmulatedTEC, "write_parameter", write)
+    monkeypatch.setattr(EmulatedTEC, "attend", attend)
     with pytest.raises(FailedError, match="parameter 2030"):
         fuzz("vo2/tec", 200, seed=0)
