@@ -7,6 +7,8 @@ SETUP := $(VENV)/.set-up
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 # mypy keeps one core busy: it runs beside the tests.
 MAKEFLAGS += --jobs=2
+# Without files of byte code each worker and each process of the tests compiles every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types tests all-tests benchmark clean
 

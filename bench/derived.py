@@ -23,7 +23,7 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from simpleeval import SimpleEval
 
 from bench.devices import Signal
 from bench.errors import DeviceError
+from bench.units import quantity, unit_registry
 
 _OPERATORS = {
     ast.Add: operator.add,
@@ -157,15 +158,15 @@ class Expression(DerivedSignal):
 
     def bind(self, name: str, units: Mapping[str, str]) -> Derived:
         """Return the signal; see `DerivedSignal.bind`."""
-        constants = {key: _quantity(f"constants.{key}", str(value)) for key, value in self.constants.items()}
-        quantities = constants | {source: _quantity(source, f"1 {units[source]}") for source in self.sources}
-        wanted = _quantity("unit", f"1 {self.unit}")
+        constants = {key: quantity(f"constants.{key}", str(value)) for key, value in self.constants.items()}
+        quantities = constants | {source: quantity(source, f"1 {units[source]}") for source in self.sources}
+        wanted = quantity("unit", f"1 {self.unit}")
         operators = {**_OPERATORS, ast.Pow: _power_of_quantity}
         check = SimpleEval(operators=operators, functions=_ON_QUANTITIES, names=quantities)
         # Only the units matter here, so a value may be infinite; the library raises many kinds of errors.
         try:
             with np.errstate(all="ignore"):
-                found = _units().Quantity(check.eval(self.expression))
+                found = unit_registry().Quantity(check.eval(self.expression))
         except Exception as error:
             raise ValueError(f"expression = {self.expression!r}: {error}") from None
         if not found.is_compatible_with(wanted):
@@ -195,27 +196,6 @@ def _power_of_quantity(base: Any, exponent: Any) -> Any:  # noqa: ANN401 - quant
     elif not base.dimensionless and not isinstance(exponent, int | float):
         raise ValueError(f"a power of {base.units:~P} needs a number as its exponent")
     return base**exponent
-
-
-@cache
-def _units() -> Any:  # noqa: ANN401 - the library's registry has no useful type
-    # It takes a second to import, which only rigs with expressions should pay for.
-    from pint import UnitRegistry
-
-    return UnitRegistry()
-
-
-def _quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the library's
-    number, _, unit = text.strip().partition(" ")
-    try:
-        # Numpy's numbers divide by zero without an exception.
-        quantity = _units().Quantity(np.float64(number), unit.replace("°C", "K") or "1")
-        origin = _units().Quantity(0.0, quantity.units).to_base_units().magnitude
-    except Exception as error:
-        raise ValueError(f"{key} = {text!r}: expected a number and a unit, such as '300e-6 m': {error}") from None
-    if not np.isfinite(quantity.magnitude) or origin != 0.0:
-        raise ValueError(f"{key} = {text!r}: expected a finite number and a unit whose scale begins at 0")
-    return quantity
 
 
 def _in_base_units(quantity: Any) -> float:  # noqa: ANN401 - a quantity of the library's

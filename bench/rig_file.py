@@ -100,7 +100,10 @@ class _RigFileContent(_Table):
 
 
 class LaboratorySettings(BaseModel):
-    """Base of what the table `[emulation]` may say; a laboratory extends it with its own keys."""
+    """Base of what the table `[emulation]` may say; a laboratory extends it with its own keys.
+
+    One that has a field `devices` is given the settings of the rig's devices in it, by name.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -330,8 +333,9 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
             found.append(str(error))
     laboratory, settings = None, None
     if tables.emulation is not None:
+        devices = {entry.name: entry.settings for entry in entries}
         loaded = _load_part(
-            "laboratories", tables.emulation, "emulation.", "laboratory", LaboratorySettings, "open", found
+            "laboratories", tables.emulation, "emulation.", "laboratory", LaboratorySettings, "open", found, devices
         )
         laboratory, settings = loaded or (None, None)
     if found:
@@ -362,8 +366,12 @@ def _load_part(
     base: type[BaseModel],
     method: str,
     found: list[str],
+    devices: Mapping[str, DriverSettings] | None = None,
 ) -> tuple[Any, Any] | None:
-    """Return the class that `key` of a table names, and its settings from the other keys; problems go to `found`."""
+    """Return the class that `key` of a table names, and its settings from the other keys; problems go to `found`.
+
+    Settings with a field `devices` are given `devices` in it.
+    """
     options = dict(table)
     reference = options.pop(key, None)
     where = f"{prefix}{key} = {reference!r}"
@@ -381,6 +389,8 @@ def _load_part(
     except ConfigurationError as error:
         found.append(str(error))
         return None
+    if devices is not None and "devices" in settings.model_fields:
+        options["devices"] = devices
     try:
         return loaded, settings.model_validate(options)
     except ValidationError as error:

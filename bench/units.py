@@ -1,9 +1,13 @@
-"""Numbers with fitting SI prefixes, for axes, titles and tables."""
+"""Units: those that are known, and numbers with fitting SI prefixes for axes, titles and tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
 
 _PREFIXABLE = ("m", "A", "V", "N", "W")
 _PREFIXES = {"": 1.0, "m": 1e3, "µ": 1e6, "n": 1e9}
@@ -53,3 +57,49 @@ def with_unit(name: str, unit: str) -> str:
 def header_with_unit(name: str, unit: str) -> str:
     """Return a column header such as `force [N]`; the name alone where there is no unit."""
     return f"{name} [{unit}]" if unit else name
+
+
+@cache
+def unit_registry() -> Any:  # noqa: ANN401 - the library's registry has no useful type
+    """Return the registry of known units."""
+    # It takes a second to import, which only rigs that need it should pay for.
+    from pint import UnitRegistry
+
+    return UnitRegistry()
+
+
+def quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the library's
+    """Return a number and its unit, such as `300e-6 m`; °C count as K.
+
+    Raises
+    ------
+    ValueError
+        If the text is not that, or the scale of the unit does not begin at 0; names `key`.
+    """
+    number, _, unit = text.strip().partition(" ")
+    try:
+        # Numpy's numbers divide by zero without an exception.
+        found = unit_registry().Quantity(np.float64(number), unit.replace("°C", "K") or "1")
+        origin = unit_registry().Quantity(0.0, found.units).to_base_units().magnitude
+    except Exception as error:
+        raise ValueError(f"{key} = {text!r}: expected a number and a unit, such as '300e-6 m': {error}") from None
+    if not np.isfinite(found.magnitude) or origin != 0.0:
+        raise ValueError(f"{key} = {text!r}: expected a finite number and a unit whose scale begins at 0")
+    return found
+
+
+def check_unit(unit: str) -> str:
+    """Return a unit that is known; a plain number has the unit 1.
+
+    Raises
+    ------
+    ValueError
+        If there is no such unit, or its scale does not begin at 0.
+    """
+    try:
+        quantity("unit", f"1 {unit}")
+        if not unit.strip():
+            raise ValueError
+    except ValueError:
+        raise ValueError("is no unit; expected one such as V, mA, °C, Pa, 1/m, or 1 for a plain number") from None
+    return unit

@@ -18,7 +18,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
 
 from sim_devices.plants import _vo2_kernels as kernels
 from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
@@ -136,6 +135,9 @@ def relay_thresholds(parameters: VO2Parameters) -> tuple[Floats, Floats]:
         Up-thresholds (sorted) and the down-thresholds of the same relays, °C; the down-threshold is
         nowhere above the up-threshold.
     """
+    # A third of a second of import, which a list of the rigs does not need.
+    from scipy.special import ndtri
+
     p = parameters
     # The additive sequence of the generalised golden ratio of three dimensions, the root of x^4 = x + 1.
     powers = 1.2207440846057596 ** -np.arange(1.0, 4.0)

@@ -1,0 +1,64 @@
+"""Identity, signals, ranges and arrival of an instrument that the rig file describes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from bench.clock import Clock
+from bench.command_table import QuantityTable, TargetTable
+from bench.devices import Identity, Signal, Status
+from bench.errors import DeviceError
+
+_ARRIVAL_INTERVAL = 0.1  # s
+
+
+def signals_of(tables: Mapping[str, QuantityTable]) -> list[Signal]:
+    """Return the signals of tables, by their names without that of the device."""
+    return [
+        Signal(name, table.unit, table.description or name.replace("_", " "), table.precision)
+        for name, table in tables.items()
+    ]
+
+
+def check_ranges(device: str, tables: Mapping[str, QuantityTable], values: Mapping[str, float]) -> None:
+    """Raise `DeviceError` if a reading is outside of the range of good ones."""
+    for name, table in tables.items():
+        if table.limits is not None and not table.limits[0] <= values[name] <= table.limits[1]:
+            low, high = table.limits
+            raise DeviceError(
+                device,
+                f"{name} is {values[name]:g} {table.unit}, outside of {low:g} to {high:g} {table.unit}; "
+                "check instrument and wiring",
+            )
+
+
+def arrival_of(
+    device: str, clock: Clock, target: TargetTable, value: float, read: Callable[[], Mapping[str, float]]
+) -> Status:
+    """Return the status of a set-point that was sent; `read` returns the quantities by name."""
+    arrival = target.arrival
+    if arrival is None:
+        return Status.completed(device, clock)
+    return Status(
+        device,
+        clock,
+        lambda: abs(read()[arrival.signal] - value) <= arrival.tolerance,
+        timeout=arrival.timeout,
+        interval=_ARRIVAL_INTERVAL,
+    )
+
+
+def check_read_back(device: str, target: TargetTable, written: float, found: float, reported: str = "") -> None:
+    """Raise `DeviceError` unless a set-point is read back as it was written; `reported` are its errors."""
+    if not abs(found - written) <= target.tolerance * (1.0 + 1e-9):
+        raise DeviceError(
+            device,
+            f"reads its set-point back as {found:g} {target.unit}, not {written:g} {target.unit}"
+            f"{f' ({reported})' if reported else ''}; was it restarted, or set by another program or by hand?",
+        )
+
+
+def identity_of(answer: str) -> Identity:
+    """Return the identity that an answer to `*IDN?` is: maker, model, serial number, firmware (IEEE 488.2, 10.14)."""
+    fields = [field.strip() or "unknown" for field in answer.split(",", 3)]
+    return Identity(*fields, *["unknown"] * (4 - len(fields)))

@@ -1,0 +1,286 @@
+"""The roles that a text instrument of the rig file plays: a sensor, an actuator, or a voltage supply.
+
+Sources: IEEE 488.2-1992, SCPI-99; the messages themselves are those of the rig file.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import ClassVar, Self
+
+from pydantic import ValidationInfo, field_validator, model_validator
+
+from bench.clock import Clock
+from bench.command_table import (
+    ANY_TEXT,
+    ActuatorTable,
+    SetpointTable,
+    Template,
+    signals_by_query,
+    template,
+    written_number,
+)
+from bench.devices import Identity, Limits, Signal, Status
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.roles import GeneralActuator, GeneralSensor, VoltageSupply
+from drivers.device import LineDevice, attempt
+from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, signals_of
+from drivers.scpi.line import LineTable, TextLine
+
+_UNKNOWN = Identity("unknown", "unknown", "unknown", "unknown")
+_DONE = template("1")
+
+
+class SensorSettings(LineTable):
+    """Rig-file settings of a text instrument that measures."""
+
+
+class ActuatorSettings(LineTable, ActuatorTable):
+    """Rig-file settings of a text instrument that takes a set-point."""
+
+
+class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
+    """A text instrument that measures: its signals are those of the rig file.
+
+    A query that several signals share is sent once. `measure` reads the queue of errors as well, `glance` does not.
+    """
+
+    Settings: ClassVar[type[LineTable]] = SensorSettings
+
+    def __init__(self, name: str, settings: LineTable, clock: Clock, line: TextLine) -> None:
+        GeneralSensor.__init__(self, name, clock, _UNKNOWN, signals_of(settings.signals))
+        self._settings, self._line = settings, line
+
+    @classmethod
+    def _open_line(cls, name: str, settings: LineTable, clock: Clock) -> TextLine:
+        return TextLine(name, settings, clock)
+
+    def _identify(self) -> Identity:
+        settings = self._settings
+        if not settings.identity_query:
+            return Identity("unknown", "text instrument", settings.port, "unknown")
+        answer, _ = self._line.ask(settings.identity_query, template(ANY_TEXT))
+        if template(settings.identity).match(answer) is None:
+            raise DeviceConnectionError(
+                self.name,
+                f"{settings.port} is {answer!r}, expected {settings.identity!r}; "
+                "check the address and the key identity",
+            )
+        return identity_of(answer)
+
+    def _start(self) -> None:
+        # What happened before is nobody's fault here.
+        self._line.errors()
+        for message in self._settings.setup:
+            self._line.tell(message)
+        if self._settings.setup:
+            self._line.raise_errors("the messages of setup")
+
+    def measure_quantities(self) -> dict[str, float]:
+        """Measure every quantity, and read the queue of errors."""
+        values = self._ask_quantities()
+        self._line.raise_errors("measuring")
+        return values
+
+    def glance(self) -> dict[str, float]:
+        """Measure every signal, without a look at the queue of errors; values by signal name."""
+        return {f"{self.name}_{name}": value for name, value in self._ask_quantities().items()}
+
+    def _ask_quantities(self) -> dict[str, float]:
+        tables = self._settings.signals
+        values = {}
+        for query, names in signals_by_query(tables).items():
+            _, numbers = self._line.ask(query, template(tables[names[0]].reply))
+            for name in names:
+                values[name] = numbers.get(name, numbers.get("value", math.nan)) * tables[name].scale
+        check_ranges(self.name, tables, values)
+        return {name: values[name] for name in tables}
+
+
+class SCPIActuator(SCPISensor, GeneralActuator):
+    """A text instrument that takes a set-point, and measures its signals.
+
+    `set` sends the set-point, reads it back, switches the output on if it is off, and reads the queue of errors. A
+    reading finds an output that is off or a set-point that has changed without the bench: a protection or a restart.
+    `safe` sends the messages of `output.off` and asks for the state; an instrument without such a question has to
+    answer at least, and to report no error. There is no watchdog: what was set stays when the bench dies.
+    """
+
+    Settings: ClassVar[type[LineTable]] = ActuatorSettings
+
+    def __init__(self, name: str, settings: ActuatorSettings, clock: Clock, line: TextLine) -> None:
+        table = settings.setpoint
+        GeneralActuator.__init__(
+            self,
+            name,
+            clock,
+            _UNKNOWN,
+            signals_of(settings.signals),
+            Limits(*table.limits, table.unit),
+            description=table.description,
+            precision=table.precision,
+        )
+        self._settings, self._line = settings, line
+        self._table, self._output = table, settings.output
+        self._command = template(table.command)
+        self._on = False
+
+    def _start(self) -> None:
+        super()._start()
+        if self._table.range_queries is not None:
+            ends = [self._ask_number(query, template("{value}")) for query in self._table.range_queries]
+            low, high = min(ends), max(ends)
+            if not low <= self._limits.low < self._limits.high <= high:
+                raise ConfigurationError(
+                    f"{self.name}: setpoint.limits = {self._limits}: the instrument takes {low:g} to {high:g} "
+                    f"{self._limits.unit}"
+                )
+            self._line.raise_errors("the questions of range_queries")
+
+    def send(self, value: float) -> Status:
+        """Send a set-point that is within the limits, and switch the output on if it is off."""
+        table = self._table
+        number = value / table.scale
+        self._line.tell(self._command.fill({self._command.names[0]: number}))
+        if self._settings.completion_query:
+            self._line.ask(self._settings.completion_query, _DONE)
+        self._check_setpoint(value)
+        if not self._on:
+            for message in self._output.on:
+                self._line.tell(message)
+        self._line.raise_errors(f"set-point {value:g} {table.unit}")
+        self._on = True
+        self._check_output()
+        return arrival_of(self.name, self._clock, table, value, self._ask_quantities)
+
+    def switch_off(self) -> None:
+        """Send the messages that reach the safe state, and have the instrument confirm it."""
+        self._on = False
+        failures = attempt(*(partial(self._line.tell, message) for message in self._output.off))
+        confirm = self._confirm_off if self._output.query else partial(self._line.raise_errors, "switching off")
+        failures += attempt(confirm)
+        if not self._output.query and self._settings.identity_query:
+            failures += attempt(partial(self._line.ask, self._settings.identity_query, template(ANY_TEXT)))
+        if failures:
+            raise DeviceError(
+                self.name,
+                f"does not confirm that its output is off ({failures[-1]}); switch it off by hand",
+            )
+
+    def measure_quantities(self) -> dict[str, float]:
+        """Measure every quantity, check output and set-point, and read the queue of errors."""
+        values = self._ask_quantities()
+        if self._on and not math.isnan(self._setpoint):
+            self._check_output()
+            self._check_setpoint(self._setpoint)
+        self._line.raise_errors("measuring")
+        return values
+
+    def glance(self) -> dict[str, float]:
+        """Measure every signal and check the output; values by signal name."""
+        values = super().glance()
+        if self._on:
+            self._check_output()
+        return values
+
+    def _ask_number(self, query: str, form: Template) -> float:
+        _, numbers = self._line.ask(query, form)
+        return numbers["value"] * self._table.scale
+
+    def _check_setpoint(self, value: float) -> None:
+        """Raise `DeviceError` unless the instrument reads a set-point back as it was written."""
+        table = self._table
+        if not table.query:
+            return
+        written = written_number(self._command, value / table.scale) * table.scale
+        found = self._ask_number(table.query, template(table.reply))
+        wrong = abs(found - written) > table.tolerance
+        check_read_back(self.name, table, written, found, "; ".join(self._line.errors()) if wrong else "")
+
+    def _check_output(self) -> None:
+        """Raise `DeviceError` if the output is off without the bench."""
+        output = self._output
+        if output.query and not self._reads_on():
+            reported = "; ".join(self._line.errors())
+            raise DeviceError(
+                self.name,
+                "its output is off although it was switched on: a protection, a restart, or another program"
+                f"{f' ({reported})' if reported else ''}",
+            )
+
+    def _reads_on(self) -> bool:
+        output = self._output
+        answer, _ = self._line.ask(output.query, template(ANY_TEXT))
+        if _is(answer, output.is_off):
+            return False
+        if _is(answer, output.is_on):
+            return True
+        raise DeviceError(
+            self.name, f"answered {answer!r} to {output.query!r}, expected {output.is_on!r} or {output.is_off!r}"
+        )
+
+    def _confirm_off(self) -> None:
+        if self._reads_on():
+            raise DeviceError(self.name, "says that its output is on")
+
+
+class VoltageSupplySettings(ActuatorSettings):
+    """Rig-file settings of a bench supply: the set-point in V, the signals `voltage` in V and `current` in A."""
+
+    @field_validator("setpoint")
+    @classmethod
+    def _is_a_voltage(cls, setpoint: SetpointTable, info: ValidationInfo) -> SetpointTable:
+        signals = {name: signal.unit for name, signal in info.data.get("signals", {}).items()}
+        if setpoint.unit != "V" or not setpoint.limits[0] <= 0.0 <= setpoint.limits[1]:
+            raise ValueError("a voltage supply is set in V, and its limits are around 0 V")
+        if signals and signals != {"voltage": "V", "current": "A"}:
+            raise ValueError(
+                "a voltage supply has the signals voltage in V and current in A; see scpi-actuator for others"
+            )
+        return setpoint
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if list(self.signals) != ["voltage", "current"]:
+            raise ValueError("signals: expected voltage before current")
+        return self
+
+
+class SCPIVoltageSupply(SCPIActuator, VoltageSupply):
+    """A direct-current bench supply. The safe state is the output off; its set-point counts as 0 V then."""
+
+    Settings: ClassVar[type[LineTable]] = VoltageSupplySettings
+
+    @property
+    def output(self) -> str:
+        """Which voltage the set-point is: `dc`."""
+        return "dc"
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured."""
+        named: tuple[Signal, ...] = VoltageSupply.signals.__get__(self)
+        return named
+
+    @property
+    def setpoint_signal(self) -> Signal:
+        """The voltage asked for."""
+        named: Signal = VoltageSupply.setpoint_signal.__get__(self)
+        return named
+
+    def safe(self) -> None:
+        """Switch the output off."""
+        try:
+            self.switch_off()
+        finally:
+            self._setpoint = 0.0
+
+
+def _is(answer: str, expected: str) -> bool:
+    """Return whether an answer is as expected, as text or as a number."""
+    if template(expected).match(answer) is not None:
+        return True
+    number = template("{value}")
+    numbers = number.match(answer), number.match(expected)
+    return None not in numbers and numbers[0] == numbers[1]

@@ -1,0 +1,140 @@
+"""A conversation with a text instrument: each question has its own answer, and the queue of errors is read."""
+
+from __future__ import annotations
+
+from bench.clock import Clock
+from bench.command_table import ANY_TEXT, CommandTable, Template, template
+from bench.errors import DeviceConnectionError, DeviceError
+from drivers.scpi.transport import TextLineSettings, open_transport
+from drivers.serial_line import RESENDS
+
+_MOST_ERRORS = 32
+"""Errors that are read of a queue at once."""
+
+_MOST_STRAY = 64
+"""Late answers that are passed over before the line counts as lost."""
+
+_NO_ERROR = template("{value}{any}")
+
+
+class LineTable(TextLineSettings, CommandTable):
+    """Where a text instrument is, and what it is told and asked."""
+
+
+class TextLine:
+    """The line to one text instrument.
+
+    An answer belongs to the question before it: what was received earlier is forgotten before a question is sent.
+    After an answer that is missing or makes no sense, a late one may still come. So the line has to be silent for the
+    time-out, then the identity is asked for where it is known, and what comes before its answer is passed over.
+
+    Questions are sent three times at most, other messages once.
+
+    Raises
+    ------
+    DeviceConnectionError
+        If the line cannot be opened.
+    """
+
+    def __init__(self, device: str, settings: LineTable, clock: Clock) -> None:
+        self._device = device
+        self._settings = settings
+        self._clock = clock
+        self._free_at = clock.now()
+        self._in_step = True
+        self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
+
+    def close(self) -> None:
+        """Release the line."""
+        self._transport.close()
+
+    def tell(self, message: str) -> None:
+        """Send a message that has no answer."""
+        self._clock.sleep_until(self._free_at)
+        text = f"{message}{self._settings.write_terminator}"
+        try:
+            self._transport.write(text.encode(self._settings.encoding))
+        except UnicodeEncodeError as error:
+            raise DeviceError(
+                self._device, f"{message!r} cannot be written in {self._settings.encoding}: {error}"
+            ) from None
+        self._free_at = self._clock.now() + self._settings.delay
+
+    def ask(self, question: str, form: Template) -> tuple[str, dict[str, float]]:
+        """Return the answer to a question, and the numbers in it by name.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If no answer comes.
+        DeviceError
+            If the last answer is not of that form, or says that the number is infinite or none.
+        """
+        answer: str | None = None
+        for _ in range(1 + RESENDS):
+            if not self._in_step and not self._catch_up():
+                continue
+            answer = self._exchange(question)
+            numbers = None if answer is None else form.match(answer)
+            if answer is not None and numbers is not None:
+                return answer, numbers
+            self._in_step = False
+        if answer is None:
+            raise DeviceConnectionError(
+                self._device,
+                f"no answer to {question!r} within {self._settings.timeout:g} s at {self._settings.port}, after "
+                f"{1 + RESENDS} requests; check power, cable, address, speed and terminators",
+            )
+        raise DeviceError(
+            self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; is it out of its range?"
+        )
+
+    def errors(self) -> list[str]:
+        """Read the queue of errors until it is empty; return them, oldest first. Empty if there is no such queue."""
+        settings = self._settings
+        found: list[str] = []
+        if not settings.error_query:
+            return found
+        form = template(ANY_TEXT)
+        while len(found) < _MOST_ERRORS:
+            answer, _ = self.ask(settings.error_query, form)
+            if self._is_no_error(answer):
+                return found
+            found.append(answer)
+        return found
+
+    def raise_errors(self, doing: str) -> None:
+        """Raise one `DeviceError` with everything in the queue of errors, if there is anything."""
+        found = self.errors()
+        if found:
+            raise DeviceError(self._device, f"reports after {doing}: {'; '.join(found)}")
+
+    def _is_no_error(self, answer: str) -> bool:
+        if self._settings.no_error:
+            return template(self._settings.no_error).match(answer) is not None
+        numbers = _NO_ERROR.match(answer)
+        return numbers is not None and numbers["value"] == 0.0
+
+    def _exchange(self, question: str) -> str | None:
+        self._transport.discard()
+        self.tell(question)
+        return self._receive()
+
+    def _receive(self) -> str | None:
+        answer = self._transport.read()
+        return None if answer is None else answer.decode(self._settings.encoding, "backslashreplace").strip()
+
+    def _catch_up(self) -> bool:
+        """Return whether the line is in step again, so that no late answer can come any more."""
+        if not any(self._receive() is None for _ in range(_MOST_STRAY)):
+            raise DeviceConnectionError(self._device, f"the line {self._settings.port} does not fall silent")
+        form = template(self._settings.identity)
+        # An identity that is not known cannot be told from a late answer.
+        if self._settings.identity_query and form.text != ANY_TEXT:
+            answer = self._exchange(self._settings.identity_query)
+            while answer is not None and form.match(answer) is None:
+                answer = self._receive()
+            if answer is None:
+                return False
+        self._in_step = True
+        return True

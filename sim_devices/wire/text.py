@@ -1,0 +1,39 @@
+"""Lines of text, as a text instrument sends and takes them."""
+
+from __future__ import annotations
+
+from sim_devices.instruments.scpi import INPUT_OVERRUN, LONGEST_MESSAGE, EmulatedTextInstrument
+from sim_devices.wire import WireServer
+
+
+class TextServer(WireServer):
+    """The line of an emulated text instrument, with the terminators and the encoding of its table."""
+
+    def __init__(self, instrument: EmulatedTextInstrument) -> None:
+        self._instrument = instrument
+        table = instrument.table
+        self._encoding = table.encoding
+        self._end_of_message = table.write_terminator.encode(self._encoding)
+        self._end_of_answer = table.read_terminator.encode(self._encoding)
+        self._received = b""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the host, in pieces of any size; return what the instrument sends."""
+        instrument = self._instrument
+        with instrument.world.lock:
+            *messages, rest = (self._received + data).split(self._end_of_message)
+            if not instrument.answering:
+                self._received = b""
+                return b""
+            instrument.attend()
+            if len(rest) > LONGEST_MESSAGE:
+                instrument.report(INPUT_OVERRUN)
+                rest = b""
+            self._received = rest
+            return b"".join(self._serve(message) for message in messages)
+
+    def _serve(self, message: bytes) -> bytes:
+        answer = self._instrument.obey(message.decode(self._encoding, "replace"))
+        if answer is None:
+            return b""
+        return self._instrument.transmit(answer.encode(self._encoding, "replace") + self._end_of_answer)

@@ -1,0 +1,279 @@
+"""PyMeasure's instruments in a role, against PyMeasure's own protocol tests and the emulated supply on TCP."""
+
+import math
+import socket
+
+import numpy as np
+import pytest
+
+from bench.clock import VirtualClock
+from bench.command_table import ActuatorTable
+from bench.contracts.devices import ActuatorContract
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.rig_file import load_rig
+from drivers.pymeasure import Adapter, InstrumentLine, SensorAdapter, parse_action
+from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
+from sim_devices.wire.text import TextServer
+from sim_devices.world import World
+
+pytest.importorskip("pymeasure")
+
+from pymeasure.instruments.keithley import Keithley2260B
+from pymeasure.test import expected_protocol
+
+TABLE = {
+    "instrument": "pymeasure.instruments.keithley:Keithley2260B",
+    "identity": "EXAMPLE,2260B,{any}",
+    "setup": ["output_enabled = False"],
+    "before_on": ["current_limit = 1.5"],
+    "on": ["output_enabled = True"],
+    "safe": ["voltage_setpoint = 0", "output_enabled = False"],
+    "output": "output_enabled",
+    "setpoint": {"property": "voltage_setpoint", "unit": "V", "limits": [0.0, 30.0], "resolution": 0.001},
+    "signals": {"voltage": {"property": "voltage", "unit": "V"}, "current": {"property": "current", "unit": "A"}},
+}
+
+
+def on_protocol(instrument, kind=Adapter, table=TABLE):
+    """Return the adapter of an instrument that PyMeasure itself has made."""
+    settings = kind.Settings(address="none", **table)
+    return kind("supply", settings, VirtualClock(), InstrumentLine("supply", instrument))
+
+
+def test_what_is_sent_is_what_pymeasure_expects():
+    exchange = [
+        (":SOUR:CURR 1.5", None),
+        (":SOUR:VOLT 12.5", None),
+        (":SOUR:VOLT?", "12.500"),
+        ("OUTPut 1", None),
+        ("OUTPut?", "1"),
+        (":SOUR:VOLT 3", None),
+        (":SOUR:VOLT?", "3.000"),
+        ("OUTPut?", "1"),
+        (":MEAS:VOLT?", "3.001"),
+        (":MEAS:CURR?", "0.25"),
+        ("OUTPut?", "1"),
+        (":SOUR:VOLT 0", None),
+        ("OUTPut 0", None),
+        ("OUTPut?", "0"),
+    ]
+    with expected_protocol(Keithley2260B, exchange) as instrument:
+        supply = on_protocol(instrument)
+        supply.set(12.5).wait()
+        supply.set(3.0).wait()
+        assert supply.setpoint == 3.0
+        assert supply.measure() == {"supply_voltage": 3.001, "supply_current": 0.25}
+        with pytest.raises(LimitError):
+            supply.set(30.1)
+        supply.safe()
+        assert math.isnan(supply.setpoint)
+
+
+@pytest.mark.parametrize(
+    ("exchange", "text"),
+    [
+        ([(":MEAS:VOLT?", "OL")], "voltage is 'OL', expected a number"),
+        ([(":MEAS:VOLT?", "9.9E37")], "voltage is 9.9e[+]37; is it out of its range"),
+        ([(":MEAS:VOLT?", "1,2")], r"voltage is \[1.0, 2.0\], expected a number"),
+    ],
+)
+def test_what_is_no_number_is_an_error(exchange, text):
+    table = {key: TABLE[key] for key in ("instrument", "signals")}
+    with expected_protocol(Keithley2260B, exchange) as instrument:
+        meter = on_protocol(instrument, SensorAdapter, table)
+        with pytest.raises(DeviceError, match=f"supply: {text}"):
+            meter.measure()
+
+
+def test_a_set_point_that_is_not_taken_is_an_error():
+    exchange = [(":SOUR:CURR 1.5", None), (":SOUR:VOLT 12", None), (":SOUR:VOLT?", "5")]
+    with (
+        expected_protocol(Keithley2260B, exchange) as instrument,
+        pytest.raises(DeviceError, match="reads its set-point back as 5 V, not 12 V"),
+    ):
+        on_protocol(instrument).set(12.0)
+
+
+def test_errors_of_the_instrument_are_one_message():
+    exchange = [
+        (":MEAS:VOLT?", "1"),
+        ("SYST:ERR?", '-310,"System error"'),
+        ("SYST:ERR?", '-330,"Self-test failed"'),
+        ("SYST:ERR?", '0,"No error"'),
+    ]
+    table = {"instrument": TABLE["instrument"], "check_errors": True}
+    signals = {"voltage": TABLE["signals"]["voltage"]}
+    with expected_protocol(Keithley2260B, exchange) as instrument:
+        meter = on_protocol(instrument, SensorAdapter, {**table, "signals": signals})
+        with pytest.raises(DeviceError, match=r"after measuring: .*System error.*; .*Self-test failed"):
+            meter.measure()
+
+
+def test_closing_shuts_the_instrument_down_unless_told_otherwise():
+    with expected_protocol(Keithley2260B, [("OUTPut 0", None)]) as instrument:
+        on_protocol(instrument).close()
+    with expected_protocol(Keithley2260B, []) as instrument:
+        on_protocol(instrument, table={**TABLE, "shutdown": False}).close()
+
+
+@pytest.mark.parametrize(
+    "text", ["output_enabled", "a.b = c", "f(x)", "f(); g()", "_x = 1", "f(*[1])", "import os", "="]
+)
+def test_an_action_is_a_call_or_an_assignment_of_literals(text):
+    with pytest.raises(ValueError, match="expected a call such as"):
+        parse_action(text)
+
+
+def test_actions_reach_channels():
+    class Channel:
+        def ramp(self, *values, **options):
+            self.ramped = (values, options)
+
+    class Instrument:
+        ch_1 = Channel()
+
+    parse_action("ch_1.voltage = -2.5")(Instrument)
+    parse_action("ch_1.ramp(1, 'fast', step=0.1)")(Instrument)
+    assert Instrument.ch_1.voltage == -2.5
+    assert Instrument.ch_1.ramped == ((1, "fast"), {"step": 0.1})
+
+
+SUPPLY = ActuatorTable(
+    identity="EXAMPLE,2260B,{any}",
+    error_query="SYST:ERR?",
+    setup=["SOUR:CURR 1.5"],
+    signals={"voltage": {"query": "MEAS:VOLT?", "unit": "V"}, "current": {"query": "MEAS:CURR?", "unit": "A"}},
+    setpoint={"command": "SOUR:VOLT {value:g}", "query": "SOUR:VOLT?", "unit": "V", "limits": [0.0, 30.0]},
+    output={"on": ["OUTPut 1"], "off": ["OUTPut 0"], "query": "OUTPut?"},
+)
+
+
+class Nothing:
+    def advance(self, dt):
+        pass
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def instrument(clock):
+    meters = {"voltage": Meter(lambda: emulated.output), "current": Meter(lambda: 0.1 * emulated.output)}
+    emulated = EmulatedTextInstrument("supply", World(Nothing(), clock), SUPPLY, meters, np.random.default_rng(0))
+    return emulated
+
+
+@pytest.fixture
+def connect(instrument, clock, tcp_port):
+    with tcp_port(TextServer(instrument)) as port:
+        address = f"TCPIP0::127.0.0.1::{port}::SOCKET"
+        options = {"visa_library": "@py", "write_termination": "\n", "timeout": 20_000}
+        settings = Adapter.Settings(address=address, options=options, check_errors=True, **TABLE)
+        yield lambda: Adapter.connect("supply", settings, clock)
+
+
+@pytest.fixture
+def supply(connect):
+    device = connect()
+    yield device
+    device.close()
+
+
+class TestContractOverTCP(ActuatorContract):
+    driven = "voltage"
+
+    @pytest.fixture
+    def device(self, supply):
+        return supply
+
+    @pytest.fixture
+    def effects(self, instrument):
+        return lambda: instrument.output
+
+    @pytest.fixture
+    def identity(self):
+        return "EXAMPLE 2260B, serial number emulated, firmware unknown"
+
+
+def test_an_output_that_goes_off_is_found(supply, instrument):
+    supply.set(5.0)
+    instrument.switch(False)
+    with pytest.raises(DeviceError, match="its output is off although it was switched on"):
+        supply.measure()
+
+
+def test_an_instrument_of_another_kind_is_refused(connect, instrument, monkeypatch):
+    monkeypatch.setitem(instrument._actions, "*IDN?", lambda: "OTHER,METER,1,1")
+    with pytest.raises(DeviceConnectionError, match=r"is 'OTHER,METER,1,1', expected 'EXAMPLE,2260B,\{any\}'"):
+        connect()
+
+
+def test_a_line_that_is_lost_is_a_connection_error(connect):
+    supply = connect()
+    supply._line.instrument.adapter.connection.close()
+    with pytest.raises(DeviceConnectionError, match=r"^supply: reading voltage: "):
+        supply.measure()
+
+
+RIG = """
+[rig]
+title = "one supply"
+
+[devices.supply]
+driver = "pymeasure"
+instrument = "pymeasure.instruments.keithley:Keithley2260B"
+address = "GPIB0::5::INSTR"
+safe = ["output_enabled = False"]
+
+[devices.supply.setpoint]
+property = "voltage_setpoint"
+unit = "V"
+limits = [0.0, 30.0]
+
+[devices.supply.signals.voltage]
+property = "voltage"
+unit = "V"
+"""
+
+WRONG = {
+    "instrument=pymeasure.instruments.keithley:Keithley1": ("instrument = ", "has no attribute 'Keithley1'"),
+    "instrument=pathlib:Path": ("instrument = 'pathlib:Path': is no instrument of PyMeasure",),
+    "setpoint.property=volts": ("setpoint", "'volts': pymeasure.instruments.keithley:Keithley2260B has no such"),
+    "signals.voltage.property=volts": (
+        "signals",
+        "'volts': pymeasure.instruments.keithley:Keithley2260B has no such",
+    ),
+    "signals.voltage.unit=volts-ish": ("signals.voltage.unit", "is no unit"),
+    'safe=["output_enabled"]': ("safe.0 = 'output_enabled'", "expected a call such as"),
+    "safe=[]": ("safe",),
+}
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_a_wrong_key_is_one_message_before_anything_is_opened(change, tmp_path):
+    (tmp_path / "rig.toml").write_text(RIG)
+    key, _, value = change.partition("=")
+    with pytest.raises(ConfigurationError) as raised:
+        load_rig(str(tmp_path / "rig.toml"), {f"devices.supply.{key}": value})
+    assert str(raised.value).startswith(f"{tmp_path / 'rig.toml'}: devices.supply.{WRONG[change][0]}")
+    for part in WRONG[change]:
+        assert part in str(raised.value)
+    assert len(str(raised.value).splitlines()) == 1
+
+
+def test_without_the_library_one_message_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "rig.toml").write_text(RIG)
+    monkeypatch.setattr("drivers.pymeasure.importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'actuator-bench\[pymeasure\]'") as raised:
+        load_rig(str(tmp_path / "rig.toml"))
+    assert len(str(raised.value).splitlines()) == 1
+
+
+def test_an_address_without_an_instrument_is_a_connection_error():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"TCPIP0::127.0.0.1::{listener.getsockname()[1]}::SOCKET"
+    settings = Adapter.Settings(address=address, options={"visa_library": "@py"}, **TABLE)
+    with pytest.raises(DeviceConnectionError, match=r"^supply: (cannot open|reading id)"):
+        Adapter.connect("supply", settings, VirtualClock())
