@@ -498,3 +498,50 @@ class SlcanCanopen(Dialect):
                 raise MalformedError(f"an SDO upload is answered by {answer!r}")
 
         return request, check
+
+
+class Scpi(Dialect):
+    """Messages of SCPI-99 that end with a line feed."""
+
+    def __init__(self, questions, messages):
+        """Take questions and messages that the instrument knows; `{}` stands for a number."""
+        self._questions = questions
+        self._messages = messages
+
+    def _number(self, rng):
+        return rng.choice(
+            ("0", "5", "-1", "11.5", "1e400", "nan", "inf", "9" * 400, "", "12,5", f"{rng.uniform(-20, 20)}")
+        )
+
+    def _one(self, rng):
+        message = rng.choice((*self._questions, *self._messages, *self._messages, "*RST", "*CLS", "*OPC", "*ESE 255"))
+        message = message.replace("{}", self._number(rng))
+        return rng.choice((message, message.lower(), f":{message}", f"  {message} ", message[: rng.randrange(9)]))
+
+    def request(self, rng):
+        return ";".join(self._one(rng) for _ in range(rng.choice((1, 1, 1, 2, 5)))).encode() + b"\n"
+
+    def wild(self, rng):
+        head = self._one(rng).encode()
+        filling = rng.choice((b" ", b"\0", b"9", b";", b"\xff", b"+", b"e", b":", b"VOLT "))
+        return (
+            head
+            + filling * rng.choice((1, 10, 300, 5000))
+            + rng.randbytes(rng.randrange(8)).replace(b"\n", b"")
+            + b"\n"
+        )
+
+    def check(self, answers):
+        *lines, rest = answers.split(b"\n")
+        if rest or not all(line and line.isascii() and line.decode().isprintable() for line in lines):
+            raise MalformedError(f"no lines of text: {answers!r}")
+        return len(lines)
+
+    def probe(self, rng):  # noqa: ARG002
+        request = b"\n*CLS\nSYST:ERR?\n"
+
+        def check(answer):
+            if not answer.endswith(b'0,"No error"\n'):
+                raise MalformedError(f"no error is answered by {answer!r}")
+
+        return request, check

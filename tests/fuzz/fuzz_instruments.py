@@ -18,11 +18,13 @@ import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from dialects import Dynamixel, MalformedError, MeCom, ModbusRtu, ModbusTcp, SlcanCanopen, reads, writes
+from dialects import Dynamixel, MalformedError, MeCom, ModbusRtu, ModbusTcp, Scpi, SlcanCanopen, reads, writes
 
 from bench.clock import VirtualClock
+from bench.rig_file import load_rig
 from rigs.hybrid.laboratory import HybridLaboratory
 from rigs.muscles.laboratory import LOAD, STAGE, SMALaboratory
 from rigs.vo2.laboratory import VO2Laboratory
@@ -31,7 +33,7 @@ from sim_devices.instruments.meerstetter_table import PARAMETERS
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus_tcp import FramingError
 
-MOST_KEPT = 2048
+MOST_KEPT = 4096
 """Bytes of unfinished frames that a server may keep."""
 LONGEST_CALL = 10.0
 """CPU time of one input, s: the longest burst of a T7 takes 16384 conversions of each of 14 inputs."""
@@ -148,6 +150,24 @@ def make(laboratory):
 T7 = ModbusTcp(T7_ADDRESSES, T7_ACTING, reads(55100, 2), bytes.fromhex("00112233"))  # the register TEST
 WITNESS = ModbusTcp(range(8), [reads(0, 4)], reads(0, 4))
 SMA = make(SMALaboratory)
+QUESTIONS = ("MEAS:VOLT?", "MEAS:CURR?", "VOLT?", "VOLT? MAX", "OUTP?", "SYST:ERR?", "*IDN?")
+SUPPLY = Scpi(QUESTIONS, ("VOLT {}", "OUTP ON", "OUTP OFF", "CURR 1.5"))
+METER = Scpi(("READ?", "SYST:ERR?", "*IDN?"), ("CONF:TEMP TC,K",))
+BENCH_SUPPLY = Path(__file__).parents[2] / "examples" / "bench-supply.toml"
+
+
+def make_bench_supply(clock, seed):
+    """Return the laboratory of text instruments of the example."""
+    file = load_rig(str(BENCH_SUPPLY))
+    return file.laboratory(file.laboratory_settings, clock, seed)
+
+
+def check_text_instrument(instrument):
+    for name, value in instrument.measure().items():
+        within(name, value, -1e3, 1e3)
+    within("output", instrument.output, 0.0, 12.0)
+
+
 # By the rig and the port of the instrument in its laboratory.
 TARGETS = {
     "vo2/tec": Target(make(VO2Laboratory), MeCom(), check_tec),
@@ -155,6 +175,8 @@ TARGETS = {
     "hybrid/tec": Target(make(HybridLaboratory), MeCom(), check_tec),
     "hybrid/t7": Target(make(HybridLaboratory), T7, check_t7),
     "hybrid/witness": Target(make(HybridLaboratory), WITNESS, lambda _: None),
+    "bench-supply/supply": Target(make_bench_supply, SUPPLY, check_text_instrument),
+    "bench-supply/meter": Target(make_bench_supply, METER, check_text_instrument),
     "sma/t7": Target(SMA, T7, check_t7, change_load),
     "sma/supply": Target(SMA, SlcanCanopen(), check_supply, change_load),
     "sma/load_cell": Target(SMA, ModbusRtu(DAD_ADDRESSES, DAD_ACTING), check_cell, change_load),

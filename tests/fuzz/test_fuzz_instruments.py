@@ -4,7 +4,7 @@ import random
 
 import pytest
 from dialects import MalformedError
-from fuzz_instruments import SMA, TARGETS, FailedError, fuzz, make, mutated
+from fuzz_instruments import SMA, TARGETS, FailedError, fuzz, make, make_bench_supply, mutated
 
 from bench.clock import VirtualClock
 from rigs.hybrid.laboratory import HybridLaboratory
@@ -29,7 +29,13 @@ def test_the_same_seed_gives_the_same_bytes(name):
 
 
 @pytest.mark.parametrize(
-    ("rig", "laboratory"), [("vo2", make(VO2Laboratory)), ("hybrid", make(HybridLaboratory)), ("sma", SMA)]
+    ("rig", "laboratory"),
+    [
+        ("vo2", make(VO2Laboratory)),
+        ("hybrid", make(HybridLaboratory)),
+        ("sma", SMA),
+        ("bench-supply", make_bench_supply),
+    ],
 )
 def test_every_port_of_a_laboratory_is_fuzzed(rig, laboratory):
     ports = laboratory(VirtualClock(), 0).servers
@@ -91,3 +97,17 @@ def test_a_state_beyond_its_range_is_noticed(monkeypatch):
     monkeypatch.setattr(EmulatedTEC, "attend", attend)
     with pytest.raises(FailedError, match="parameter 2030"):
         fuzz("vo2/tec", 200, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (b"VOLT" + 3000 * b" " + b"5\n", b'0,"No error"\n'),
+        (b"VOLT" + 3000 * b" " + b"x\n", b'-113,"Undefined header"\n'),
+        (b"VOLT" + 9000 * b" " + b"5\n", b'-363,"Input buffer overrun"\n'),
+    ],
+)
+def test_a_long_message_is_taken_or_refused_at_once(message, error):
+    line = make_bench_supply(VirtualClock(), 0).servers["supply"]
+    assert line.receive(message) == b""
+    assert line.receive(b"SYST:ERR?\n") == error
