@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pymodbus.client import ModbusSerialClient
-from pymodbus.client.base import ModbusBaseSyncClient
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
@@ -42,13 +41,13 @@ class PymodbusClient(ModbusClient):
 
     Parameters
     ----------
-    client : pymodbus.client.base.ModbusBaseSyncClient
+    client : pymodbus.client.ModbusTcpClient or pymodbus.client.ModbusSerialClient
         The client; it must not repeat requests.
     unit : int
         Unit identifier or address of the instrument.
     """
 
-    def __init__(self, client: ModbusBaseSyncClient, unit: int) -> None:
+    def __init__(self, client: ModbusTcpClient | ModbusSerialClient, unit: int) -> None:
         self._client = client
         self._unit = unit
 

@@ -146,6 +146,9 @@ class TECLine:
     def _read_answer(self, length: int) -> bytes | None:
         """Read up to the next carriage return, without waiting for more than the shortest answer has."""
         received = self._received
+        if not received:
+            # All of it may be there, as it always is on an emulated line.
+            received += self._port.read_all()
         while (end := received.find(b"\r")) < 0:
             if len(received) < _ACKNOWLEDGE_LENGTH:
                 missing = _ACKNOWLEDGE_LENGTH - len(received)

@@ -9,6 +9,8 @@ from sim_devices.wire import WireServer
 class TextServer(WireServer):
     """The line of an emulated text instrument, with the terminators and the encoding of its table."""
 
+    protocol = "lines of text"
+
     def __init__(self, instrument: EmulatedTextInstrument) -> None:
         self._instrument = instrument
         table = instrument.table
