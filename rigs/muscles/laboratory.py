@@ -25,7 +25,6 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import PlantParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -62,10 +61,6 @@ FaultName = Literal[
 class MusclePlant(Protocol):
     """What frame and instruments need of a muscle."""
 
-    @property
-    def parameters(self) -> PlantParameters:
-        """Its numbers."""
-
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds."""
 
@@ -83,7 +78,7 @@ class MusclePlant(Protocol):
 
     @property
     def parameters(self) -> MuscleParameters:
-        """Numbers of the muscle."""
+        """Its numbers."""
 
     @property
     def current(self) -> float:
