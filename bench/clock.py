@@ -1,7 +1,10 @@
 """The one clock: holds, time stamps, emulated instruments and watchdogs all read it.
 
-Nothing else in the bench reads or spends time. On the virtual clock a hold of 8 s costs only what the
-samples within it cost, and two runs with one seed are equal to the last digit.
+Nothing else in the bench reads or spends time. Where all instruments are emulated in this process, laboratory time
+passes only by `sleep`: on the virtual clock a hold of 8 s costs only what the samples within it cost, and a paced
+clock waits in each sleep until the wall clock has caught up. A busy machine then slows the laboratory down, and no
+emulated watchdog trips because of it; two runs with one seed are equal to the last digit. Real instruments, and
+emulated ones that other processes use, run by themselves: on the wall clock or a scaled one.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from bench.errors import ConfigurationError
@@ -21,6 +25,19 @@ VIRTUAL_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 _LONGEST_NAP = 0.2
 """Longest single wait in seconds, so that a signal to the process is noticed soon."""
 
+_SHORTEST_NAP = 1e-3
+"""Lead in s from which a paced clock waits: shorter naps are inexact, so the sleeps of single bytes are collected."""
+
+_MOST_CATCHING_UP = 0.2
+"""Lateness in s that a paced clock makes up for by running fast; what is beyond is lost."""
+
+SHORTEST_SUSPENSION = 1.0
+"""Suspension of the machine in s from which a wall clock notices it."""
+
+_CLOCK_WITH_SUSPENSION: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
+"""System clock that goes on while the machine is suspended, which `time.monotonic` does not: on Linux its boot time,
+on macOS CLOCK_MONOTONIC. Windows has none that can be read here; there `time.monotonic` itself goes on."""
+
 
 class Clock(ABC):
     """Laboratory time in seconds since the clock was made.
@@ -29,14 +46,14 @@ class Clock(ABC):
     ----------
     epoch : datetime
         Time of day (UTC) at which `now()` was zero.
-    runs_by_itself : bool
-        Whether time passes without `sleep`.
+    sleep_waits : bool
+        Whether `sleep` takes wall-clock time, so that a loop of sleeps lasts until someone acts.
     interrupted : callable
-        Asked during every sleep; when it returns True the sleep ends early.
+        Asked during every sleep that waits; when it returns True the sleep ends early.
     """
 
     epoch: datetime
-    runs_by_itself: bool = True
+    sleep_waits: bool = True
 
     def __init__(self) -> None:
         self.interrupted: Callable[[], bool] = lambda: False
@@ -64,6 +81,10 @@ class Clock(ABC):
         """Let laboratory time pass until `now()` is `instant` (s); an instant in the past returns at once."""
         self.sleep(instant - self.now())
 
+    def suspension(self) -> float:
+        """Return for how many seconds the machine was suspended since the last call; 0 where it cannot matter."""
+        return 0.0
+
     def timestamp(self) -> float:
         """Return the laboratory time as seconds since 1970-01-01 UTC."""
         return self.epoch.timestamp() + self.now()
@@ -73,28 +94,58 @@ class Clock(ABC):
         return self.epoch + timedelta(seconds=self.now())
 
 
-class WallClock(Clock):
-    """Wall-clock time: a second is a second."""
+def _seconds_with_suspension() -> float:
+    return time.monotonic() if _CLOCK_WITH_SUSPENSION is None else time.clock_gettime(_CLOCK_WITH_SUSPENSION)
 
-    def __init__(self) -> None:
+
+class WallClock(Clock):
+    """Wall-clock time: a second is a second. It stands still while the machine is suspended, except on Windows.
+
+    Parameters
+    ----------
+    running, passing : callable, optional
+        Sources of time in s: one that stands still while the machine is suspended, and one that goes on.
+    """
+
+    def __init__(
+        self,
+        running: Callable[[], float] = time.monotonic,
+        passing: Callable[[], float] = _seconds_with_suspension,
+    ) -> None:
         super().__init__()
         self.epoch = datetime.now(UTC)
-        self._start = time.monotonic()
+        self._running = running
+        self._passing = passing
+        self._start = running()
+        self._lag = passing() - self._start
 
     def now(self) -> float:
         """Return seconds since the clock was made."""
-        return time.monotonic() - self._start
+        return self._running() - self._start
 
     def sleep(self, seconds: float) -> None:
         """Wait, in naps short enough for signals to be handled between them."""
         _check_finite(seconds)
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0 and not self.interrupted():
+        end = self._running() + seconds
+        while (left := end - self._running()) > 0 and not self.interrupted():
             time.sleep(min(left, _LONGEST_NAP))
+
+    def suspension(self) -> float:
+        """Return for how many seconds the machine was suspended since the last call, if it was for 1 s or longer."""
+        # In this order: what passes between the two calls makes the lag smaller, and is no suspension.
+        passed = self._passing()
+        lag = passed - self._running()
+        grown = lag - self._lag
+        if grown < SHORTEST_SUSPENSION:
+            return 0.0
+        self._lag = lag
+        return grown
 
 
 class ScaledClock(Clock):
-    """Wall-clock time, `factor` times as fast, for people who watch an emulated rig.
+    """Wall-clock time, `factor` times as fast, for emulated instruments that other processes use.
+
+    It goes on whatever this process does, as their clients wait for nothing else.
 
     Parameters
     ----------
@@ -108,8 +159,7 @@ class ScaledClock(Clock):
     """
 
     def __init__(self, factor: float) -> None:
-        if not (math.isfinite(factor) and factor > 0):
-            raise ValueError(f"factor: expected a positive number, got {factor}")
+        _check_factor(factor)
         super().__init__()
         self.factor = factor
         self._wall = WallClock()
@@ -132,7 +182,7 @@ class VirtualClock(Clock):
     Only one thread should let time pass, the one that carries the run out; any thread may read the time.
     """
 
-    runs_by_itself = False
+    sleep_waits = False
 
     def __init__(self) -> None:
         super().__init__()
@@ -158,6 +208,95 @@ class VirtualClock(Clock):
             self._now = max(self._now, instant)
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How fast a paced clock went.
+
+    Attributes
+    ----------
+    asked : float
+        Laboratory seconds per wall-clock second that were asked for.
+    reached : float
+        Those that were reached.
+    """
+
+    asked: float
+    reached: float
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether at least 90 % of what was asked for was reached."""
+        return self.reached >= 0.9 * self.asked
+
+    def __str__(self) -> str:
+        return f"x{self.asked:g} asked for, x{self.reached:.3g} reached"
+
+
+class PacedClock(VirtualClock):
+    """A virtual clock that waits: after each sleep until the wall clock has caught up, for people who watch.
+
+    Laboratory time passes only by `sleep`, so it never runs ahead of what the process has done: on a busy machine
+    the laboratory slows down instead. Readings are those of the virtual clock. A process that is late makes up for
+    0.2 s of wall-clock time at most.
+
+    Parameters
+    ----------
+    factor : float
+        Laboratory seconds per wall-clock second at most; positive. A process that cannot reach it never waits.
+
+    Raises
+    ------
+    ValueError
+        If `factor` is not a positive finite number.
+    """
+
+    sleep_waits = True
+
+    def __init__(self, factor: float) -> None:
+        _check_factor(factor)
+        super().__init__()
+        self.factor = factor
+        self.epoch = datetime.now(UTC)
+        # Wall-clock instant at which laboratory time would have been zero at this pace.
+        self._origin = time.monotonic()
+        self.restart_pace()
+
+    def restart_pace(self) -> None:
+        """Begin to measure the pace here."""
+        self._pace_since = self._now, time.monotonic()
+
+    def pace(self) -> Pace:
+        """Return the pace since the clock was made or `restart_pace` was called."""
+        laboratory, wall = self._pace_since
+        passed = time.monotonic() - wall
+        return Pace(self.factor, (self._now - laboratory) / passed if passed > 0 else self.factor)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait until the wall clock has caught up with the end of the sleep, then let laboratory time pass."""
+        _check_finite(seconds)
+        if seconds > 0:
+            self._pass_until(self._now + seconds)
+
+    def sleep_until(self, instant: float) -> None:
+        """Wait until the wall clock has caught up with `instant`, then let laboratory time pass up to it exactly."""
+        _check_finite(instant)
+        if instant > self._now:
+            self._pass_until(instant)
+
+    def _pass_until(self, instant: float) -> None:
+        due = self._origin + instant / self.factor
+        while (left := due - time.monotonic()) >= _SHORTEST_NAP:
+            if self.interrupted():
+                # As far as the wall clock is; a loop of interrupted sleeps comes to its end as on the wall clock.
+                reached = (time.monotonic() - self._origin) * self.factor
+                self._now = max(self._now, min(instant, reached))
+                return
+            time.sleep(min(left, _LONGEST_NAP))
+        self._now = instant
+        if -left > _MOST_CATCHING_UP:
+            self._origin -= left + _MOST_CATCHING_UP
+
+
 class Stopwatch:
     """Wall-clock seconds since it was made, to report how long work took; never for control."""
 
@@ -174,13 +313,15 @@ def wall_time() -> datetime:
     return datetime.now(UTC)
 
 
-def make_clock(name: str) -> Clock:
+def make_clock(name: str, *, in_process: bool) -> Clock:
     """Make a clock by its name on the command line.
 
     Parameters
     ----------
     name : {"wall", "virtual", "xN"}
         `x20` is a clock twenty times as fast as the wall clock; N may be any positive number.
+    in_process : bool
+        Whether every instrument is emulated in this process. Then `wall` and `xN` are paced clocks.
 
     Raises
     ------
@@ -188,12 +329,13 @@ def make_clock(name: str) -> Clock:
         If the name is none of these.
     """
     if name == "wall":
-        return WallClock()
+        return PacedClock(1.0) if in_process else WallClock()
     if name == "virtual":
         return VirtualClock()
     if name.startswith("x"):
         try:
-            return ScaledClock(float(name[1:]))
+            factor = float(name[1:])
+            return PacedClock(factor) if in_process else ScaledClock(factor)
         except ValueError:
             pass
     raise ConfigurationError(f"clock {name!r} is unknown; allowed are wall, virtual, and xN such as x20")
@@ -202,3 +344,8 @@ def make_clock(name: str) -> Clock:
 def _check_finite(seconds: float) -> None:
     if not math.isfinite(seconds):
         raise ValueError(f"seconds: expected a finite number, got {seconds}")
+
+
+def _check_factor(factor: float) -> None:
+    if not (math.isfinite(factor) and factor > 0):
+        raise ValueError(f"factor: expected a positive number, got {factor}")

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from bench.clock import Pace, PacedClock
 from bench.control.estimators import DriftEstimator, agility_for
 from bench.control.tracking import Command, Trace
 from bench.devices import Actuator, Status
@@ -87,6 +88,8 @@ class Outcome:
         By device: `safe`, or what went wrong.
     error : Exception or None
         What ended the run, when it was not completed.
+    pace : Pace or None
+        How fast the run went, on a paced clock.
     """
 
     status: str
@@ -95,6 +98,7 @@ class Outcome:
     laboratory_seconds: float
     safe_state: Mapping[str, str]
     error: Exception | None
+    pace: Pace | None = None
 
     @property
     def is_safe(self) -> bool:
@@ -150,6 +154,9 @@ class Engine:
         """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
         start = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
+        if isinstance(self._clock, PacedClock):
+            self._clock.restart_pace()
+        self._clock.suspension()  # what was before the run does not concern it
         error: Exception | None = None
         try:
             self._carry_out(definition, parameters)
@@ -448,6 +455,14 @@ class Engine:
         self._raise_if_aborted()
         self._clock.sleep_until(instant)
         self._raise_if_aborted()
+        if (seconds := self._clock.suspension()) > 0:
+            # The next reading finds what the watchdogs have done meanwhile.
+            self._event(
+                "WARN",
+                "suspended",
+                f"the machine was suspended for {seconds:.0f} s: the set-points stood, nothing was recorded, and "
+                "watchdogs may have switched outputs off",
+            )
 
     def _tick(self) -> dict[str, float]:
         values = self._values(self._rig.glance)
@@ -490,7 +505,7 @@ class Engine:
         asking = threading.Thread(target=lambda: answer.append(ask(question)), name="ask-operator", daemon=True)
         asking.start()
         while asking.is_alive():
-            if self._clock.runs_by_itself:
+            if self._clock.sleep_waits:
                 # Interlocks and watchdogs do not pause.
                 self._sleep_until(self._clock.now() + self._period)
                 self._tick()
@@ -523,19 +538,22 @@ class Engine:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
         finished = self._clock.now()
+        pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
             if error is not None:
                 self._event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)
             for name, state in safe_state.items():
                 ok = state == SAFE
                 self._event("INFO" if ok else "ERROR", "safe-state", f"{name}: {state}")
+            if pace is not None:
+                self._event("INFO", "clock", str(pace))
             self._event("INFO" if error is None else "WARN", "end", status)
             self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
         # A full disk must not hide whether the devices are safe.
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._steps, finished - start, safe_state, error)
+        return Outcome(status, reason, self._steps, finished - start, safe_state, error, pace)
 
 
 def check_before_moving(rig: Rig, definition: ProtocolDefinition, expected: Plan) -> None:

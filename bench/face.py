@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from bench.clock import make_clock
 from bench.errors import BenchError, DeviceError
 from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
@@ -28,7 +27,7 @@ from bench.results.models import IdentifiedFile, InvertedTargets, identify_file,
 from bench.results.models import predict as predict_file
 from bench.results.report import report_run
 from bench.results.run_folder import RunFolder
-from bench.rig import Rig
+from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from bench.safety import SAFE
@@ -49,7 +48,8 @@ def open_rig(
     seed : int
         Seed of all that is random in an emulated laboratory.
     clock : str, optional
-        `wall`, `virtual` or `xN`; `virtual` for an emulated rig if not given, else `wall`.
+        `wall`, `virtual` or `xN`; if not given, `virtual` where all instruments are emulated in this process,
+        else `wall`. There `wall` and `xN` slow down when the process is late, rather than run ahead of it.
     overrides : mapping of str to str, optional
         Values of the rig file to replace, by dotted key.
 
@@ -66,7 +66,7 @@ def open_rig(
         If a device cannot be connected; nothing has moved.
     """
     file = load_rig(str(rig), overrides)
-    return Rig(file, make_clock(clock or ("virtual" if file.emulated else "wall")), seed)
+    return Rig(file, clock_for(file, clock or ("virtual" if file.in_process else "wall")), seed)
 
 
 def run(
@@ -128,7 +128,7 @@ def run(
             folder=Path(out),
             overrides=overrides or {},
             seed=seed,
-            clock=clock or ("virtual" if file.emulated else "wall"),
+            clock=clock or ("virtual" if file.in_process else "wall"),
             live=live,
             recording=recording,
         ),

@@ -24,7 +24,8 @@ Schema, version 2
 `telemetry(tick, t, step, "<signal>", …)`
     One row a tick of a hold: quick readings.
 `events(event, t, level, kind, text)`
-    Phases, notes, pauses, interlocks, errors, safe state; level is `INFO`, `WARN` or `ERROR`.
+    Phases, notes, pauses, suspensions of the machine, interlocks, errors, safe state, the factor that a paced clock
+    reached; level is `INFO`, `WARN` or `ERROR`.
 `models(name, t, model)`
     Model files (JSON) that were identified from this run.
 """
@@ -110,7 +111,8 @@ class Event:
     level : str
         `INFO`, `WARN` or `ERROR`.
     kind : str
-        `phase`, `note`, `pause`, `resume`, `observer`, `interlock`, `error`, `safe-state`, `end`.
+        `phase`, `note`, `pause`, `resume`, `observer`, `suspended`, `interlock`, `error`, `safe-state`, `clock`,
+        `end`.
     text : str
         One sentence.
     """

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from bench.binding import Slots, bind, check_roles
-from bench.clock import Clock
+from bench.clock import Clock, make_clock
 from bench.derived import Derived
 from bench.devices import Actuator, Device, DriverSettings, Signal
 from bench.errors import ConfigurationError, DeviceError
@@ -214,6 +214,17 @@ class Rig:
                     f"{path}: {key} = {signal!r}: there is no such signal; there are: {', '.join(self._by_name)}"
                 )
         check_roles(self.file.roles, self.devices, self._by_name, path)
+
+
+def clock_for(file: RigFile, name: str) -> Clock:
+    """Make the clock of a run on a rig: `wall`, `virtual` or `xN`; see `bench.clock.make_clock`.
+
+    Raises ConfigurationError if there is no such clock, or real devices are asked to follow another than `wall`.
+    """
+    clock = make_clock(name, in_process=file.in_process)
+    if name != "wall" and not file.in_process:
+        raise ConfigurationError(f"rig {file.name} has real devices, which know only the wall clock")
+    return clock
 
 
 def _close(device: Device) -> None:

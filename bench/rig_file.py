@@ -181,6 +181,12 @@ class RigFile:
         """Whether the rig brings its own emulated laboratory."""
         return self.laboratory is not None
 
+    @property
+    def in_process(self) -> bool:
+        """Whether every device is emulated in this process, so that time can stand while the process computes."""
+        ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
+        return self.emulated and all(port.startswith("emulated://") for port in ports)
+
 
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
     """Return the rigs of all installed packages by name, each with the entry that brings it.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from bench.binding import Slots
-from bench.clock import Stopwatch, make_clock, wall_time
+from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
@@ -27,7 +27,7 @@ from bench.extras import MissingExtraError, needed_for
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
-from bench.rig import Rig
+from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
 from bench.terminal import ProgressDisplay, ask_operator
 
@@ -56,7 +56,7 @@ class Run:
     seed : int
         Seed of everything random in an emulated laboratory.
     clock : str
-        `wall`, `virtual` or `xN`.
+        `wall`, `virtual` or `xN`; see `bench.clock.make_clock`.
     folder : Path
         Where the folder of the run is made.
     live : bool
@@ -112,9 +112,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
     """
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
-    clock = make_clock(run.clock)
-    if run.clock != "wall" and any(not _is_emulated(entry.settings) for entry in rig_file.devices):
-        raise ConfigurationError(f"rig {rig_file.name} has real devices, which know only the wall clock")
+    clock = clock_for(rig_file, run.clock)
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
@@ -243,10 +241,6 @@ def _make_folder(parent: Path, name: str) -> Path:
             raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
         return folder
     raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
-
-
-def _is_emulated(settings: Any) -> bool:  # noqa: ANN401 - a driver's own settings
-    return str(getattr(settings, "port", "")).startswith("emulated://")
 
 
 def _operator() -> str:

@@ -61,7 +61,10 @@ class EmulatedLaboratory:
 
 
 def compile_loops(plant: T, use: Callable[[T], object]) -> None:
-    """Use a copy of a plant once, so that its compiled loops are ready before a driver waits for an answer."""
+    """Use a copy of a plant once, so that its compiled loops are ready before a driver waits for an answer.
+
+    `use` does all that the instruments do with it, and advances it by a step of its grid at least.
+    """
     use(copy.deepcopy(plant))
 
 

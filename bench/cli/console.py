@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -38,6 +39,16 @@ def print_error(error: BenchError) -> None:
 def warn(text: str) -> None:
     """Print a warning."""
     error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def show_compilation() -> Iterator[None]:
+    """Say when numerical kernels are compiled, which a first use does for seconds; also a decorator of commands."""
+    # Here, as numba takes half a second to load.
+    from bench.compilation_display import CompilationDisplay
+
+    with CompilationDisplay(console, error_console):
+        yield
 
 
 def print_table(title: str, rows: dict[str, str]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from bench.cli.console import JsonOption, console, parse_numbers, print_rows, warn, write_json
+from bench.cli.console import JsonOption, console, parse_numbers, print_rows, show_compilation, warn, write_json
 from bench.errors import ConfigurationError
 
 app = typer.Typer()
@@ -34,6 +34,7 @@ def _check_figures(folder: Path | None) -> None:
 
 
 @app.command("identify")
+@show_compilation()
 def identify_(
     file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
@@ -123,6 +124,7 @@ def identify_(
 
 
 @app.command("predict")
+@show_compilation()
 def predict_(
     model_path: ModelArgument,
     file: DataArgument,
@@ -168,6 +170,7 @@ def predict_(
 
 
 @app.command("compare")
+@show_compilation()
 def compare_(
     models: Annotated[list[Path], typer.Argument(metavar="A.json B.json", help="Model files.")],
     data: Annotated[
@@ -216,6 +219,7 @@ def compare_(
 
 
 @app.command()
+@show_compilation()
 def design(
     rig: Annotated[
         str | None, typer.Option("--rig", metavar="RIG", help="Rig whose range, plane and dwell are taken.")
@@ -279,6 +283,7 @@ class PolicyOption(Enum):
 
 
 @app.command()
+@show_compilation()
 def invert(
     model_path: ModelArgument,
     file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],

@@ -8,12 +8,13 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, write_json
+from bench.cli.console import JsonOption, console, show_compilation, write_json
 
 app = typer.Typer()
 
 
 @app.command()
+@show_compilation()
 def report(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
     models: Annotated[
@@ -47,6 +48,7 @@ class ExportFormat(StrEnum):
 
 
 @app.command()
+@show_compilation()
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
     format_: Annotated[ExportFormat, typer.Option("--format", help="Format of the files.")],

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from bench import registry
-from bench.cli.console import JsonOption, console, write_json
+from bench.cli.console import JsonOption, console, show_compilation, write_json
 from bench.errors import ConfigurationError
 
 
@@ -40,7 +40,7 @@ class RegisteredCommands(TyperGroup):
                 raise failure
 
             callback.__doc__ = f"Cannot be loaded: {error}"
-        one.command(cmd_name)(callback)
+        one.command(cmd_name)(show_compilation()(callback))
         return typer.main.get_command(one)
 
     def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401

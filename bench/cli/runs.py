@@ -17,6 +17,7 @@ from bench.cli.console import (
     parse_assignments,
     print_error,
     print_table,
+    show_compilation,
     warn,
     write_json,
 )
@@ -110,7 +111,9 @@ def run(
     clock: Annotated[
         str,
         typer.Option(
-            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast, up to about 100)."
+            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast as the wall "
+            "clock). There a process that cannot keep up slows the laboratory down, so that no emulated watchdog "
+            "trips because the machine is busy; the factor reached is recorded, and printed if it is below 90 % of N."
         ),
     ] = "wall",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
@@ -147,19 +150,18 @@ def run(
     from bench.runs import Run, carry_out
     from bench.safety import SAFE
 
-    result = carry_out(
-        Run(
-            protocol=definition,
-            settings=given,
-            rig=rig,
-            overrides=parse_assignments("--override", overrides or []),
-            seed=seed,
-            clock=clock,
-            folder=out,
-            live=live,
-        ),
-        console,
+    asked = Run(
+        protocol=definition,
+        settings=given,
+        rig=rig,
+        overrides=parse_assignments("--override", overrides or []),
+        seed=seed,
+        clock=clock,
+        folder=out,
+        live=live,
     )
+    with show_compilation():
+        result = carry_out(asked, console)
     outcome, ratio = result.outcome, result.time_ratio
     console.print(
         f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time in "
@@ -167,6 +169,8 @@ def run(
         + (f" ({ratio:.0f} times as fast)" if (ratio := result.time_ratio) >= 2 else ""),
         highlight=False,
     )
+    if outcome.pace is not None and not outcome.pace.is_reached:
+        console.print(f"clock: {outcome.pace}", highlight=False)
     console.print(f"record: {result.folder}", highlight=False, soft_wrap=True)
     write_json(
         json_file,

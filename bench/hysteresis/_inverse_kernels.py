@@ -190,8 +190,9 @@ def follow(
     below = memory.borrowed(below)
     left0, height0, present = start
     n = left0.size
-    pieces[0][:n] = left0
-    pieces[1][:n] = height0
+    for p in range(n):
+        pieces[0][p] = left0[p]
+        pieces[1][p] = height0[p]
     k, mass = memory.load(plane, pieces, n, present)
     for t in range(targets.size):
         value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)

@@ -1,5 +1,7 @@
 """Compiled loops over the memory curve. Imported on first use only, because numba is slow to load.
 
+Arrays are copied element by element: for the message of an assignment that does not fit, numba would compile for 3 s.
+
 The on-region of the plane is a staircase of pieces (left edge, height); see `MemoryCurve.staircase`.
 With each diagonal cell completed to a square, the integral of the density over {β < b, α < a} is bilinear
 within a cell: G + y row + x col + density x y, with x, y measured from the cell's lower left node. What the
@@ -217,8 +219,9 @@ def _run(
     low, high = plane[0][0], plane[0][-1]
     left0, height0, present = start
     n = left0.size
-    pieces[0][:n] = left0
-    pieces[1][:n] = height0
+    for p in range(n):
+        pieces[0][p] = left0[p]
+        pieces[1][p] = height0[p]
     k, mass = load(plane, pieces, n, present)
     for t in range(inputs.size):
         raw = inputs[t]
@@ -409,9 +412,10 @@ def swept_differences(
     left0, height0, present = start
     left = np.empty(inputs.size + left0.size + 1)
     height = np.empty(inputs.size + left0.size + 1)
-    left[: left0.size] = left0
-    height[: left0.size] = height0
     n = left0.size
+    for p in range(n):
+        left[p] = left0[p]
+        height[p] = height0[p]
     low, high = axis[0][0], axis[0][-1]
     end = 0
     for t in range(inputs.size):
@@ -466,7 +470,8 @@ def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base
     for t in range(starts.size - 1):
         for e in range(starts[t], starts[t + 1]):
             row[cells[e]] += changes[e]
-        result[t, : base.size] = row
+        for c in range(base.size):
+            result[t, c] = row[c]
 
 
 @njit(cache=True)

@@ -82,7 +82,7 @@ class HybridLaboratorySettings(LaboratorySettings):
 
 
 def _use(plant: HybridCantilever) -> float:
-    plant.advance(1e-3)
+    plant.advance(plant.parameters.step)
     plant.apply(1.0)
     return plant.deflection
 

@@ -24,6 +24,7 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.laboratory import EmulatedLaboratory, Event, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.grid import PlantParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.magnet import RatiometricSensor
@@ -58,6 +59,10 @@ FaultName = Literal[
 
 class MusclePlant(Protocol):
     """What frame and instruments need of a muscle."""
+
+    @property
+    def parameters(self) -> PlantParameters:
+        """Its numbers."""
 
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds."""
@@ -153,6 +158,11 @@ class Frame:
         self.muscle.advance(dt)
 
 
+def _use(muscle: MusclePlant) -> tuple[float, float]:
+    muscle.advance(muscle.parameters.step)
+    return muscle.position, muscle.force
+
+
 class MuscleLaboratory(EmulatedLaboratory):
     """A laboratory with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
@@ -175,7 +185,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
         self.muscle = settings.make_muscle(plant)
-        compile_loops(self.muscle, lambda muscle: muscle.advance(1e-3))
+        compile_loops(self.muscle, _use)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
         self._cell_is_broken = False

@@ -60,7 +60,7 @@ class VO2Laboratory(EmulatedLaboratory):
         if not settings.disturbances:
             specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
         self.plant = VO2Cantilever(specimen, plant_stream)
-        compile_loops(self.plant, lambda plant: plant.advance(1e-3))
+        compile_loops(self.plant, lambda plant: plant.advance(plant.parameters.step))
         self.world = World(self.plant, clock)
         self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
         detector = NormalisedPSD(

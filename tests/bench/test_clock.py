@@ -7,12 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.clock import VIRTUAL_EPOCH, ScaledClock, Stopwatch, VirtualClock, WallClock, make_clock, wall_time
+from bench.clock import (
+    VIRTUAL_EPOCH,
+    Pace,
+    PacedClock,
+    ScaledClock,
+    Stopwatch,
+    VirtualClock,
+    WallClock,
+    make_clock,
+    wall_time,
+)
 from bench.errors import ConfigurationError
 
 
 def every_clock():
-    return [VirtualClock(), ScaledClock(1000.0), WallClock()]
+    return [VirtualClock(), PacedClock(1000.0), ScaledClock(1000.0), WallClock()]
 
 
 @pytest.mark.parametrize("clock", every_clock(), ids=lambda clock: type(clock).__name__)
@@ -80,10 +90,8 @@ class TestVirtualClock:
             clock.sleep_until(instant)
         assert clock.now() == max(instants)
 
-    def test_does_not_run_by_itself(self):
-        assert not VirtualClock.runs_by_itself
-        assert WallClock.runs_by_itself
-        assert ScaledClock.runs_by_itself
+    def test_is_the_only_one_whose_sleep_does_not_wait(self):
+        assert [clock.sleep_waits for clock in every_clock()] == [False, True, True, True]
 
     def test_any_thread_may_read_while_one_lets_time_pass(self):
         clock = VirtualClock()
@@ -103,7 +111,9 @@ class TestVirtualClock:
         assert clock.now() == 5000.0
 
 
-@pytest.mark.parametrize("make", [WallClock, lambda: ScaledClock(2.0)], ids=["wall", "scaled"])
+@pytest.mark.parametrize(
+    "make", [WallClock, lambda: PacedClock(2.0), lambda: ScaledClock(2.0)], ids=["wall", "paced", "scaled"]
+)
 class TestInterruptedSleep:
     def test_does_not_begin_when_interrupted_before(self, make):
         clock = make()
@@ -122,7 +132,7 @@ class TestInterruptedSleep:
 
         clock.interrupted = interrupted
         clock.sleep(3600.0)
-        assert len(asked) == 2
+        assert len(asked) >= 2
         assert clock.now() < 60.0
 
     def test_a_signal_ends_it_soon(self, make):
@@ -153,19 +163,143 @@ class TestScaledClock:
         assert watch.seconds() < 30.0
 
 
+def compute(seconds):
+    """Keep the processor busy for some wall-clock seconds."""
+    watch = Stopwatch()
+    while watch.seconds() < seconds:
+        pass
+
+
+class TestPacedClock:
+    @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+    def test_refuses_a_factor_that_is_not_positive(self, factor):
+        with pytest.raises(ValueError, match="factor: expected a positive number"):
+            PacedClock(factor)
+
+    def test_time_passes_only_by_sleep(self):
+        clock = PacedClock(1e6)
+        compute(0.05)
+        assert clock.now() == 0.0
+        clock.sleep(3.0)
+        compute(0.05)
+        assert clock.now() == 3.0
+
+    def test_waits_for_the_wall_clock(self):
+        clock, watch = PacedClock(100.0), Stopwatch()
+        for tick in range(1, 31):
+            clock.sleep_until(float(tick))
+            assert watch.seconds() >= tick / 100.0 - 2e-3
+        assert clock.now() == 30.0
+
+    def test_collects_short_sleeps(self):
+        """A nap for each of them would take at least 50 microseconds."""
+        clock, naps = PacedClock(1000.0), []
+        clock.interrupted = lambda: naps.append(clock.now())
+        for _ in range(10_000):
+            clock.sleep(1e-3)
+        assert clock.now() == pytest.approx(10.0)
+        assert len(naps) < 100
+
+    def test_stands_at_the_instants_of_the_virtual_clock(self):
+        paced, virtual = PacedClock(1e4), VirtualClock()
+        for tick in range(1, 2001):
+            for clock in (paced, virtual):
+                clock.sleep(1e-3)
+                clock.sleep_until(tick * 0.1)
+            assert paced.now() == virtual.now()
+
+    def test_makes_up_for_little_of_what_is_lost(self):
+        clock = PacedClock(10.0)
+        compute(1.2)
+        # It catches up with 0.2 s, which are 2 s here, and then waits again.
+        watch = Stopwatch()
+        clock.sleep(1e-6)
+        clock.sleep(6.0)
+        assert watch.seconds() >= 0.35
+        assert clock.pace().reached < 5.0
+
+    def test_reports_the_pace_that_was_reached(self):
+        clock = PacedClock(1e9)
+        clock.sleep(1.0)
+        compute(0.05)
+        pace = clock.pace()
+        assert pace.asked == 1e9
+        assert 0.0 < pace.reached <= 20.0
+        assert not pace.is_reached
+        assert str(Pace(100.0, 37.04)) == "x100 asked for, x37 reached"
+        clock.restart_pace()
+        compute(0.01)
+        assert clock.pace().reached == 0.0
+
+    def test_a_pace_of_90_per_cent_is_reached(self):
+        assert Pace(100.0, 90.0).is_reached
+        assert not Pace(100.0, 89.9).is_reached
+
+    def test_a_loop_of_interrupted_sleeps_comes_to_its_end(self):
+        clock = PacedClock(10.0)
+        clock.interrupted = lambda: True
+        while clock.now() < 1.0:
+            clock.sleep(0.5)
+        assert clock.now() < 60.0
+
+
+class TestSuspension:
+    def times(self):
+        class Times:
+            running = 100.0
+            passing = 5000.0
+
+            def go(self, seconds, suspended=0.0):
+                self.running += seconds
+                self.passing += seconds + suspended
+
+        times = Times()
+        return times, WallClock(lambda: times.running, lambda: times.passing)
+
+    def test_is_noticed_once(self):
+        times, clock = self.times()
+        times.go(10.0)
+        assert clock.suspension() == 0.0
+        times.go(10.0, suspended=3600.0)
+        assert clock.suspension() == pytest.approx(3600.0)
+        times.go(10.0)
+        assert clock.suspension() == 0.0
+        assert clock.now() == pytest.approx(30.0)
+
+    def test_below_a_second_is_none(self):
+        times, clock = self.times()
+        times.go(1.0, suspended=0.9)
+        assert clock.suspension() == 0.0
+        times.go(1.0, suspended=0.2)
+        assert clock.suspension() == pytest.approx(1.1)
+
+    def test_there_was_none_while_this_test_ran(self):
+        clock = WallClock()
+        clock.sleep(0.01)
+        assert clock.suspension() == 0.0
+
+    def test_of_a_clock_in_process_cannot_matter(self):
+        assert PacedClock(1.0).suspension() == VirtualClock().suspension() == 0.0
+
+
 class TestMakeClock:
     def test_by_name(self):
-        assert isinstance(make_clock("wall"), WallClock)
-        assert isinstance(make_clock("virtual"), VirtualClock)
-        fast = make_clock("x20")
+        assert isinstance(make_clock("wall", in_process=False), WallClock)
+        fast = make_clock("x20", in_process=False)
         assert isinstance(fast, ScaledClock)
         assert fast.factor == 20.0
-        assert make_clock("x0.5").factor == 0.5
+
+    def test_in_process_by_name(self):
+        assert type(make_clock("virtual", in_process=True)) is VirtualClock
+        for name, factor in {"wall": 1.0, "x20": 20.0, "x0.5": 0.5}.items():
+            clock = make_clock(name, in_process=True)
+            assert isinstance(clock, PacedClock)
+            assert clock.factor == factor
 
     @pytest.mark.parametrize("name", ["", "x", "x0", "x-3", "xnan", "xinf", "20", "Virtual", "real", "xx2"])
     def test_names_what_is_allowed(self, name):
         with pytest.raises(ConfigurationError) as caught:
-            make_clock(name)
+            make_clock(name, in_process=True)
         assert repr(name) in str(caught.value)
         assert "wall, virtual, and xN" in str(caught.value)
         assert caught.value.exit_code == 2

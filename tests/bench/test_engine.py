@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
-from bench.clock import ScaledClock, VirtualClock
+from bench.clock import PacedClock, VirtualClock, WallClock
 from bench.control.tracking import Command, Trace
 from bench.engine import ABORT, RESUME, Engine, check_before_moving
 from bench.errors import (
@@ -877,7 +877,7 @@ class TestInterrupted:
             done.wait(60.0)
             return RESUME
 
-        self.b = b = bench(ask=ask, clock=ScaledClock(50.0))
+        self.b = b = bench(ask=ask, clock=PacedClock(50.0))
         outcome = b.run(self.request(pause_requested=True))
         done.set()
         assert isinstance(outcome.error, InterlockError)
@@ -896,9 +896,48 @@ class TestInterrupted:
             enough.wait(60.0)
             return RESUME
 
-        self.b = b = bench(ask=ask, clock=ScaledClock(50.0), observers=[Counting()])
+        self.b = b = bench(ask=ask, clock=PacedClock(50.0), observers=[Counting()])
         assert b.run(self.request(pause_requested=True)).status == "completed"
         assert len([tick for tick in b.watcher.ticks if tick[1] == 1]) > 3
+
+    def test_the_pace_of_a_paced_clock_is_recorded(self, bench):
+        self.b = b = bench(clock=PacedClock(1e9))
+        outcome = b.run(stairs)
+        assert outcome.pace.asked == 1e9
+        assert not outcome.pace.is_reached
+        with b.record() as run:
+            (event,) = (event for event in run.events() if event.kind == "clock")
+            assert event.level == "INFO"
+            assert event.text == str(outcome.pace)
+
+    def test_a_run_at_the_pace_of_the_virtual_clock_reads_the_same(self, bench):
+        values = []
+        for clock in (VirtualClock(), PacedClock(200.0)):
+            b = bench(clock=clock)
+            assert b.run(stairs).status == "completed"
+            with b.record() as run:
+                values.append([run.steps().columns, run.telemetry().columns])
+        for table, other in zip(*values, strict=True):
+            for name, column in table.items():
+                assert np.array_equal(column, other[name], equal_nan=True), name
+
+    def test_a_suspension_of_the_machine_is_recorded(self, bench):
+        suspended = [0.0]
+        wall = WallClock()
+        clock = WallClock(wall.now, lambda: wall.now() + suspended[0])
+
+        def sleeper(parameters):
+            yield Step({"tec": 30.0}, Dwell(0.05))
+            suspended[0] = 3600.0
+            yield Step({"tec": 31.0}, Dwell(0.05))
+            yield Step({"tec": 32.0}, Dwell(0.05))
+
+        self.b = b = bench(clock=clock)
+        assert b.run(define(sleeper)).status == "completed"
+        with b.record() as run:
+            (event,) = (event for event in run.events() if event.kind == "suspended")
+            assert event.level == "WARN"
+            assert "suspended for 3600 s" in event.text
 
     def test_the_clock_is_left_as_it_was(self, bench):
         self.b = b = bench()

@@ -1,6 +1,5 @@
 """The laboratories of the muscles: the operator, the faults, the ports, and noise that nobody else disturbs."""
 
-import socket
 from contextlib import closing
 
 import numpy as np
@@ -254,31 +253,41 @@ class TestPorts:
         bench = laboratory()
         for _ in range(2):
             ports = bench.open()
-            assert set(ports) == {*PORTS, "t7"}
-            host, port = ports["t7"].removeprefix("tcp://").split(":")
-            socket.create_connection((host, int(port))).close()
+            assert ports == {name: f"emulated://{name}" for name in (*PORTS, "t7")}
+            for port in ports.values():
+                serial.serial_for_url(port).close()
             bench.close()
-            with pytest.raises(ConnectionRefusedError):
-                socket.create_connection((host, int(port)))
-            for name in PORTS:
+            for port in ports.values():
                 with pytest.raises(serial.SerialException, match="there are: none"):
-                    serial.serial_for_url(ports[name])
+                    serial.serial_for_url(port)
 
     def test_closing_what_was_never_opened_does_no_harm(self):
         with rig() as bench:
             laboratory().close()
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
 
-    def test_a_second_one_does_not_take_the_ports_of_the_first(self):
+    def test_a_second_one_has_ports_of_its_own(self):
         with rig(seed=1) as bench:
             second = laboratory(seed=2)
-            with pytest.raises(ValueError, match="emulated://supply is taken"):
-                second.open()
+            ports = second.open()
+            assert ports == {name: f"emulated://{name}-2" for name in (*PORTS, "t7")}
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
             second.close()
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
         with rig(seed=2) as bench:
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
+
+    def test_two_in_one_process_do_not_disturb_each_other(self):
+        with rig(seed=1) as first, rig(seed=2) as second:
+            first.laboratory.operate(LOAD, 2.0)
+            second.devices["supply"].set(1.0)
+            for bench in (first, second):
+                bench.clock.sleep_until(5.0)
+            ours, theirs = first.glance(), second.glance()
+            assert ours["load_cell_force"] == pytest.approx(2.0, abs=0.5)
+            assert theirs["load_cell_force"] == pytest.approx(0.0, abs=0.5)
+            assert ours["supply_voltage"] == 0.0
+            assert theirs["supply_voltage"] == pytest.approx(1.0, abs=0.1)
 
 
 class TestNoise:

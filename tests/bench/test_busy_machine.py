@@ -1,0 +1,161 @@
+"""Runs on an emulated rig do not depend on how busy the machine is.
+
+`python tests/bench/test_busy_machine.py --runs 50 --busy 16`, or `make busy`, carries many virtual runs out beside
+many busy processes, compares their journals bit by bit, and shows the pace of a run at x100. The tests do less.
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bench.journal import Record
+
+SHORT = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=8"]
+
+
+def _work():
+    x = 0.5
+    while True:
+        x = math.cos(x)
+
+
+@contextmanager
+def busy(processes):
+    """Keep the processors busy."""
+    loops = [multiprocessing.get_context("spawn").Process(target=_work, daemon=True) for _ in range(processes)]
+    for loop in loops:
+        loop.start()
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.join()
+
+
+def run(rig, clock, folder, cache=None):
+    """Carry a short run out in a process of its own; return the folder of its record and what it printed."""
+    folder.mkdir(parents=True)
+    command = ["run", "creep", "--rig", rig, "--clock", clock, *SHORT, "--seed", "3", "--out", str(folder)]
+    result = subprocess.run(
+        [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        env=os.environ | ({"NUMBA_CACHE_DIR": str(cache)} if cache else {}),
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    (record,) = folder.iterdir()
+    return record, result.stdout, result.stderr
+
+
+def fingerprint(folder):
+    """Return a hash of every bit of the readings and set-points of a run, and of their times."""
+    digest = hashlib.sha256()
+    with Record(folder) as record:
+        assert record.status == "completed"
+        for table in (record.steps(), record.telemetry()):
+            assert len(table) > 0
+            for name, column in table.columns.items():
+                digest.update(name.encode() + column.tobytes())
+        for step in record.step_records():
+            digest.update(json.dumps(dict(step.setpoints)).encode() + struct.pack("<dd", step.started, step.finished))
+    return digest.hexdigest()
+
+
+@pytest.mark.slow
+class TestBusyMachine:
+    def test_virtual_runs_are_equal_to_the_last_bit(self, tmp_path):
+        """The first of them compiles, in the middle of the load."""
+        with busy(4):
+            prints = {fingerprint(run("vo2", "virtual", tmp_path / str(n), tmp_path / "cache")[0]) for n in range(2)}
+        alone, _, _ = run("vo2", "virtual", tmp_path / "alone")
+        assert prints == {fingerprint(alone)}
+
+    def test_a_scaled_clock_slows_down_and_says_so(self, tmp_path):
+        with busy(4):
+            folder, out, _ = run("vo2", "x100000", tmp_path / "runs")
+        assert "clock: x100000 asked for, x" in out.replace("1e+05", "100000")
+        with Record(folder) as record:
+            (event,) = (event for event in record.events() if event.kind == "clock")
+            assert event.text.endswith("reached")
+
+    def test_a_first_use_says_that_it_compiles(self, tmp_path):
+        message = "compiling the numerical kernels (once on this machine)"
+        printed = [run("vo2", "virtual", tmp_path / str(n), tmp_path / "cache")[2] for n in range(2)]
+        assert [text.count(message) for text in printed] == [1, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["vo2", "sma", "mckibben", "coiled-polymer", "hybrid"])
+def test_an_open_laboratory_has_compiled_its_loops(rig, tmp_path):
+    """Otherwise a driver would wait for an answer while its instrument compiles."""
+    script = f"""
+import bench
+from numba.core import event
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        raise AssertionError("compiled after opening: " + str(event.data["dispatcher"]))
+    def on_end(self, event):
+        pass
+
+with bench.open_rig({rig!r}) as rig:
+    event.register("numba:compile", Listener())
+    for actuator in rig.actuators.values():
+        limits = actuator.limits
+        actuator.set(limits.high if limits.high == 1.0 else limits.low + 0.6 * (limits.high - limits.low))
+    for _ in range(5):
+        rig.clock.sleep(0.5)
+        rig.glance()
+    rig.measure()
+print("done")
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        check=False,
+    )
+    assert result.stdout == "done\n", result.stderr
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rig", default="vo2")
+    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--busy", type=int, default=16, help="busy processes")
+    parser.add_argument("--clock", default="x100", help="clock of the last run")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        first = None
+        with busy(arguments.busy):
+            for n in range(arguments.runs):
+                found = fingerprint(run(arguments.rig, "virtual", Path(folder, str(n)))[0])
+                first = first or found
+                print(f"run {n + 1} of {arguments.runs}: {found[:16]}", flush=True)
+                if found != first:
+                    sys.exit("the runs differ")
+            record, _, _ = run(arguments.rig, arguments.clock, Path(folder, "paced"))
+        with Record(record) as journal:
+            print("clock:", next(event.text for event in journal.events() if event.kind == "clock"))
+    print(f"{arguments.runs} runs beside {arguments.busy} busy processes are equal to the last bit")
+
+
+if __name__ == "__main__":
+    main()
