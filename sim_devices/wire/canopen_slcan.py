@@ -92,7 +92,7 @@ class CanopenSlcanServer(WireServer):
         """Return when the node next sends something by itself, s; infinity while nothing passes."""
         device = self._device
         with device.world.lock:
-            if not (self._on_the_bus() and device.plugged_in):
+            if not self._on_the_bus():
                 return math.inf
             return device.next_message()
 

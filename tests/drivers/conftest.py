@@ -1,4 +1,4 @@
-"""What the tests of several drivers share."""
+"""What the tests of several drivers share: the class `Script` of a module at its `PORT`, and a TCP port."""
 
 import socket
 import threading
