@@ -14,8 +14,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from bench.clock import Pace, PacedClock
 from bench.control.estimators import DriftEstimator, agility_for
+from bench.control.loops import BlockController, Floats, SampledController
 from bench.control.tracking import Command, Trace
 from bench.devices import Actuator, Status
 from bench.errors import (
@@ -264,6 +267,9 @@ class Engine:
             self._trace = _NOT_AT_WORK
 
     def _fixed_rate(self, message: FixedRate) -> Reading:
+        if message.block:
+            return self._blocks(message)
+        assert isinstance(message.controller, SampledController)
         self._check_signals(*message.inputs, *message.watched)
         actuators = [self._actuator(name) for name in message.actuators]
         setpoints = [f"{name}_setpoint" for name in message.actuators]
@@ -323,11 +329,104 @@ class Engine:
                 k = min(samples, max(k + 1, math.floor((self._clock.now() - start) / period)))
         finally:
             self._trace = _NOT_AT_WORK
+        return self._finish_loop(message, started, taken, (lateness, latest), commands)
+
+    def _blocks(self, message: FixedRate) -> Reading:
+        """Carry a fixed rate out block by block; see `FixedRate.block`."""
+        self._check_signals(*message.inputs, *message.watched)
+        actuators = [self._actuator(name) for name in message.actuators]
+        setpoints = [f"{name}_setpoint" for name in message.actuators]
+        signals = (*message.inputs, *message.watched)
+        period, samples = 1.0 / message.rate, max(1, round(message.duration * message.rate))
+        controller = message.controller
+        assert isinstance(controller, BlockController)
+        if message.block * period > self._period:
+            raise ConfigurationError(
+                f"a block of {message.block} samples takes {message.block * period:g} s; interlocks wait for its "
+                f"end, so {self._period:g} s, the telemetry period, is allowed at most"
+            )
+        play = self._rig.block_player(signals, message.actuators, period)
+        started = self._clock.now()
+        values = self._tick()
+        start = self._clock.now()
+        next_tick = start + self._period
+        readings: Floats = np.empty((0, len(signals)))
+        k = taken = 0
+        lateness = latest = 0.0
+        try:
+            while True:
+                due = start + k * period
+                self._sleep_until(due)
+                if k == samples:
+                    break
+                now = self._clock.now()
+                count = min(message.block, samples - k)
+                out = np.full((count, len(actuators)), math.nan)
+                times: Floats = np.arange(k, k + count) * period
+                controller.step_block(times, readings[:, : len(message.inputs)], out)
+                self._check_block(message, actuators, out)
+                late = now - due
+                readings = play(out) if play is not None else self._sampled(signals, actuators, out, start + times)
+                lateness, latest = lateness + count * late, max(latest, late)
+                self._trace = _traced(controller.trace)
+                for each in range(-taken % message.record_every, count, message.record_every):
+                    values.update(self._trace)
+                    values.update(zip(signals, readings[each].tolist(), strict=True))
+                    values.update(zip(setpoints, out[each].tolist(), strict=True))
+                    values[LATENESS.name] = late
+                    self._record_tick(float(start + times[each]) + late, values)
+                taken += count
+                now = self._clock.now()
+                if now >= next_tick:
+                    values = self._values(self._rig.glance)
+                    self._watch.check(now, values)
+                    next_tick = self._tick_after(next_tick)
+                k = min(samples, max(k + count, math.floor((now - start) / period)))
+        finally:
+            self._trace = _NOT_AT_WORK
+        return self._finish_loop(message, started, taken, (lateness, latest), out[-1].tolist())
+
+    def _check_block(self, message: FixedRate, actuators: Sequence[Actuator], out: Floats) -> None:
+        """Raise `LimitError` unless all set-points of a block are allowed; none has been sent then."""
+        limits = message.limits or [(actuator.limits.low, actuator.limits.high) for actuator in actuators]
+        for actuator, (low, high), column in zip(actuators, limits, out.T, strict=True):
+            wrong = column[~((low <= column) & (column <= high))]
+            if wrong.size:
+                raise LimitError(actuator.name, f"the controller asked for {wrong[0]:g}, beyond {low:g} to {high:g}")
+            for extreme in (column.min(), column.max()):
+                actuator.check(float(extreme))
+
+    def _sampled(
+        self, signals: Sequence[str], actuators: Sequence[Actuator], out: Floats, instants: Floats
+    ) -> Floats:
+        """Take the samples of a block one by one, as an instrument does that can by itself."""
+        read = self._rig.quick_reader(signals)
+        rows = []
+        for instant, commands in zip(instants.tolist(), out.tolist(), strict=True):
+            self._sleep_until(instant)
+            values = read()
+            rows.append([values[name] for name in signals])
+            for actuator, command in zip(actuators, commands, strict=True):
+                if command != actuator.setpoint:
+                    actuator.set(command)
+        return np.array(rows).reshape(len(out), len(signals))
+
+    def _finish_loop(
+        self,
+        message: FixedRate,
+        started: float,
+        taken: int,
+        lateness: tuple[float, float],
+        commands: Sequence[float],
+    ) -> Reading:
+        """Tell how a loop went, of which the sum and the largest of all lateness are known, and take the reading."""
+        samples = max(1, round(message.duration * message.rate))
+        total, latest = lateness
         self._event(
             "INFO",
             "loop",
             f"{taken} samples at {message.rate:g} Hz, {samples - taken} left out; late by "
-            f"{1e3 * lateness / taken:.3g} ms on average, {1e3 * latest:.3g} ms at most",
+            f"{1e3 * total / taken:.3g} ms on average, {1e3 * latest:.3g} ms at most",
         )
         values = self._values(self._rig.measure)
         self._watch.check(self._clock.now(), values)

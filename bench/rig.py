@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -15,6 +16,7 @@ from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
 from bench.protocol.parameters import ProtocolDefinition
 from bench.rig_file import DeviceEntry, Laboratory, RigFile
+from bench.roles import BlockPlayer, Floats
 from bench.safety import SAFE, make_safe
 
 
@@ -126,6 +128,23 @@ class Rig:
 
         return read
 
+    def block_player(
+        self, inputs: Sequence[str], actuators: Sequence[str], period: float
+    ) -> Callable[[Floats], Floats] | None:
+        """Return what has an instrument carry out blocks of samples by itself; None if none can.
+
+        It takes and returns what `bench.roles.BlockPlayer.play` does, of signals and actuators in their order.
+        """
+        if len(actuators) != 1:
+            return None
+        player = self.devices[actuators[0]]
+        if not isinstance(player, BlockPlayer):
+            return None
+        for sensor in self.devices.values():
+            if tuple(signal.name for signal in sensor.signals) == tuple(inputs) and player.can_play(sensor, period):
+                return partial(_play, player, sensor, period)
+        return None
+
     def _sources(self, wanted: Collection[str]) -> set[str]:
         """Return signals, and those that the derived ones among them come from."""
         sources = {*wanted}
@@ -225,6 +244,10 @@ def clock_for(file: RigFile, name: str) -> Clock:
     if name != "wall" and not file.in_process:
         raise ConfigurationError(f"rig {file.name} has real devices, which know only the wall clock")
     return clock
+
+
+def _play(player: BlockPlayer, sensor: Device, period: float, setpoints: Floats) -> Floats:
+    return player.play(setpoints[:, 0], period, sensor)
 
 
 def _close(device: Device) -> None:

@@ -11,10 +11,16 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bench.clock import Clock
 from bench.devices import Actuator, Device, Identity, Limits, Signal, Status
 from bench.errors import LimitError
+
+Floats = NDArray[np.float64]
 
 
 class TECMode(Enum):
@@ -93,6 +99,39 @@ class VoltageSupply(Actuator):
     def setpoint_signal(self) -> Signal:
         """The voltage asked for."""
         return Signal(f"{self.name}_setpoint", "V", f"{self.output} voltage set-point", 3)
+
+
+@runtime_checkable
+class BlockPlayer(Protocol):
+    """An actuator whose instrument carries out blocks of samples by itself: read a sensor, send a set-point, wait."""
+
+    def can_play(self, sensor: Device, period: float) -> bool:
+        """Return whether `play` takes this sensor, and this time between two samples in s."""
+
+    def play(self, setpoints: Floats, period: float, sensor: Device) -> Floats:
+        """Carry a block out, from now on; returns after its last set-point.
+
+        Parameters
+        ----------
+        setpoints : numpy.ndarray
+            One for each sample, in the unit of the actuator's limits.
+        period : float
+            Time between two samples, s.
+        sensor : Device
+            Read in each sample before the set-point is sent.
+
+        Returns
+        -------
+        numpy.ndarray
+            What `sensor.glance` would have returned: a row for each sample, a column for each signal.
+
+        Raises
+        ------
+        LimitError
+            If a set-point is not allowed; nothing is sent.
+        DeviceError
+            If a device refuses or a reading is not valid.
+        """
 
 
 class LoadCell(Device):

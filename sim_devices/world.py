@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -52,7 +52,7 @@ class World:
         self.lock = threading.RLock()
         self._plant = plant
         self._time = clock.now()
-        self._timed: list[Timed] = []
+        self._timed: list[tuple[Callable[[], float], Timed]] = []
         self._advancing = False
 
     @property
@@ -62,7 +62,7 @@ class World:
 
     def add(self, timed: Timed) -> None:
         """Keep the deadlines of an instrument."""
-        self._timed.append(timed)
+        self._timed.append((timed.deadline, timed))
 
     @contextmanager
     def at_present(self) -> Iterator[None]:
@@ -87,10 +87,10 @@ class World:
         while True:
             # A plain loop: this is asked some ten times for each sample of a fast loop.
             due, first = math.inf, None
-            for timed in self._timed:
-                deadline = timed.deadline()
-                if deadline < due:
-                    due, first = deadline, timed
+            for deadline, timed in self._timed:
+                instant = deadline()
+                if instant < due:
+                    due, first = instant, timed
             if first is None or due > target:
                 break
             self._advance_plant(max(due, self._time))

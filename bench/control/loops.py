@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bench.control.tracking import Command, Follower, Trace
+
+Floats = NDArray[np.float64]
 
 SHORTEST_WAIT = 1e-3
 """Least time between two commands of a loop that is late, s."""
@@ -29,6 +34,7 @@ class ControlTask(Protocol):
         """Internal values at present."""
 
 
+@runtime_checkable
 class SampledController(Protocol):
     """A controller of one or several actuators that is called at a fixed rate."""
 
@@ -43,8 +49,32 @@ class SampledController(Protocol):
         """Internal values at present."""
 
 
+@runtime_checkable
+class BlockController(Protocol):
+    """A controller of one or several actuators that steps a block of samples in one call, such as a compiled one."""
+
+    def step_block(self, times: Floats, readings: Floats, out: Floats) -> None:
+        """Write the set-points of the next block, from the readings of the last one.
+
+        A reading acts on the set-points one to two blocks later: the delay of a loop that is closed this way.
+
+        Parameters
+        ----------
+        times : numpy.ndarray
+            Instants of the samples of the next block, s from the beginning of the loop.
+        readings : numpy.ndarray
+            Readings of the last block, a row for each sample and a column for each signal; no row before the first.
+        out : numpy.ndarray
+            Takes the set-points, a row for each sample and a column for each actuator.
+        """
+
+    @property
+    def trace(self) -> Trace:
+        """Internal values at present."""
+
+
 class Playback:
-    """Set-points as functions of time, without feedback: a `SampledController`.
+    """Set-points as functions of time, without feedback: a `SampledController` and a `BlockController`.
 
     Parameters
     ----------
@@ -59,6 +89,11 @@ class Playback:
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, ...]:  # noqa: ARG002
         """Return the set-points of the moment."""
         return tuple(setpoint(t) for setpoint in self._setpoints)
+
+    def step_block(self, times: Floats, readings: Floats, out: Floats) -> None:  # noqa: ARG002
+        """Write the set-points of a block; without feedback nothing is delayed."""
+        for k, t in enumerate(times.tolist()):
+            out[k] = self.update(t, ())
 
 
 class Reaching(Protocol):

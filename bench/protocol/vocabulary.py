@@ -27,7 +27,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 
-from bench.control.loops import ControlTask, SampledController
+from bench.control.loops import BlockController, ControlTask, SampledController
 from bench.devices import Signal
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
 
@@ -169,7 +169,7 @@ class FixedRate(Message):
 
     Attributes
     ----------
-    controller : SampledController
+    controller : SampledController or BlockController
         The controller at work; it sees numbers only.
     rate : float
         Samples in a second, Hz.
@@ -187,9 +187,14 @@ class FixedRate(Message):
         Of so many samples one is recorded.
     label : str
         A few words for the record.
+    block : int
+        Samples for which the controller is asked at once, by `step_block`; 0 for a `SampledController`. Where an
+        instrument can, it carries them out by itself; otherwise they are taken one by one, with the same result.
+        Interlocks, watchdogs and the telemetry of other devices wait for the end of a block, which therefore may not
+        be longer than the telemetry period of the rig.
     """
 
-    controller: SampledController
+    controller: SampledController | BlockController
     rate: float
     duration: float
     inputs: tuple[str, ...]
@@ -198,8 +203,13 @@ class FixedRate(Message):
     watched: tuple[str, ...] = ()
     record_every: int = 1
     label: str = ""
+    block: int = 0
 
     def __post_init__(self) -> None:
+        if self.block < 0 or (self.block and not isinstance(self.controller, BlockController)):
+            raise ValueError(
+                f"FixedRate: expected block ≥ 0, and a controller with step_block where it is not 0, got {self.block}"
+            )
         if not (0 < self.rate < math.inf and 0 < self.duration < math.inf and self.record_every >= 1):
             raise ValueError(
                 "FixedRate: expected rate, duration > 0 and record_every ≥ 1, got "

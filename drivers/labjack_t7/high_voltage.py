@@ -11,22 +11,24 @@ from contextlib import suppress
 from functools import partial
 from typing import ClassVar, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
-from bench.devices import Limits, Status
+from bench.devices import Device, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import VoltageSupply
 from drivers.device import Slope, attempt
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings
-from drivers.labjack_t7.registers import DAC, TDAC, LabJackT7
+from drivers.labjack_t7.registers import DAC, TDAC, Floats, LabJackT7
 
 _DAC_REACH = (0.0, 5.0)  # V, datasheet 15.0
 _TDAC_REACH = (-10.0, 10.0)  # V, datasheet of the LJTick-DAC
 _STATUS_ON = 2.0  # V, from which on a status output is high, the level of TTL
 _STATUS_AGE = 0.1  # s, after which `set` looks at the status again
 _LOOKS, _LOOK_INTERVAL = 50, 0.01  # how often, and every how many s, a change of the status is looked for
+_LONGEST_WAIT = 100_000.0  # µs
 _DISCHARGED = 1.0  # V, below which an output counts as 0 V
 
 
@@ -145,6 +147,45 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         self._setpoint = float(value)
         self._send(value)
         return self._sent
+
+    def can_play(self, sensor: Device, period: float) -> bool:
+        """Return whether `play` takes a sensor and a period: one on the same connection, and whole µs of a wait."""
+        return (
+            isinstance(sensor, T7InputDevice)
+            and sensor.is_on(self._line)
+            and 1.0 <= 1e6 * period <= _LONGEST_WAIT
+            and math.isclose(round(1e6 * period), 1e6 * period, rel_tol=1e-6)
+            and self._line.most_played(sensor.conversions) * period < self._settings.timeout
+        )
+
+    def play(self, setpoints: Floats, period: float, sensor: Device) -> Floats:
+        """Read a sensor on the same T7 and send a voltage, sample after sample, at the pace of the instrument.
+
+        One request holds up to 51 samples of a sensor with one input: per sample a read of AIN#, a write of the
+        output, and a wait of the period. So the host takes part once in a block only. A real T7 needs more than the
+        period: a conversion takes 40 µs or more by its resolution index, and an LJTick-DAC, which is written over
+        I2C, about 1 ms together with the request (its datasheet), so that blocks of some 500 samples a second are
+        what to expect there; 20 kHz is for an emulated one.
+
+        Raises what `set` and the `glance` of the sensor raise; readings of the block are lost then.
+        """
+        for volts in (float(setpoints.min()), float(setpoints.max())):
+            self.check(volts)
+        if not self._enabled:
+            self._switch_on()
+        elif self._clock.now() - self._looked >= _STATUS_AGE:
+            self.glance()
+        assert isinstance(sensor, T7InputDevice)
+        spans = sensor.conversions
+        most, wait = self._line.most_played(spans), round(1e6 * period)
+        start = self._clock.now()
+        sent = self._offset + setpoints / self._gain
+        rows = []
+        for first in range(0, len(sent), most):
+            self._clock.sleep_until(start + first * period)
+            self._setpoint = float(setpoints[min(first + most, len(sent)) - 1])
+            rows.append(self._line.play(spans, self._register, sent[first : first + most], wait))
+        return sensor.converted(np.concatenate(rows))
 
     def safe(self) -> None:
         """Send 0 V, switch the enable line off, and see that the amplifier is off and its output at 0 V."""

@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, Self, TypeVar
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
@@ -33,6 +34,7 @@ from drivers.labjack_t7.registers import (
     AIN_SETTLING_US,
     STREAM_RESOLUTION_INDEX,
     STREAM_SETTLING_US,
+    Floats,
     LabJackT7,
     Register,
     Span,
@@ -147,6 +149,28 @@ class T7InputDevice(T7Device[InputSettingsT]):
             if not -limit < volts < limit:
                 raise self._invalid(voltages)
         return self._values(*voltages)
+
+    @property
+    def conversions(self) -> tuple[Span, ...]:
+        """What `glance` reads."""
+        return self._conversions
+
+    def is_on(self, instrument: LabJackT7) -> bool:
+        """Return whether it shares this connection to its instrument."""
+        return self._line.shares_connection(instrument)
+
+    def converted(self, voltages: Floats) -> Floats:
+        """Return the signals (a row each) of conversions of each input (a row each, V).
+
+        Raises what `glance` does for the first of the conversions that is wrong.
+        """
+        if not (np.abs(voltages) < self._limit).all():
+            for row in voltages.tolist():
+                self._check(row)
+        return self._converted(voltages)
+
+    def _converted(self, voltages: Floats) -> Floats:
+        return np.array([list(self._values(*row).values()) for row in voltages.tolist()])
 
     @abstractmethod
     def _values(self, *volts: float) -> dict[str, float]: ...

@@ -16,7 +16,7 @@ from bench.errors import DeviceError
 from bench.roles import PositionSensor
 from drivers.device import Slope
 from drivers.labjack_t7.inputs import T7InputDevice, T7InputSettings
-from drivers.labjack_t7.registers import LabJackT7
+from drivers.labjack_t7.registers import Floats, LabJackT7
 
 _USABLE = 0.95  # share of a detector's length that limits may use
 _READOUTS = {"voltage": 1, "currents": 2, "ratiometric": 2}  # inputs that each takes
@@ -130,6 +130,15 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
                 "actuator back or extend the calibration and `position_limits`",
             )
         return {self._signal: position}
+
+    def _converted(self, voltages: Floats) -> Floats:
+        settings = self._settings
+        if settings.readout == "voltage":
+            positions = (voltages - settings.zero_volts) / settings.volts_per_metre
+            low, high = settings.position_limits
+            if ((low <= positions) & (positions <= high)).all():
+                return positions
+        return super()._converted(voltages)
 
     def _from_currents(self, first: float, second: float) -> float:
         settings = self._settings

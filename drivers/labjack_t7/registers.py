@@ -4,7 +4,8 @@ Sources: `ljm_constants.json` (repository labjack/ljm_constants) for the registe
 Protocol Details, for the byte order and for function 76; the error table of the same repository for the details of
 refusals.
 
-Assumption: the instrument reads back the settings that were written.
+Assumptions: the instrument reads back the settings that were written. WAIT_US_BLOCKING, which programs use beside
+TDAC# but the versions of the map at hand do not have, is a UINT32 at 61590 and takes up to 100 000 µs.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.modbus import RefusedError, exception_text, read_frame, read_request, swapped, write_frame
@@ -21,6 +25,7 @@ from drivers.modbus_tcp import Connection, share
 
 Kind = Literal["F32", "U32", "U16"]
 Access = Literal["R", "W", "RW"]
+Floats = NDArray[np.float64]
 
 _FORMS = {"F32": "f", "U32": "I", "U16": "H"}
 
@@ -107,6 +112,7 @@ TEST_FLOAT32 = Register("TEST_FLOAT32", 55124, "F32", "R")
 PRODUCT_ID = Register("PRODUCT_ID", 60000, "F32", "R")
 FIRMWARE_VERSION = Register("FIRMWARE_VERSION", 60004, "F32", "R")
 SERIAL_NUMBER = Register("SERIAL_NUMBER", 60028, "U32", "R")
+WAIT_US_BLOCKING = Register("WAIT_US_BLOCKING", 61590, "U32", "W")
 WATCHDOG_ENABLE = Register("WATCHDOG_ENABLE_DEFAULT", 61600, "U32", "RW")
 WATCHDOG_TIMEOUT_S = Register("WATCHDOG_TIMEOUT_S_DEFAULT", 61604, "U32", "RW")
 WATCHDOG_STRICT_ENABLE = Register("WATCHDOG_STRICT_ENABLE_DEFAULT", 61610, "U32", "RW")
@@ -118,6 +124,9 @@ WATCHDOG_DAC_ENABLE = (
     Register("WATCHDOG_DAC0_ENABLE_DEFAULT", 61640, "U32", "RW"),
     Register("WATCHDOG_DAC1_ENABLE_DEFAULT", 61650, "U32", "RW"),
 )
+
+_FRAME_HEAD = 4  # bytes of a frame of function 76 before its values
+_MOST_FRAMES = 1040 - 8  # bytes of all frames of a packet
 
 _TEST_WORDS = [0x0011, 0x2233]
 _TEST_FLOAT = -9999.0
@@ -225,6 +234,52 @@ class LabJackT7:
             values.append(list(span.values.unpack_from(reply, position)))
             position += span.values.size
         return values
+
+    def shares_connection(self, other: LabJackT7) -> bool:
+        """Return whether another device on the same instrument uses this connection."""
+        return self._connection is other._connection
+
+    def play(self, spans: Sequence[Span], register: Register, values: Floats, wait: int) -> Floats:
+        """Read spans and set a register again and again, with waits between, in one request of function 76.
+
+        The instrument carries it out by itself, in the order of the frames: reads, then the value, then the wait.
+        What conversions and outputs take comes on top of the wait.
+
+        Parameters
+        ----------
+        spans : sequence of Span
+            FLOAT32 registers to be read.
+        values : numpy.ndarray
+            Values of a FLOAT32 register, one after the other, `most_played(spans)` at most.
+        wait : int
+            Time between, µs, 0 to 100000; there is none behind the last.
+
+        Returns
+        -------
+        numpy.ndarray
+            What was read, one row for each value.
+        """
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        reads = b"".join(span.frame for span in spans)
+        size = len(reads)
+        pause = write_frame(WAIT_US_BLOCKING.address, self.encode(WAIT_US_BLOCKING, wait))
+        sample = reads + write_frame(register.address, self.encode(register, 0.0)) + pause
+        packet = np.frombuffer(bytearray(sample * len(values)), np.uint8).reshape(len(values), len(sample))
+        at = size + _FRAME_HEAD
+        packet[:, at : at + 4] = values.astype(">f4").view(np.uint8).reshape(-1, 4)
+        row = sum(span.values.size for span in spans)
+        try:
+            with self._lock:
+                reply = self._client.feedback(packet.tobytes()[: -len(pause)], row * len(values))
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, f"playing {len(values)} values on register {register.address}") from error
+        return np.frombuffer(reply, ">f4").astype(np.float64).reshape(len(values), -1)
+
+    @staticmethod
+    def most_played(spans: Sequence[Span]) -> int:
+        """Return how many values `play` takes at once: a packet has 1040 bytes, of which 8 are its head."""
+        return _MOST_FRAMES // (sum(len(span.frame) for span in spans) + 2 * (_FRAME_HEAD + 4))
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""

@@ -26,6 +26,7 @@ def _play(
     setpoints: dict[str, Callable[[float], float]],
     limits: tuple[tuple[float, float], ...],
     sensors: tuple[str, ...] = SENSORS,
+    block: int = 0,
 ) -> FixedRate:
     """Return a loop that plays functions of time back on slots, within limits, and reads sensors."""
     return FixedRate(
@@ -36,6 +37,7 @@ def _play(
         actuators=tuple(slots[name].device for name in setpoints),
         limits=limits,
         label=label,
+        block=block,
     )
 
 
@@ -166,6 +168,9 @@ class PiezoStepParameters(ProtocolParameters):
     rest: float = parameter(0.02, unit="s", low=0, high=10, help="time at 0 V before it")
     duration: float = parameter(0.3, unit="s", low=1e-3, high=100, help="time after it")
     rate: float = parameter(20e3, unit="Hz", low=10, high=1e6, help="samples in a second")
+    block: int = parameter(
+        0, unit="1", low=0, high=1000, help="samples in one request, as the step is known; 0: one by one"
+    )
 
 
 @protocol(needs=FINE, controls="response")
@@ -187,6 +192,7 @@ def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
         {"fine": lambda t: height if t >= begin else 0.0},
         ((min(0.0, height), max(0.0, height)),),
         ("response",),
+        parameters.block,
     )
 
 

@@ -64,13 +64,14 @@ class EmulatedDevice(Device):
         return 0.0 if self._normals is None else deviation * next(self._normals)
 
 
-class EmulatedInstrument(EmulatedDevice):
-    """An emulated instrument with a line of its own, which can be unplugged and disturbed."""
+class LineFaults:
+    """The line of an emulated instrument, which can be unplugged and disturbed."""
 
-    def __init__(self, name: str, world: World, rng: np.random.Generator | None = None) -> None:
-        super().__init__(name, world, rng)
-        self.plugged_in = True
-        self._corrupt_next = self._drop_next = False
+    world: World
+
+    plugged_in = True
+    _corrupt_next = False
+    _drop_next = False
 
     @property
     def answering(self) -> bool:
@@ -113,6 +114,10 @@ class EmulatedInstrument(EmulatedDevice):
         """Flip one bit."""
         middle = len(answer) // 2
         return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
+
+
+class EmulatedInstrument(LineFaults, EmulatedDevice):
+    """An emulated instrument with a line of its own."""
 
     @contextmanager
     def _request(self) -> Iterator[None]:

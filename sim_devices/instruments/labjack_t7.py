@@ -19,6 +19,9 @@ Assumptions, where these say nothing:
   offset. The register of a DAC reads back what was written.
 - After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
   nothing while there is no communication, so they are done once.
+- WAIT_US_BLOCKING, which the versions of the map at hand do not have, is a UINT32 at 61590 that takes 0 to
+  100 000 µs; a longer wait is refused with exception 4. The frames of a packet of function 76 are carried out one
+  after the other, those behind a wait after it.
 - A single conversion takes no laboratory time; a burst takes what its scan rate says.
 - Reading the register of a single digital line makes it an input, as the map says that it configures the
   direction too; an input that nothing drives is pulled high, as all lines are after power-up.
@@ -36,6 +39,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.devices import Identity
+from sim_devices.instruments.emulated import LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument, Service
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
@@ -83,6 +87,7 @@ _DEFAULT_STREAM_INDEX = 1  # and to a burst, as ljm_constants.json says of STREA
 _EF_OFF, _EF_AVERAGE = 0, 3
 _MOST_SAMPLES = 16384
 _LONGEST_BURST = 0.18
+_LONGEST_WAIT = 100_000  # µs
 _LONGEST_SETTLING = 50_000.0
 _LONGEST_STREAM_SETTLING = 4_400.0
 _TDACS = 23
@@ -162,7 +167,7 @@ _SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in
 """By range and resolution index."""
 
 
-class EmulatedT7(RegisterInstrument):
+class EmulatedT7(LineFaults, RegisterInstrument):
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
     Every access first brings the world up to date and holds its lock. A burst lets the clock pass, as the
@@ -248,6 +253,10 @@ class EmulatedT7(RegisterInstrument):
         """Identity of the instrument."""
         return Identity("LabJack", "T7", str(self.serial_number), f"{self.firmware:.4f}")
 
+    def _corrupted(self, answer: bytes) -> bytes:
+        """Flip a bit of the transaction's number: Modbus TCP has no check of its own."""
+        return answer[:1] + bytes((answer[1] ^ 1,)) + answer[2:]
+
     # The outputs as the laboratory sees them.
 
     def dac_volts(self, number: int) -> float:
@@ -314,6 +323,17 @@ class EmulatedT7(RegisterInstrument):
                 self._lead()
         finally:
             self.world.lock.release()
+
+    def _after_frame(self) -> None:
+        if self._touched:
+            self._lead()
+
+    def _wait(self, microseconds: float) -> None:
+        if microseconds > _LONGEST_WAIT:
+            raise RegisterError(DEVICE_FAILURE, f"WAIT_US_BLOCKING: {microseconds:g} is not 0 to {_LONGEST_WAIT}")
+        world = self.world
+        world.clock.sleep_until(world.time + 1e-6 * microseconds)
+        world.advance()
 
     def _lead(self) -> None:
         self._touched = False
@@ -416,8 +436,8 @@ class EmulatedT7(RegisterInstrument):
         if settings.negative != SINGLE_ENDED:
             volts -= self._terminal(settings.negative)
         noise, step, lowest, highest = _SCALES[settings.range, index]
-        volts += noise * next(self._normals)
-        return min(max(round(volts / step) * step, lowest), highest)
+        volts = round((volts + noise * next(self._normals)) / step) * step
+        return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
 
     def _terminal(self, channel: int) -> float:
         source = self._sources.get(channel)
@@ -542,6 +562,7 @@ class EmulatedT7(RegisterInstrument):
             Register("PRODUCT_ID", 60000, "F32", lambda: 7.0),
             Register("FIRMWARE_VERSION", 60004, "F32", lambda: self.firmware),
             Register("SERIAL_NUMBER", 60028, "U32", lambda: self.serial_number),
+            Register("WAIT_US_BLOCKING", 61590, "U32", None, self._wait),
             Register("WATCHDOG_ENABLE_DEFAULT", 61600, "U32", dog("enabled")[0], self._enable_watchdog),
             Register("WATCHDOG_TIMEOUT_S_DEFAULT", 61604, "U32", *dog("timeout")),
             Register("WATCHDOG_STRICT_ENABLE_DEFAULT", 61610, "U32", *dog("strict")),

@@ -283,7 +283,12 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
 
     def deadline(self) -> float:
         """Return when the watchdog, a restart, the reset of an error or a check of the protections is due (s)."""
-        return min(self._watchdog_due, self._restart_due, self._recovery_due, self._supervision_due)
+        # A plain comparison: this is asked with each sample of a fast loop.
+        due = self._supervision_due
+        for other in (self._watchdog_due, self._restart_due, self._recovery_due):
+            if other < due:
+                due = other
+        return due
 
     def expire(self) -> None:
         """Carry out what is due."""

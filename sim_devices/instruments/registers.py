@@ -12,7 +12,7 @@ from functools import partial
 from types import TracebackType
 from typing import Literal, NamedTuple
 
-from sim_devices.wire.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterError
+from sim_devices.wire.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, Frame, Packet, RegisterError
 
 Kind = Literal["F32", "I32", "U32", "U16"]
 
@@ -147,12 +147,55 @@ class RegisterInstrument(ABC):
             writes = self._known_writes.get((address, count)) or self._writes(address, count)
             decoded = writes.values.unpack_from(writes.words.pack(*values))
             for register, value in zip(writes.registers, decoded, strict=True):
-                if not math.isfinite(value):
-                    raise RegisterError(ILLEGAL_VALUE, f"{register.name}: allowed are finite numbers, got {value}")
-                if register.write is not None:
-                    register.write(value)
+                self._take(register, value)
             if writes.refusal is not None:
                 raise writes.refusal
+
+    def prepare(self, frames: Sequence[Frame]) -> Packet | None:
+        """Return what carries such a packet of function 76 out, as one request; see `wire.modbus.PacketBank`."""
+        sent, answered = ">", ">"
+        parts: list[tuple[tuple[Callable[[], float], ...], tuple[Register, ...]]] = []
+        for frame in frames:
+            sent += "4x"
+            try:
+                if frame.writes:
+                    writes = self._writes(frame.address, frame.number)
+                    if writes.refusal is not None:
+                        return None
+                    sent += writes.values.format[1:]
+                    parts.append(((), writes.registers))
+                else:
+                    reads = self._reads(frame.address, frame.number)
+                    if reads.values.size != reads.words.size:
+                        return None
+                    answered += reads.values.format[1:]
+                    parts.append((reads.read, ()))
+            except RegisterError:
+                return None
+        unpack, pack = struct.Struct(sent).unpack, struct.Struct(answered).pack
+
+        def carry_out(body: bytes) -> bytes:
+            given, values = iter(unpack(body)), []
+            with self._request():
+                for readers, registers in parts:
+                    for read in readers:
+                        values.append(read())
+                    for register in registers:
+                        self._take(register, next(given))
+                    self._after_frame()
+                return pack(*values)
+
+        return carry_out
+
+    @staticmethod
+    def _take(register: Register, value: float) -> None:
+        if not math.isfinite(value):
+            raise RegisterError(ILLEGAL_VALUE, f"{register.name}: allowed are finite numbers, got {value}")
+        if register.write is not None:
+            register.write(value)
+
+    def _after_frame(self) -> None:  # noqa: B027 - most have no outputs
+        """Let what depends on the outputs follow, between two frames of a packet."""
 
     def _reads(self, address: int, count: int) -> _Reads:
         registers = list(dict.fromkeys(self._at(each) for each in range(address, address + count)))

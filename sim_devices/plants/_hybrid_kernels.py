@@ -222,6 +222,23 @@ def piezo_deflection(elapsed: float, fast: Floats, f: Floats) -> float:
 
 
 @njit(cache=True)
+def deflection(
+    fraction: float,
+    rise: Floats,
+    increment: Floats,
+    c: Record,
+    nodes: Floats,
+    elapsed: float,
+    fast: Floats,
+    f: Floats,
+) -> float:
+    """Add up the deflection of the tip; takes what `bending` and `piezo_deflection` take."""
+    thermal, warming = bending(fraction, rise, increment, c, nodes)
+    total: float = thermal + warming * piezo_deflection(elapsed, fast, f)
+    return total
+
+
+@njit(cache=True)
 def hysteresis(lag: float, change: float, f: Floats) -> float:
     """Move the Bouc-Wen part over a change of the voltage: the exact solution of its equation.
 

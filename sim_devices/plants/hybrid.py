@@ -105,7 +105,12 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
     def advance(self, dt: float) -> None:
         """Advance the plant in time; see `GridPlant.advance`."""
-        super().advance(dt)
+        pending = self._pending + dt
+        if dt >= 0.0 and pending + GRID_TOLERANCE < self._step:
+            # What the base does with less than a step.
+            self._pending = pending
+        else:
+            super().advance(dt)
         self._elapsed += dt
         if not self._ahead and self._pending > GRID_TOLERANCE:
             kernels.look_ahead(self._thermal)
@@ -236,8 +241,18 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     @property
     def deflection(self) -> float:
         """Deflection of the tip, m."""
-        thermal, warming = self._bending()
-        return thermal + warming * self._unwarmed_piezo_deflection()
+        # In one call, as a fast loop asks for it with each sample.
+        total: float = kernels.deflection(
+            self._pending / self._step if self._ahead else 0.0,
+            self._rise,
+            self._increment,
+            self._coefficients,
+            self._nodes,
+            self._elapsed,
+            self._fast,
+            self._fast_coefficients,
+        )
+        return total
 
     @property
     def heat_to_air(self) -> float:

@@ -157,7 +157,8 @@ class PiezoAmplifier:
     def _apply(self, volts: float) -> None:
         # A load that is ahead of the output waits for it: going back would be a loop of its hysteresis.
         low, high = (volts, self._target) if volts < self._target else (self._target, volts)
-        volts = min(max(self._applied, low), high)
-        if volts != self._applied:
-            self._applied = volts
-            self._load.apply(volts)
+        applied = self._applied
+        if low <= applied <= high:
+            return
+        self._applied = low if applied < low else high
+        self._load.apply(self._applied)

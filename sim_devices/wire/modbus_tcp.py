@@ -15,11 +15,10 @@ import struct
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-from sim_devices.wire.modbus import FEEDBACK, RegisterBank, answer, feedback
+from sim_devices.wire.modbus import FEEDBACK, Feedback, RegisterBank, answer
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _MOST_BYTES = 1034  # unit identifier and the longest PDU of a T7, whose packets have up to 1040 bytes
-_FUNCTIONS = {FEEDBACK: feedback}
 
 
 class FramingError(Exception):
@@ -32,6 +31,18 @@ class Restartable(Protocol):
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each restart."""
+
+
+@runtime_checkable
+class OnLine(Protocol):
+    """An instrument whose line can be disturbed."""
+
+    @property
+    def answering(self) -> bool:
+        """Whether requests arrive."""
+
+    def transmit(self, answer: bytes) -> bytes:
+        """Return what the host receives of an answer."""
 
 
 class ModbusTcpInstrument:
@@ -81,7 +92,9 @@ class ModbusTcpStream:
 
     def __init__(self, bank: RegisterBank, closed: Callable[[ModbusTcpStream], None] = lambda _: None) -> None:
         self._bank = bank
+        self._line = bank if isinstance(bank, OnLine) else None
         self._closed = closed
+        self._functions = {FEEDBACK: Feedback()}
         self._received = b""
         self._is_open = True
 
@@ -97,6 +110,9 @@ class ModbusTcpStream:
         """
         if not self._is_open:
             raise ConnectionResetError("the connection is closed")
+        line = self._line
+        if line is not None and not line.answering:
+            return b""
         received = self._received + data if self._received else data
         replies = b""
         begin, size = 0, len(received)
@@ -108,9 +124,10 @@ class ModbusTcpStream:
             end = begin + _HEADER.size + length - 1
             if size < end:
                 break
-            reply = answer(self._bank, received[begin + _HEADER.size : end], _FUNCTIONS)
+            reply = answer(self._bank, received[begin + _HEADER.size : end], self._functions)
             # Any unit is echoed: a device on TCP is addressed by its port.
-            replies += _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
+            reply = _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
+            replies += reply if line is None else line.transmit(reply)
             begin = end
         self._received = received[begin:]
         return replies

@@ -1013,3 +1013,82 @@ def test_mbpoll_is_refused(served):
     result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "40000", "127.0.0.1", "5.0")
     assert result.returncode != 0
     assert "failure" in result.stderr.lower()
+
+
+# Packets that come again, and waits between their frames
+
+
+def packet(volts, wait_us, count=3):
+    """A read of AIN0, a write of DAC0 and a wait, `count` times."""
+    sample = "00 0000 02" + "01 03e8 02" + struct.pack(">f", volts).hex() + "01 f096 02" + f"{wait_us:08x}"
+    return frame("4c" + sample * count)
+
+
+def send(stream, body):
+    return stream.receive(struct.pack(">HHHB", 1, 0, len(body) + 1, 1) + body)
+
+
+def test_frames_behind_a_wait_are_carried_out_after_it():
+    seen = []
+    t7 = make({0: lambda: 0.1 * t7.world.time})
+    t7.add_follower(lambda: seen.append((t7.world.time, t7.dac_volts(0))))
+    stream = ModbusTcpStream(t7)
+    start = t7.world.time
+    for volts in (1.25, 2.5):
+        reply = send(stream, packet(volts, 50_000))
+        values = struct.unpack(">3f", reply[8:])
+        assert np.diff(values) == pytest.approx([5e-3, 5e-3], abs=1e-3)
+    assert t7.world.time == pytest.approx(start + 0.3)
+    changed = [(t - start, volts) for t, volts in seen[1:]]
+    assert [t for t, _ in changed] == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2, 0.25])
+    assert [volts for _, volts in changed] == pytest.approx([1.25] * 3 + [2.5] * 3, abs=DAC_STEP)
+
+
+def test_a_packet_that_comes_again_is_carried_out_as_the_first_time():
+    # The same frames one by one, each in a packet of its own that no other resembles.
+    known, plain = make({0: lambda: 2.5}), make({0: lambda: 2.5})
+    stream = ModbusTcpStream(known)
+    for volts in (1.0, 2.0, 7.0):
+        reply = send(stream, packet(volts, 0))
+        readings = []
+        for _ in range(3):
+            readings += plain.read_registers(0, 2)
+            plain.write_value("DAC0", volts)
+            plain.write_value("WAIT_US_BLOCKING", 0)
+        assert reply[8:] == struct.pack(">6H", *readings)
+        assert known.dac_volts(0) == plain.dac_volts(0)
+
+
+def test_a_refused_value_ends_a_packet_that_is_known():
+    t7 = make({0: lambda: 2.5})
+    stream = ModbusTcpStream(t7)
+    assert send(stream, packet(1.0, 0))[7] == 76
+    for body, code in ((packet(2.0, 100_001), 4), (packet(math.nan, 0), 3)):
+        assert send(stream, body)[7:] == bytes((0xCC, code))
+    assert t7.dac_volts(0) == pytest.approx(2.0, abs=DAC_STEP)
+    assert send(stream, packet(3.0, 0))[7] == 76
+
+
+def test_a_wait_is_no_communication():
+    t7 = make()
+    t7.write_value("WATCHDOG_TIMEOUT_S_DEFAULT", 1)
+    t7.write_value("WATCHDOG_DAC0_ENABLE_DEFAULT", 1)
+    t7.write_value("WATCHDOG_ENABLE_DEFAULT", 1)
+    send(ModbusTcpStream(t7), packet(2.0, 100_000, 12))
+    assert t7.watchdog_expired
+
+
+def test_disturbed_lines():
+    t7 = make()
+    stream = ModbusTcpStream(t7)
+    request = frame("0101 0000 0006 01 03 d73c 0002")
+    reply = frame("0101 0000 0007 01 03 04 0011 2233")
+    t7.unplug()
+    assert stream.receive(request) == b""
+    t7.plug_in()
+    assert stream.receive(request) == reply
+    t7.drop_next_answer()
+    assert stream.receive(request) == b""
+    t7.corrupt_next_answer()
+    assert stream.receive(request) == b"\x01\x00" + reply[2:]
+    assert stream.receive(request) == reply
