@@ -171,8 +171,15 @@ class TcpClient(_PortClient):
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
         transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
         self._port.write(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
-        # What has come already, as it has in process; the shortest reply is a refusal, a function and a code.
-        reply = self._receive(self._port.read_all(), _MBAP.size + min(expected, 2))
+        # What has come already, as it has in process.
+        reply: bytes = self._port.read_all()
+        size = _MBAP.size + expected
+        if len(reply) == size and reply.startswith(
+            _MBAP.pack(transaction, 0, expected + 1, self._unit) + request[:1]
+        ):
+            return reply[_MBAP.size :]
+        # The shortest reply is a refusal, a function and a code.
+        reply = self._receive(reply, _MBAP.size + min(expected, 2))
         answered, protocol, length, unit = _MBAP.unpack_from(reply)
         function = reply[_MBAP.size]
         if answered != transaction or protocol != 0 or unit != self._unit or function & ~_REFUSED != request[0]:
@@ -181,7 +188,7 @@ class TcpClient(_PortClient):
             raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
         if length != expected + 1:
             raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
-        return self._receive(reply, _MBAP.size + expected)[_MBAP.size :]
+        return self._receive(reply, size)[_MBAP.size :]
 
 
 def _crc_table() -> tuple[int, ...]:

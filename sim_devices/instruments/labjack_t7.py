@@ -432,7 +432,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _convert(self, channel: int, index: int) -> float:
         settings = self._inputs[channel]
-        volts = self._terminal(channel)
+        source = self._sources.get(channel)
+        volts = 0.0 if source is None else source()
         if settings.negative != SINGLE_ENDED:
             volts -= self._terminal(settings.negative)
         noise, step, lowest, highest = _SCALES[settings.range, index]

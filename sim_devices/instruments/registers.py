@@ -151,12 +151,12 @@ class RegisterInstrument(ABC):
             if writes.refusal is not None:
                 raise writes.refusal
 
-    def prepare(self, frames: Sequence[Frame]) -> Packet | None:
+    def prepare(self, frames: Sequence[Frame], head: int) -> Packet | None:
         """Return what carries such a packet of function 76 out, as one request; see `wire.modbus.PacketBank`."""
         sent, answered = ">", ">"
         parts: list[tuple[tuple[Callable[[], float], ...], tuple[Register, ...]]] = []
         for frame in frames:
-            sent += "4x"
+            sent += f"{head}x"
             try:
                 if frame.writes:
                     writes = self._writes(frame.address, frame.number)
@@ -173,16 +173,21 @@ class RegisterInstrument(ABC):
             except RegisterError:
                 return None
         unpack, pack = struct.Struct(sent).unpack, struct.Struct(answered).pack
+        request, after_frame, isfinite = self._request, self._after_frame, math.isfinite
 
         def carry_out(body: bytes) -> bytes:
             given, values = iter(unpack(body)), []
-            with self._request():
+            with request():
                 for readers, registers in parts:
                     for read in readers:
                         values.append(read())
                     for register in registers:
-                        self._take(register, next(given))
-                    self._after_frame()
+                        value = next(given)
+                        if register.write is None or not isfinite(value):
+                            self._take(register, value)
+                        else:
+                            register.write(value)
+                    after_frame()
                 return pack(*values)
 
         return carry_out

@@ -25,6 +25,7 @@ _MOST_WRITTEN = 123  # registers in one write, Application Protocol 6.12
 _REGISTERS = 0x10000
 _FUNCTIONS = frozenset((_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY))
 _BODY = struct.Struct(">BHH")  # function, address, and value or number of registers
+_WRITE_HEAD = _BODY.size + 1  # and the number of bytes of the values
 _WORDS = tuple(struct.Struct(f">{number}H") for number in range(256))
 _FRAME = struct.Struct(">BHB")  # of function 76: kind, address, number of registers
 _FRAME_READ, _FRAME_WRITE = 0, 1
@@ -73,12 +74,19 @@ Packet = Callable[[bytes], bytes]
 """Carries the frames of a packet out, with the values in it, and returns what the reads among them give."""
 
 
+_Known = tuple[int, Packet, bytes]
+"""Of a request that comes again: its length, what carries it out, and what stands before the values of its reply."""
+
+
 @runtime_checkable
 class PacketBank(Protocol):
     """A bank that can prepare for packets of the same frames with other values, as a fast loop sends them."""
 
-    def prepare(self, frames: Sequence[Frame]) -> Packet | None:
-        """Return what carries such packets out, with the result of frame by frame; None if it cannot."""
+    def prepare(self, frames: Sequence[Frame], head: int) -> Packet | None:
+        """Return what carries such packets out, with the result of frame by frame; None if it cannot.
+
+        `head` is the number of bytes of each frame before its values.
+        """
 
 
 OwnFunctions = Mapping[int, Callable[[RegisterBank, bytes], bytes]]
@@ -92,12 +100,70 @@ def answer(bank: RegisterBank, request: bytes, own: OwnFunctions = MappingProxyT
         if function in own:
             return request[:1] + own[function](bank, request[1:])
         return request[:1] + _carry_out(bank, function, request)
-    except RegisterError as refusal:
-        return bytes([function | 0x80, refusal.code])
-    except Exception:
-        # An emulator's defect must not end the server; the client sees a device that has failed.
-        _log.exception("the emulated instrument failed on request %s", request.hex(" "))
-        return bytes([function | 0x80, DEVICE_FAILURE])
+    except Exception as error:
+        return _refusal(request, error)
+
+
+def _refusal(request: bytes, error: Exception) -> bytes:
+    """Return the reply to a request that was not carried out."""
+    if isinstance(error, RegisterError):
+        return bytes((request[0] | 0x80, error.code))
+    # An emulator's defect must not end the server; the client sees a device that has failed.
+    _log.error("the emulated instrument failed on request %s", request.hex(" "), exc_info=error)
+    return bytes((request[0] | 0x80, DEVICE_FAILURE))
+
+
+class Answers:
+    """Answers the requests of one host, as `answer` does, and prepares for those that come again.
+
+    A fast loop sends the same few reads, and writes of the same registers with other values.
+    """
+
+    _MOST_KNOWN = 256
+
+    def __init__(self, bank: RegisterBank, own: OwnFunctions = MappingProxyType({})) -> None:
+        self._bank = bank
+        self._own = own
+        # By what comes before the values, if any.
+        self._known: dict[bytes, _Known] = {}
+
+    def __call__(self, request: bytes) -> bytes:
+        """Return the reply to one request, both without a header and at least one byte long."""
+        known = self._known.get(request[:_WRITE_HEAD])
+        if known is None or known[0] != len(request):
+            self._learn(request)
+            return answer(self._bank, request, self._own)
+        _, packet, head = known
+        try:
+            return head + packet(request)
+        except Exception as error:
+            return _refusal(request, error)
+
+    def _learn(self, request: bytes) -> None:
+        """Prepare for a request that is well formed, if the instrument can."""
+        bank, function = self._bank, request[0]
+        if not isinstance(bank, PacketBank) or len(request) < _BODY.size:
+            return
+        _, address, number = _BODY.unpack_from(request)
+        if address + number > _REGISTERS:
+            return
+        if function == _READ_HOLDING and len(request) == _BODY.size and 1 <= number <= _MOST_READ:
+            packet = bank.prepare([Frame(False, address, number)], _BODY.size)
+            head = bytes((function, 2 * number))
+        elif (
+            function == _WRITE_MANY
+            and 1 <= number <= _MOST_WRITTEN
+            and len(request) == _WRITE_HEAD + 2 * number
+            and request[5] == 2 * number
+        ):
+            packet = bank.prepare([Frame(True, address, number)], _WRITE_HEAD)
+            head = request[: _BODY.size]
+        else:
+            return
+        if packet is not None:
+            if len(self._known) >= self._MOST_KNOWN:
+                self._known.clear()
+            self._known[request[:_WRITE_HEAD]] = len(request), packet, head
 
 
 def _carry_out(bank: RegisterBank, function: int, request: bytes) -> bytes:
@@ -179,7 +245,7 @@ class Feedback:
         elif len(self._known) >= self._MOST_KNOWN:
             self._known.clear()
         if isinstance(bank, PacketBank) and (frames := _frames(body)) is not None:
-            packet = bank.prepare(frames)
+            packet = bank.prepare(frames, _FRAME.size)
             if packet is not None:
                 mask = int.from_bytes(
                     b"".join(b"\xff" * _FRAME.size + bytes(2 * frame.number * frame.writes) for frame in frames)

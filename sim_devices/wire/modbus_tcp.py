@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-from sim_devices.wire.modbus import FEEDBACK, Feedback, RegisterBank, answer
+from sim_devices.wire.modbus import FEEDBACK, Answers, Feedback, RegisterBank
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _MOST_BYTES = 1034  # unit identifier and the longest PDU of a T7, whose packets have up to 1040 bytes
@@ -91,10 +91,9 @@ class ModbusTcpStream:
     """
 
     def __init__(self, bank: RegisterBank, closed: Callable[[ModbusTcpStream], None] = lambda _: None) -> None:
-        self._bank = bank
         self._line = bank if isinstance(bank, OnLine) else None
         self._closed = closed
-        self._functions = {FEEDBACK: Feedback()}
+        self._answer = Answers(bank, {FEEDBACK: Feedback()})
         self._received = b""
         self._is_open = True
 
@@ -124,7 +123,7 @@ class ModbusTcpStream:
             end = begin + _HEADER.size + length - 1
             if size < end:
                 break
-            reply = answer(self._bank, received[begin + _HEADER.size : end], self._functions)
+            reply = self._answer(received[begin + _HEADER.size : end])
             # Any unit is echoed: a device on TCP is addressed by its port.
             reply = _HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
             replies += reply if line is None else line.transmit(reply)
