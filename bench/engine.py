@@ -304,16 +304,21 @@ class Engine:
                 for name, (low, high), command in zip(message.actuators, message.limits, commands, strict=False):
                     if not low <= command <= high:
                         raise LimitError(name, f"the controller asked for {command:g}, beyond {low:g} to {high:g}")
-                changed = [each for each in zip(actuators, commands, strict=True) if each[1] != each[0].setpoint]
+                changed = [
+                    (actuator, command)
+                    for actuator, command in zip(actuators, commands, strict=False)
+                    if command != actuator.setpoint
+                ]
                 # None is sent when another is wrong.
                 if len(changed) > 1:
                     for actuator, command in changed:
                         actuator.check(command)
                 for actuator, command in changed:
                     actuator.set(command)
-                values.update(zip(setpoints, commands, strict=True))
+                values.update(zip(setpoints, commands, strict=False))
                 late = now - due
-                lateness, latest = lateness + late, max(latest, late)
+                if late > 0:
+                    lateness, latest = lateness + late, max(latest, late)
                 if taken % message.record_every == 0:
                     # Without the lateness, which tells the samples from the ticks.
                     self._trace = _traced(message.controller.trace)
@@ -326,7 +331,9 @@ class Engine:
                     values = self._values(self._rig.glance)
                     self._watch.check(self._clock.now(), values)
                     next_tick = self._tick_after(next_tick)
-                k = min(samples, max(k + 1, math.floor((self._clock.now() - start) / period)))
+                k += 1
+                if (reached := math.floor((self._clock.now() - start) / period)) > k:
+                    k = min(samples, reached)
         finally:
             self._trace = _NOT_AT_WORK
         return self._finish_loop(message, started, taken, (lateness, latest), commands)
@@ -361,10 +368,10 @@ class Engine:
                     break
                 now = self._clock.now()
                 count = min(message.block, samples - k)
-                out = np.full((count, len(actuators)), math.nan)
-                times: Floats = np.arange(k, k + count) * period
+                out: Floats = np.full((count, len(actuators)), math.nan)
+                times = (np.arange(k, k + count) * period).astype(np.float64)
                 controller.step_block(times, readings[:, : len(message.inputs)], out)
-                self._check_block(message, actuators, out)
+                self._check_block(message, out)
                 late = now - due
                 readings = play(out) if play is not None else self._sampled(signals, actuators, out, start + times)
                 lateness, latest = lateness + count * late, max(latest, late)
@@ -386,20 +393,22 @@ class Engine:
             self._trace = _NOT_AT_WORK
         return self._finish_loop(message, started, taken, (lateness, latest), out[-1].tolist())
 
-    def _check_block(self, message: FixedRate, actuators: Sequence[Actuator], out: Floats) -> None:
-        """Raise `LimitError` unless all set-points of a block are allowed; none has been sent then."""
-        limits = message.limits or [(actuator.limits.low, actuator.limits.high) for actuator in actuators]
-        for actuator, (low, high), column in zip(actuators, limits, out.T, strict=True):
-            wrong = column[~((low <= column) & (column <= high))]
-            if wrong.size:
-                raise LimitError(actuator.name, f"the controller asked for {wrong[0]:g}, beyond {low:g} to {high:g}")
-            for extreme in (column.min(), column.max()):
-                actuator.check(float(extreme))
+    @staticmethod
+    def _check_block(message: FixedRate, out: Floats) -> None:
+        """Raise `LimitError` unless all set-points of a block are within the limits of the loop."""
+        for name, (low, high), column in zip(message.actuators, message.limits, out.T, strict=False):
+            if not (allowed := (low <= column) & (column <= high)).all():
+                wrong = column[~allowed][0]
+                raise LimitError(name, f"the controller asked for {wrong:g}, beyond {low:g} to {high:g}")
 
     def _sampled(
         self, signals: Sequence[str], actuators: Sequence[Actuator], out: Floats, instants: Floats
     ) -> Floats:
         """Take the samples of a block one by one, as an instrument does that can by itself."""
+        # None is sent when another is wrong.
+        for actuator, column in zip(actuators, out.T, strict=True):
+            for command in column.tolist():
+                actuator.check(command)
         read = self._rig.quick_reader(signals)
         rows = []
         for instant, commands in zip(instants.tolist(), out.tolist(), strict=True):

@@ -1,6 +1,9 @@
 """A high-voltage amplifier for a piezo, controlled and monitored by a LabJack T7.
 
-Sources: LabJack T-series datasheet 15.0 for the analog outputs; LJTick-DAC datasheet for the outputs TDAC.
+Sources: LabJack T-series datasheet 15.0 for the analog outputs; LJTick-DAC datasheet for the outputs TDAC; LabJack,
+Direct Modbus TCP, Protocol Details, for function 76 and the 1040 bytes of a packet.
+
+Assumption: a T7 takes several writes of an LJTick-DAC in one packet.
 """
 
 from __future__ import annotations
@@ -162,15 +165,18 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         """Read a sensor on the same T7 and send a voltage, sample after sample, at the pace of the instrument.
 
         One request holds up to 51 samples of a sensor with one input: per sample a read of AIN#, a write of the
-        output, and a wait of the period. So the host takes part once in a block only. A real T7 needs more than the
-        period: a conversion takes 40 µs or more by its resolution index, and an LJTick-DAC, which is written over
-        I2C, about 1 ms together with the request (its datasheet), so that blocks of some 500 samples a second are
-        what to expect there; 20 kHz is for an emulated one.
+        output, and a wait of the period, so that the host takes part once in a block only.
+
+        A real T7 takes longer than the period, as conversions and writes come on top of the wait. The datasheet of
+        the LJTick-DAC gives about 1 ms for an update of its output over I2C, most of it for the communication with
+        the host, which a block needs once only; how long the update itself takes it does not say. So 20 kHz is for
+        an emulated T7, and the pace of a real one has to be measured before a model is made of such samples.
 
         Raises what `set` and the `glance` of the sensor raise; readings of the block are lost then.
         """
-        for volts in (float(setpoints.min()), float(setpoints.max())):
-            self.check(volts)
+        low, high = self._settings.voltage_limits
+        if not (allowed := (low <= setpoints) & (setpoints <= high)).all():
+            self.check(float(setpoints[~allowed][0]))
         if not self._enabled:
             self._switch_on()
         elif self._clock.now() - self._looked >= _STATUS_AGE:

@@ -178,7 +178,7 @@ def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
     """Measure the deflection after a step of the voltage, fast enough for the resonance.
 
     Rakotondrabe and Ivan 2010, section V-D, Fig. 16: 40 V. The default rate is for an emulated rig: over a network a
-    T7 answers one or two requests in a millisecond.
+    T7 answers one or two requests in a millisecond. With `block` it carries so many samples out by itself.
     """
     height = parameters.voltage
     # Half a sample sooner, as the instants of samples are rounded.

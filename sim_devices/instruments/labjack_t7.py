@@ -508,7 +508,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _set_tdac(self, number: int, value: float) -> None:
         self._touched = True
-        self._tdacs[number] = min(max(value, -_TDAC_TOP), _TDAC_TOP)
+        self._tdacs[number] = value if -_TDAC_TOP <= value <= _TDAC_TOP else math.copysign(_TDAC_TOP, value)
 
     def _read_dio(self, number: int) -> float:
         self._touched = True

@@ -35,4 +35,7 @@ class DisplacementSensor:
         """Return the voltage in V at this instant."""
         noisy = self.displacement() + self.noise * next(self._normals)
         shown = round(noisy / self.resolution) * self.resolution
-        return self.volts_per_metre * min(max(shown, -self.reach), self.reach)
+        reach = self.reach
+        if not -reach <= shown <= reach:
+            shown = min(max(shown, -reach), reach)
+        return self.volts_per_metre * shown

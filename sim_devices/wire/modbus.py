@@ -123,12 +123,16 @@ class Answers:
 
     def __init__(self, bank: RegisterBank, own: OwnFunctions = MappingProxyType({})) -> None:
         self._bank = bank
+        self._preparing = bank if isinstance(bank, PacketBank) else None
         self._own = own
         # By what comes before the values, if any.
         self._known: dict[bytes, _Known] = {}
 
     def __call__(self, request: bytes) -> bytes:
         """Return the reply to one request, both without a header and at least one byte long."""
+        function = request[0]
+        if function in self._own:
+            return answer(self._bank, request, self._own)
         known = self._known.get(request[:_WRITE_HEAD])
         if known is None or known[0] != len(request):
             self._learn(request)
@@ -141,8 +145,8 @@ class Answers:
 
     def _learn(self, request: bytes) -> None:
         """Prepare for a request that is well formed, if the instrument can."""
-        bank, function = self._bank, request[0]
-        if not isinstance(bank, PacketBank) or len(request) < _BODY.size:
+        bank, function = self._preparing, request[0]
+        if bank is None or len(request) < _BODY.size:
             return
         _, address, number = _BODY.unpack_from(request)
         if address + number > _REGISTERS:
