@@ -11,7 +11,9 @@ from rich.console import Console
 from rich.errors import LiveError
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-_MESSAGE = "compiling the numerical kernels (once on this machine)"
+MESSAGE = "compiling the numerical kernels (once on this machine)"
+"""What is printed at the first compilation."""
+
 _KIND = "numba:compile"
 
 
@@ -59,7 +61,7 @@ class CompilationDisplay(event.Listener):
             return
         if not self._said:
             self._said = True
-            self._error_console.print(_MESSAGE, highlight=False, soft_wrap=True)
+            self._error_console.print(MESSAGE, highlight=False, soft_wrap=True)
             self._progress.start_task(self._task)
         # Not while the progress of a run is drawn on the same console.
         with suppress(LiveError):

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from bench.cli import main
+from bench.compilation_display import MESSAGE
 
 
 @pytest.hookimpl(trylast=True)
@@ -74,13 +75,16 @@ def finished_process():
 
 @pytest.fixture
 def bench(capsys):
-    """Run a command in this process; return exit code, standard output and standard error."""
+    """Run a command in this process; return exit code, standard output and standard error.
+
+    Without the line of a first use, which depends on what ran before on this machine.
+    """
 
     def run(*arguments):
         with pytest.raises(SystemExit) as stopped:
             main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
+        return stopped.value.code or 0, captured.out, captured.err.replace(f"{MESSAGE}\n", "")
 
     return run
 

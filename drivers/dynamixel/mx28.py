@@ -9,7 +9,8 @@ setting `zero_counts` holds until the next power cycle.
 The EEPROM wears: the driver writes an item there only if its value differs, with the torque off. Those items
 are operating mode, drive mode, return delay time, and the shutdown mask, to which overload, electrical shock
 and overheating are added if they are missing. Set-points, profile and bus watchdog live in RAM. Limits of
-velocity, acceleration, PWM, temperature and voltage, and the homing offset, are left as the bench builder set them.
+velocity, acceleration, PWM, temperature and voltage, and the homing offset, are left as the bench builder set them;
+a homing offset other than 0 is refused together with the bus watchdog.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class _Item:
 _DELAY = _Item(9, 1, "return delay time")
 _DRIVE_MODE = _Item(10, 1, "drive mode")
 _MODE = _Item(11, 1, "operating mode")
+_MODES = _Item(9, 4, "return delay time, modes and secondary id")
+_HOMING_OFFSET = _Item(20, 4, "homing offset")
 _ACCELERATION_LIMIT = _Item(40, 4, "acceleration limit")
 _VELOCITY_LIMIT = _Item(44, 4, "velocity limit")
 _SHUTDOWN = _Item(63, 1, "shutdown mask")
@@ -199,10 +202,10 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     does not allow is refused before anything is written to its EEPROM.
 
     While the torque is on, the servo watches its host (`watchdog` of the settings, 2.5 s by default): if no packet
-    comes for that long, it stops where it is, holds, and takes no more goals. The watchdog takes 2.54 s at most, and
-    the longest pause between two ticks of the bench is 2 s, hence the default. It is armed just before the torque is
-    switched on. Once it has expired, every reading, every set-point and the status of the motion raise; `safe`,
-    `reboot` and `connect` clear it by writing 0 to it.
+    comes for that long, to any servo of the bus, it stops where it is, holds, and answers goals by error 4. The
+    watchdog takes 2.54 s at most, and the longest pause between two ticks of the bench is 2 s, hence the default. It
+    is armed just before the torque is switched on. Once it has expired, every reading, every set-point and the status
+    of the motion raise; `safe`, `reboot` and `connect` clear it by writing 0 to it.
 
     A hardware error of the servo (overload, overheating, ...) comes with every answer as its alert bit, and
     is raised with its meaning, voltage and temperature. After a shutdown only `reboot` or a power cycle brings
@@ -218,6 +221,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
+        self._names = [signal.name for signal in self.signals]
         self._goal = 0
         self._armed = False
         self._expired = False
@@ -254,7 +258,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         direction = self._settings.direction
         velocity_in_unit = direction * velocity * _VELOCITY_UNIT * self._settings.per_radian
         values = (self._position(position), velocity_in_unit, direction * load * 1e-3)
-        return {signal.name: value for signal, value in zip(self.signals, values, strict=True)}
+        return dict(zip(self._names, values, strict=True))
 
     def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
         """Take the present position as the goal and hold it; does nothing while the torque is off."""
@@ -317,6 +321,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         self._ensure_answers()
         if self._line.alert:
             raise self._fault()
+        self._refuse_homing_offset()
         self._check_limit("profile_velocity", self._velocity_units, _VELOCITY_LIMIT, _VELOCITY_UNIT, "rad/s")
         self._check_limit(
             "profile_acceleration", self._acceleration_units, _ACCELERATION_LIMIT, _ACCELERATION_UNIT, "rad/s²"
@@ -326,10 +331,14 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
             raise DeviceError(self.name, "does not switch its torque off; power-cycle it")
         self._write(_WATCHDOG, 0)
         self._armed = self._expired = False
-        self._set_up(_MODE, _EXTENDED_POSITION_MODE)
-        self._set_up(_DRIVE_MODE, 0)
-        self._set_up(_DELAY, round(settings.return_delay / _DELAY_UNIT))
-        self._set_up(_SHUTDOWN, self._read(_SHUTDOWN) | _REQUIRED_SHUTDOWN)
+        delay, drive_mode, mode, _ = self._read(_MODES).to_bytes(_MODES.size, "little")
+        self._set_up(_MODE, mode, _EXTENDED_POSITION_MODE)
+        self._set_up(_DRIVE_MODE, drive_mode, 0)
+        self._set_up(_DELAY, delay, round(settings.return_delay / _DELAY_UNIT))
+        shutdown = self._read(_SHUTDOWN)
+        self._set_up(_SHUTDOWN, shutdown, shutdown | _REQUIRED_SHUTDOWN)
+        # A servo that does not report its feedback is found here, not in the first motion.
+        self._feedback()
         self._setpoint = math.nan
 
     def _ensure_answers(self) -> None:
@@ -341,6 +350,16 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
             self._line.tell(WRITE, struct.pack("<HB", _RETURN_LEVEL.address, _ANSWER_EVERYTHING))
             self._read(_RETURN_LEVEL)
 
+    def _refuse_homing_offset(self) -> None:
+        """Refuse what makes the firmware turn the shaft without end (ROBOTIS DynamixelSDK, issue 584)."""
+        offset = self._read(_HOMING_OFFSET, signed=True)
+        if offset and self._settings.watchdog:
+            raise ConfigurationError(
+                f"{self.name}: watchdog: the servo has a homing offset of {offset} counts, with which an expired bus "
+                "watchdog makes it turn without end in its extended position mode; set the homing offset (register "
+                "20) to 0 with the maker's software and the key zero_counts instead, or do without the watchdog (0)"
+            )
+
     def _check_limit(self, key: str, units: int, item: _Item, unit: float, dimension: str) -> None:
         limit = self._read(item)
         if units > limit:
@@ -349,9 +368,9 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
                 f"servo, {limit * unit:.4g} {dimension}"
             )
 
-    def _set_up(self, item: _Item, value: int) -> None:
-        """Set an item of the EEPROM, but write only a value that differs, as the EEPROM wears."""
-        if self._read(item) == value:
+    def _set_up(self, item: _Item, present: int, value: int) -> None:
+        """Set an item of the EEPROM, but write only what differs from the present value, as the EEPROM wears."""
+        if present == value:
             return
         self._write(item, value)
         found = self._read(item)

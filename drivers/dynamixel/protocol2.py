@@ -80,6 +80,7 @@ class ServoLine:
         self._settings = settings
         self._clock = clock
         self._received = bytearray()
+        self._heads: dict[int, bytes] = {}
         self._unsettled = False
         self._silence = f"no answer within {settings.timeout:g} s"
         self._answered_at = clock.now()
@@ -151,8 +152,30 @@ class ServoLine:
 
     def _answer(self, length: int) -> tuple[str, int, bytes]:
         """Return what is wrong with the answer, if anything, its error byte and its content."""
+        ended = False
+        if not self._received:
+            # As a rule the answer comes whole, and nothing else does.
+            expected = _SHORTEST_ANSWER + length
+            data = self._port.read(expected)
+            whole = len(data) == expected and data.startswith(self._answer_head(length))
+            if whole and not data[8] & ~_ALERT and crc(data[:-2]) == data[-2] | data[-1] << 8:
+                return "", data[8], data[9:-2]
+            self._received += data
+            ended = len(data) < expected
+        return self._search_answer(length, ended)
+
+    def _answer_head(self, length: int) -> bytes:
+        """Return the beginning of an answer that has so many bytes of content, up to the instruction."""
+        head = self._heads.get(length)
+        if head is None:
+            head = self._heads[length] = _HEADER + struct.pack("<BHB", self._settings.id, length + 4, _STATUS)
+        return head
+
+    def _search_answer(self, length: int, ended: bool) -> tuple[str, int, bytes]:
+        """Look for the answer among what has come and comes; `ended` is whether the line has just been silent."""
         for _ in range(_MOST_STRAY_PACKETS):
-            packet = self._read_packet(_SHORTEST_ANSWER + length)
+            packet = self._read_packet(_SHORTEST_ANSWER + length, ended)
+            ended = False
             if packet is None:
                 return self._silence, 0, b""
             if packet == b"":
@@ -168,14 +191,14 @@ class ServoLine:
             return "", error, content
         return "only packets of others", 0, b""
 
-    def _read_packet(self, expected: int) -> bytes | None:
+    def _read_packet(self, expected: int, ended: bool) -> bytes | None:
         """Return the next packet, None after silence, nothing for a damaged one.
 
         All the bytes that are expected are waited for at once, which is faster than to begin with the head. A
         refusal of a read is shorter, so it is noticed after the timeout only.
         """
         received = self._received
-        read, ended = 0, False
+        read = 0
         while read < _MOST_NOISE:
             start = received.find(_HEADER)
             # Without a header, the last bytes may be the beginning of one.
@@ -209,21 +232,30 @@ class ServoLine:
         self._unsettled = False
 
 
-def _crc_row(index: int) -> int:
-    crc = index << 8
+def _crc_step(value: int) -> int:
     for _ in range(8):
-        crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-    return crc & 0xFFFF
+        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+    return value & 0xFFFF
 
 
-_CRC_TABLE = tuple(_crc_row(index) for index in range(256))
+def _table() -> tuple[int, ...]:
+    """Return the CRC of every two bytes: a table of words halves the steps of one of bytes."""
+    by_high = [_crc_step(_crc_step(high << 8)) for high in range(256)]
+    by_low = [_crc_step(low << 8) for low in range(256)]
+    return tuple(high ^ low for high in by_high for low in by_low)
+
+
+_CRC_TABLE = _table()
 
 
 def crc(data: bytes) -> int:
     """Return the CRC-16 of a packet: polynomial 0x8005, initial value 0, highest bit first."""
+    if len(data) % 2:
+        # A zero in front does not change it.
+        data = b"\0" + data
     value = 0
-    for byte in data:
-        value = ((value & 0xFF) << 8) ^ _CRC_TABLE[(value >> 8) ^ byte]
+    for word in struct.unpack(f">{len(data) // 2}H", data):
+        value = _CRC_TABLE[value ^ word]
     return value
 
 

@@ -1,34 +1,35 @@
-"""CANopen through an slcan adapter: service data objects of one node, and its heartbeat.
+"""CANopen on an slcan adapter: service data objects of one node, and its heartbeat.
 
 Source: CiA 301 (SDO, abort codes, heartbeat). The examples in Roboteq's manual leave the bits e and s of the command
-byte clear; the device takes the standard ones that are used here.
+byte clear; the device takes the standard ones that are used here, and answers of both forms are understood.
 """
 
 from __future__ import annotations
 
+import math
 import struct
-import threading
+from binascii import unhexlify
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
 import serial
-from can import CanError, Message
-from can.interfaces.slcan import slcanBus
+from can import CanError
 from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import DeviceConnectionError, DeviceError
+from drivers.roboteq.slcan import SlcanAdapter
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
-_MOST_READS = 4096
-_LONGEST_LINE = 64
 _LONGEST_TEXT = 256
 
 _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
+_SDO_LINE = 21  # characters of a line with an SDO
 _ABORT = 0x80
+_TIMED_OUT = 0x0504_0000
 _BOOT_UP = 0
 
 ABORT_CODES: Mapping[int, str] = {
@@ -60,6 +61,10 @@ ABORT_CODES: Mapping[int, str] = {
     0x0800_0023: "no object dictionary is there",
 }
 """Why the device ends a transfer (CiA 301, SDO abort codes)."""
+
+
+ABSENT = (0x0602_0000, 0x0609_0011)
+"""Codes that say that an object or its subindex does not exist."""
 
 
 class NodeSettings(SerialSettings):
@@ -98,118 +103,38 @@ class AbortedError(Exception):
         self.code = code
 
 
-class SlcanAdapter(slcanBus):
-    """python-can's slcan adapter, reading what has arrived rather than byte by byte.
-
-    The only wait is the port's own timeout, so the port decides which clock it uses. An empty read means silence
-    for the whole timeout.
-
-    Attributes
-    ----------
-    refused : bool
-        Whether the adapter has answered with BEL since this was last cleared.
-    """
-
-    _buffer: bytearray
-
-    def __init__(self, settings: NodeSettings) -> None:
-        self.refused = False
-        self._patient = True
-        try:
-            super().__init__(
-                settings.port,
-                tty_baudrate=settings.baudrate,
-                bitrate=settings.bitrate,
-                sleep_after_open=0,
-                timeout=settings.timeout,
-            )
-        except BaseException:
-            self._abandon()
-            raise
-
-    def frame(self) -> Message | None:
-        """Return the next frame; None after the silence of the port's timeout."""
-        for _ in range(_MOST_FRAMES):
-            # A damaged line is no frame: the request is sent again when the answer does not come.
-            with suppress(ValueError, IndexError, KeyError):
-                return self.recv(0)
-        return None
-
-    def waiting_frames(self) -> list[Message]:
-        """Return the frames that have arrived, without waiting."""
-        frames: list[Message] = []
-        self._patient = False
-        try:
-            while len(frames) < _MOST_FRAMES:
-                frame = self.frame()
-                if frame is None:
-                    break
-                frames.append(frame)
-        finally:
-            self._patient = True
-        return frames
-
-    def release(self) -> None:
-        """Close the channel and the port, in any state."""
-        with suppress(CanError, serial.SerialException, OSError):
-            self.shutdown()
-        self._abandon()
-
-    def _abandon(self) -> None:
-        port = getattr(self, "serialPortOrig", None)
-        if port is not None:
-            port.close()
-
-    def _read(self, timeout: float | None) -> str | None:  # noqa: ARG002 - the port's timeout decides
-        """Return the next line that carries a frame."""
-        port, buffer = self.serialPortOrig, self._buffer
-        for _ in range(_MOST_READS):
-            while line := self._take_line():
-                if line[0] in b"tTrR":
-                    return line.decode("ascii", "replace")
-            if len(buffer) > _LONGEST_LINE:
-                buffer.clear()
-            waiting = port.in_waiting
-            if not (waiting or self._patient):
-                return None
-            received = port.read(max(waiting, 1))
-            if not received:
-                return None
-            buffer += received
-        return None
-
-    def _take_line(self) -> bytes:
-        """Return the next line with its end, nothing if there is none; BEL ends a line, too."""
-        buffer = self._buffer
-        end = buffer.find(b"\r")
-        bell = buffer.find(b"\a", 0, end if end >= 0 else None)
-        if bell >= 0:
-            self.refused = True
-            end = bell
-        line = bytes(buffer[: end + 1])
-        del buffer[: end + 1]
-        return line
+class MissedError(Exception):
+    """A request was not sent, as it would have arrived too late."""
 
 
 class NodeLine:
     """The service data objects of one node: requests, their answers, and the node's heartbeat.
 
     A request that brings no answer is sent again, twice at most; all of them may be carried out twice without
-    harm. An answer for another object is a late one to an earlier request, and is skipped.
+    harm. An answer for another object is a late one to an earlier request, and is skipped. As nothing tells two
+    answers for one object apart, answers that are missing are waited for before the next request, for the timeout
+    at most. Calls must not overlap.
+
+    Attributes
+    ----------
+    round_trip : float
+        How long the last request that was answered took, s.
     """
 
     def __init__(self, device: str, settings: NodeSettings, clock: Clock) -> None:
         self._device = device
         self._settings = settings
         self._clock = clock
-        self._lock = threading.Lock()
-        self._request_id = _SDO_REQUEST + settings.node
-        self._answer_id = _SDO_ANSWER + settings.node
-        self._heartbeat_id = _HEARTBEAT + settings.node
+        self._request_head = b"t%03X8" % (_SDO_REQUEST + settings.node)
+        answer_head = b"t%03X8" % (_SDO_ANSWER + settings.node)
+        self._answer_heads = frozenset((answer_head, answer_head.lower()))
+        self._queries: dict[tuple[int, int], tuple[bytes, bytes]] = {}
         self._heard: set[int] = set()
         self._restarted = False
+        self._missing = 0
+        self.round_trip = 0.0
         try:
-            self._adapter = SlcanAdapter(settings)
+            self._adapter = SlcanAdapter(settings, settings.bitrate)
         except (CanError, serial.SerialException, OSError, ValueError) as error:
             raise DeviceConnectionError(device, f"cannot open {settings.port}: {_cause(error)}") from None
         self._heard_at = clock.now()
@@ -229,13 +154,16 @@ class NodeLine:
 
     def read(self, item: Entry, sub: int) -> int:
         """Read a number; errors are `AbortedError` and `DeviceConnectionError`."""
-        answer = self._exchange(0x40, item, sub)
+        query = self._queries.get((item.index, sub))
+        if query is None:
+            multiplexer = struct.pack("<HB", item.index, sub)
+            query = self._queries[item.index, sub] = self._request(b"\x40" + multiplexer), multiplexer
+        answer = self._exchange(*query)
         command = answer[0]
         # The maker's own examples leave the bits e and s clear and still say the size.
-        data = answer[4 : 8 - (command >> 2 & 3)]
         if command >> 5 != 2 or command & 3 == 1:
             raise DeviceError(self._device, f"answered {answer.hex(' ')} for its {described(item, sub)}")
-        return int.from_bytes(data, "little", signed=item.signed)
+        return int.from_bytes(answer[4 : 8 - (command >> 2 & 3)], "little", signed=item.signed)
 
     def read_text(self, item: Entry) -> str:
         """Read a text, in one piece or in segments; errors as of `read`."""
@@ -245,89 +173,128 @@ class NodeLine:
                 return self._read_text(item)
         return self._read_text(item)
 
-    def _read_text(self, item: Entry) -> str:
-        answer = self._exchange(0x40, item, 0)
-        text, toggle = b"", 0
-        if answer[0] & 2:
-            text = answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
-        else:
-            last = False
-            while not last and len(text) < _LONGEST_TEXT:
-                segment = self._exchange(0x60 | toggle, item, 0)
-                if segment[0] & 0x10 != toggle:
-                    raise DeviceError(self._device, f"answered {segment.hex(' ')} for its {described(item, 0)}")
-                text += segment[1 : 8 - (segment[0] >> 1 & 7)]
-                last = bool(segment[0] & 1)
-                toggle ^= 0x10
-        return text.split(b"\0")[0].decode("ascii", "replace").strip()
+    def write(self, item: Entry, value: int, sub: int, *, before: float = math.inf) -> None:
+        """Write a number, which is to arrive before an instant (s); errors are those of `read`.
 
-    def write(self, item: Entry, value: int, sub: int) -> None:
-        """Write a number; errors are those of `read`."""
+        Raises `MissedError` if it would arrive later: it is not sent then, or not sent again.
+        """
+        multiplexer = struct.pack("<HB", item.index, sub)
         data = value.to_bytes(item.size, "little", signed=item.signed)
-        answer = self._exchange(0x23 | (4 - item.size) << 2, item, sub, data)
+        request = self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data)
+        answer = self._exchange(request, multiplexer, before)
         if answer[0] != 0x60:
             raise DeviceError(self._device, f"answered {answer.hex(' ')} for its {described(item, sub)}")
 
-    def _exchange(self, command: int, item: Entry, sub: int, data: bytes = b"") -> bytes:
-        """Send a request; return the eight bytes of its answer."""
-        segment = command >> 5 == 3
-        multiplexer = b"" if segment else struct.pack("<HB", item.index, sub)
-        payload = (bytes((command,)) + multiplexer + data).ljust(8, b"\0")
-        request = Message(arbitration_id=self._request_id, is_extended_id=False, data=payload)
-        adapter = self._adapter
+    def _read_text(self, item: Entry) -> str:
+        multiplexer = struct.pack("<HB", item.index, 0)
+        answer = self._exchange(self._request(b"\x40" + multiplexer), multiplexer)
+        if answer[0] & 2:
+            text = answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
+        else:
+            text = self._read_segments(item, multiplexer)
+        return text.split(b"\0")[0].decode("ascii", "replace").strip()
+
+    def _read_segments(self, item: Entry, multiplexer: bytes) -> bytes:
+        text, toggle, last = b"", 0, False
+        while not last and len(text) < _LONGEST_TEXT:
+            try:
+                segment = self._exchange(self._request(bytes((0x60 | toggle,))))
+            except DeviceConnectionError:
+                # CiA 301: the client ends a transfer that has stopped. The answer may still come.
+                with suppress(serial.SerialException, OSError):
+                    self._adapter.transmit(self._request(b"\x80" + multiplexer + struct.pack("<I", _TIMED_OUT)))
+                raise
+            if segment[0] & 0x10 != toggle:
+                raise DeviceError(self._device, f"answered {segment.hex(' ')} for its {described(item, 0)}")
+            text += segment[1 : 8 - (segment[0] >> 1 & 7)]
+            last = bool(segment[0] & 1)
+            toggle ^= 0x10
+        return text
+
+    def _request(self, payload: bytes) -> bytes:
+        """Return the line of a request."""
+        return b"%s%s\r" % (self._request_head, payload.ljust(8, b"\0").hex().upper().encode("ascii"))
+
+    def _exchange(self, request: bytes, multiplexer: bytes = b"", before: float = math.inf) -> bytes:
+        """Send the line of a request; return the eight bytes of its answer."""
+        adapter, clock = self._adapter, self._clock
+        refusals = adapter.refusals
         try:
-            with self._lock:
-                for frame in adapter.waiting_frames():
-                    self._notice(frame)
-                adapter.refused = False
-                # Twice the same segment would be a wrong toggle bit.
-                for _ in range(1 if segment else 1 + RESENDS):
-                    adapter.send(request, timeout=self._settings.timeout)
-                    answer = self._answer(multiplexer)
-                    if answer is not None:
-                        if answer[0] == _ABORT:
-                            raise AbortedError(int.from_bytes(answer[4:], "little"))
-                        return answer
+            while (line := adapter.line(wait=False)) is not None:
+                self._notice(line)
+            if self._missing:
+                self._settle()
+            # Twice the same segment would be a wrong toggle bit.
+            for _ in range(1 + RESENDS if multiplexer else 1):
+                sent_at = clock.now()
+                if sent_at + self.round_trip >= before:
+                    raise MissedError
+                adapter.transmit(request)
+                answer = self._answer(multiplexer, sent_at)
+                if answer is not None:
+                    self.round_trip = clock.now() - sent_at
+                    if answer[0] == _ABORT:
+                        raise AbortedError(int.from_bytes(answer[4:], "little"))
+                    return answer
+                self._missing += 1
         except (CanError, serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, _cause(error)) from None
-        raise self._silence()
+        raise self._silence(adapter.refusals - refusals)
 
-    def _answer(self, multiplexer: bytes) -> bytes | None:
+    def _answer(self, multiplexer: bytes, sent_at: float) -> bytes | None:
         """Return the answer, or None if it does not come in time."""
-        adapter, clock = self._adapter, self._clock
-        end = clock.now() + self._settings.timeout
+        adapter = self._adapter
         for _ in range(_MOST_FRAMES):
-            frame = adapter.frame()
-            if frame is None:
+            line = adapter.line()
+            if line is None:
                 return None
-            data = frame.data
-            if frame.arbitration_id == self._answer_id and len(data) == 8 and not frame.is_extended_id:
-                answer = bytes(data)
+            answer = self._notice(line)
+            if answer:
                 # An answer to a segment does not name its object; an abort and all others do.
-                if answer[1:4] == multiplexer or (not multiplexer and (answer[0] >> 5 == 0 or answer[0] == _ABORT)):
+                if answer[1:4] == multiplexer:
                     return answer
-            else:
-                self._notice(frame)
-            if clock.now() >= end:
+                if not multiplexer and (answer[0] >> 5 == 0 or answer[0] == _ABORT):
+                    return answer
+            if self._clock.now() >= sent_at + self._settings.timeout:
                 return None
         return None
 
-    def _notice(self, frame: Message) -> None:
-        """Take note of a heartbeat."""
-        identifier = frame.arbitration_id
-        if frame.is_extended_id or not _HEARTBEAT < identifier < _HEARTBEAT + 128 or len(frame.data) != 1:
-            return
-        if identifier == self._heartbeat_id:
-            self._heard_at = self._clock.now()
-            self._restarted = self._restarted or frame.data[0] == _BOOT_UP
-        else:
-            self._heard.add(identifier - _HEARTBEAT)
+    def _settle(self) -> None:
+        """Wait for the answers that are missing, for the timeout at most; they are late, and are not used."""
+        end = self._clock.now() + self._settings.timeout
+        for _ in range(_MOST_FRAMES):
+            line = self._adapter.line()
+            if line is not None and self._notice(line):
+                self._missing -= 1
+            if line is None or not self._missing or self._clock.now() >= end:
+                break
+        self._missing = 0
 
-    def _silence(self) -> DeviceConnectionError:
+    def _notice(self, line: bytes) -> bytes:
+        """Return the eight bytes of an SDO of the node, none for other frames; take note of a heartbeat."""
+        try:
+            if line[:5] in self._answer_heads and len(line) >= _SDO_LINE:
+                return unhexlify(line[5:_SDO_LINE])
+            identifier = int(line[1:4], 16)
+            if _HEARTBEAT < identifier < _HEARTBEAT + 128 and line[4:5] == b"1":
+                self._notice_heartbeat(identifier - _HEARTBEAT, unhexlify(line[5:7]))
+        except ValueError:
+            # A damaged line is no frame: the request is sent again when the answer does not come.
+            return b""
+        return b""
+
+    def _notice_heartbeat(self, node: int, state: bytes) -> None:
+        if node != self._settings.node:
+            self._heard.add(node)
+        elif state:
+            self._heard_at = self._clock.now()
+            self._restarted = self._restarted or state[0] == _BOOT_UP
+
+    def _silence(self, refusals: int) -> DeviceConnectionError:
         settings = self._settings
         found = f"; heard of node {', '.join(map(str, sorted(self._heard)))} instead" if self._heard else ""
-        if self._adapter.refused:
-            found += "; the adapter reports an error"
+        if refusals:
+            found += f"; the adapter reports an error ({refusals} BEL)"
         problem, speed = f"no answer within {settings.timeout:g} s", f"{settings.bitrate} bit/s"
         return no_answer(self._device, settings, problem, "node", settings.node, found, speed)
 

@@ -2,7 +2,7 @@
 
 Sources: Roboteq CANBus Networking Manual V2.0 (objects, types, scales), the electronic data sheet
 `roboteq_motor_controllers_v60.eds` (communication objects), Roboteq Advanced Digital Motor Controller User Manual
-V1.8 (watchdog `RWD`, emergency stop).
+V1.8 (watchdog `RWD`, p. 286; emergency stop).
 
 The duty cycle of the output is D = command / 1000. The voltage depends on the load:
 
@@ -36,11 +36,12 @@ from bench.devices import Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.roles import VoltageSupply
 from drivers.device import RecoverableDevice, attempt
-from drivers.roboteq.canopen import AbortedError, Entry, NodeLine, NodeSettings, described
+from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
 
 DEVICE_TYPE = 0x000F0191
 """Object 0x1000 of a controller: device profile 401 (electronic data sheet)."""
 
+_MOST_CHANNELS = 3
 _FULL = 1000  # command of a duty cycle of 1
 _LAST_DIGIT = 0.1  # of the battery voltage, V
 _ARRIVAL_TIMEOUT = 5.0
@@ -92,7 +93,9 @@ CHANNEL_FLAGS: Mapping[int, tuple[str, str]] = {
 class SupplySettings(NodeSettings):
     """Rig-file settings of a Roboteq controller as a voltage supply."""
 
-    channel: int = Field(default=1, ge=1, le=3, description="motor output, 1 to as many as the controller has")
+    channel: int = Field(
+        default=1, ge=1, le=_MOST_CHANNELS, description="motor output, 1 to as many as the controller has"
+    )
     output: Literal["average", "rms"] = Field(
         description="which voltage is set: average (behind an LC filter) or rms (heating, without a filter)"
     )
@@ -123,14 +126,16 @@ class SupplySettings(NodeSettings):
 class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     """One channel of a Roboteq brushed motor controller as a PWM voltage supply.
 
-    `connect` sends a command of 0. A device with a fault is refused; `recover` releases its emergency stop.
+    `connect` sends a command of 0 to every channel. A device with a fault is refused; `recover` releases its
+    emergency stop.
 
     The controller watches its host: when no command has come for as long as its watchdog is set to, it drops
-    its output by itself. Only commands feed the watchdog, queries do not (User Manual V1.8 says so of the
-    serial commands; that CANopen is alike is an assumption). So `measure` and `glance` send the command again;
-    while a voltage is held, ask for readings more often than the watchdog is long. After a longer gap the next
-    command would resume the previous power: the driver sends 0 first, and the reading that comes too late raises
-    `DeviceError`, as the voltage was not held. The set-point is 0 after the output was dropped.
+    its outputs by itself. Only commands feed the watchdog, from CAN as well; queries do not. So `measure` and
+    `glance` send the command again; while a voltage is held, ask for readings more often than the watchdog is long.
+    After a longer gap the next command resumes the previous power, on all channels. So the first one is 0, to every
+    channel if one had a voltage, and a command that had to be sent again is not sent as late as that. The reading
+    that comes too late raises `DeviceError`, as the voltage was not held. The set-point is 0 after the output was
+    dropped.
 
     The current is the one that the controller reports, with its resolution of 0.1 A; of what it is the mean within
     a PWM period is not documented.
@@ -144,6 +149,8 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         super().__init__(name, settings, clock, line)
         self._lock = threading.RLock()
         self._limits = Limits(*settings.voltage_limits, "V")
+        self._voltage_name, self._current_name = (signal.name for signal in self.signals)
+        self._channels: tuple[int, ...] = (settings.channel,)
         self._command = 0
         self._battery = math.nan
         self._commanded_at = -math.inf
@@ -176,9 +183,15 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             self._check()
             battery = self._read_battery()
             command = self._command_for(value, battery)
-            if self._was_silent():
-                self._send(0)
-            self._send(command)
+            if self._was_silent() or not self._send(command):
+                self._zero()
+                if not self._send(command):
+                    self._drop()
+                    raise DeviceError(
+                        self.name,
+                        f"no command arrives within the watchdog of {self._settings.watchdog:g} s; lengthen it (^RWD "
+                        "and the key watchdog)",
+                    )
             self._setpoint, self._battery = value, battery
             self._powered = False
             self._order += 1
@@ -200,15 +213,15 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             current = self._read(_AMPS, self._settings.channel) / 10
             self._check()
             self._keep(power, battery)
-            voltage_signal, current_signal = self.signals
-            return {voltage_signal.name: self._voltage(power, battery), current_signal.name: current}
+            return {self._voltage_name: self._voltage(power, battery), self._current_name: current}
 
     def safe(self) -> None:
         """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
         with self._lock:
             self._order += 1
             channel = self._settings.channel
-            failures = attempt(partial(self._write, _COMMAND, 0, channel), partial(self._write, _STOP, channel))
+            zeros = [partial(self._write, _COMMAND, 0, number) for number in self._resumable()]
+            failures = attempt(*zeros, partial(self._write, _STOP, channel))
             self._setpoint, self._command = 0.0, 0
             if not failures and self._is_off():
                 return
@@ -234,7 +247,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         with self._lock:
             self._order += 1
             # Whether the release brings the last command back is not documented.
-            self._send(0)
+            self._zero()
             self._write(_RELEASE, 1)
             self._drop()
             self._check()
@@ -245,10 +258,14 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             super().close()
 
     def _identify(self) -> Identity:
-        device_type = self._read(_DEVICE_TYPE)
         name = self._read_text(_DEVICE_NAME)
         # That the name begins or ends with the maker's own, as in the data sheet, is an assumption.
-        if "roboteq" not in name.lower() if name else device_type != DEVICE_TYPE:
+        known = "roboteq" in name.lower()
+        if not known:
+            # Without a name the type decides.
+            device_type = self._read(_DEVICE_TYPE)
+            known = not name and device_type == DEVICE_TYPE
+        if not known:
             vendor = ""
             with suppress(DeviceError):
                 vendor = f", vendor 0x{self._read(_IDENTITY, 1):08X}"
@@ -273,13 +290,22 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
     def _configure(self) -> None:
         settings = self._settings
-        try:
-            self._line.read(_POWER, settings.channel)
-        except AbortedError as error:
-            raise ConfigurationError(
-                f"{self.name}: channel: the controller does not have channel {settings.channel} ({error})"
-            ) from None
-        self._send(0)
+        now = self._clock.now()
+        self._channels = ()
+        # The channel of this driver first; which others there are shows in the same way.
+        for channel in sorted(range(1, _MOST_CHANNELS + 1), key=lambda number: number != settings.channel):
+            try:
+                self._line.write(_COMMAND, 0, channel)
+            except AbortedError as error:
+                if error.code not in ABSENT:
+                    raise self._refused(_COMMAND, 0, channel, error) from None
+                if channel == settings.channel:
+                    raise ConfigurationError(
+                        f"{self.name}: channel: the controller does not have channel {channel} ({error})"
+                    ) from None
+            else:
+                self._channels += (channel,)
+        self._commanded_at, self._command = now, 0
         self._line.take_restart()
         # Three heartbeats in the time allowed, so that one that is lost does not matter.
         allowed = int(1e3 * settings.heartbeat / 3.0)
@@ -317,25 +343,44 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         dropped = self._powered and power == 0
         self._powered = self._powered or power * self._command > 0
         if self._was_silent() or dropped:
-            silence = self._clock.now() - self._commanded_at
-            self._drop()
-            raise DeviceError(
-                self.name,
-                f"the output was dropped: the last command is {silence:.3g} s old and the watchdog "
-                f"{self._settings.watchdog:g} s long; ask for readings more often or lengthen it (^RWD and the "
-                "key watchdog)",
-            )
+            raise self._dropped()
         # The last digit flickers; following it would make the voltage flicker.
         if abs(battery - self._battery) > 1.5 * _LAST_DIGIT:
             self._command = self._command_for(self._setpoint, battery)
             self._battery = battery
-        self._send(self._command)
+        if not self._send(self._command):
+            raise self._dropped()
+
+    def _dropped(self) -> DeviceError:
+        """End the set-point that was not held; return the error."""
+        silence = self._clock.now() - self._commanded_at
+        self._drop()
+        return DeviceError(
+            self.name,
+            f"the output was dropped: the last command is {silence:.3g} s old and the watchdog "
+            f"{self._settings.watchdog:g} s long; ask for readings more often or lengthen it (^RWD and the "
+            "key watchdog)",
+        )
 
     def _drop(self) -> None:
         """Command 0, which ends the present set-point."""
         self._order += 1
         self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
-        self._send(0)
+        self._zero()
+
+    def _zero(self) -> None:
+        """Command 0 on every channel that this command may resume, back to back."""
+        now = self._clock.now()
+        for channel in self._resumable():
+            self._write(_COMMAND, 0, channel)
+        self._commanded_at, self._command = now, 0
+
+    def _resumable(self) -> tuple[int, ...]:
+        """Return the channels that the next command may resume, that of this driver first.
+
+        All of them after a silence, unless the last command was 0: so were those to the other channels.
+        """
+        return self._channels if self._command and self._was_silent() else self._channels[:1]
 
     def _arrived(self, order: int) -> bool:
         with self._lock:
@@ -389,16 +434,19 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def _read_battery(self) -> float:
         return self._read(_VOLTS, _BATTERY) / 10
 
-    def _send(self, command: int) -> None:
+    def _send(self, command: int) -> bool:
+        """Send a command; return whether it arrived before the device's watchdog could expire."""
         # The device takes it somewhere between request and answer; the earlier one is the safe assumption.
         now, watchdog = self._clock.now(), self._settings.watchdog
-        self._write(_COMMAND, command, self._settings.channel)
-        if command and self._clock.now() - self._commanded_at >= watchdog > 0.0:
-            # It had to be sent again, and may have come late enough to resume the previous power.
-            now = self._clock.now()
-            self._write(_COMMAND, command, self._settings.channel)
-        self._commanded_at = now
-        self._command = command
+        end = self._commanded_at + watchdog if watchdog else math.inf
+        try:
+            self._write(_COMMAND, command, self._settings.channel, before=end)
+        except MissedError:
+            return False
+        if self._clock.now() >= end:
+            return False
+        self._commanded_at, self._command = now, command
+        return True
 
     def _read(self, item: Entry, sub: int = 0) -> int:
         try:
@@ -413,8 +461,11 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         except AbortedError:
             return ""
 
-    def _write(self, item: Entry, value: int, sub: int = 0) -> None:
+    def _write(self, item: Entry, value: int, sub: int = 0, *, before: float = math.inf) -> None:
         try:
-            self._line.write(item, value, sub)
+            self._line.write(item, value, sub, before=before)
         except AbortedError as error:
-            raise DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}") from None
+            raise self._refused(item, value, sub, error) from None
+
+    def _refused(self, item: Entry, value: int, sub: int, error: AbortedError) -> DeviceError:
+        return DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}")

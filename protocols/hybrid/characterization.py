@@ -176,13 +176,15 @@ def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
     T7 answers one or two requests in a millisecond.
     """
     height = parameters.voltage
+    # Half a sample sooner, as the instants of samples are rounded.
+    begin = parameters.rest - 0.5 / parameters.rate
     yield Phase("step of the voltage")
     yield _play(
         slots,
         "piezo step",
         parameters.rate,
         parameters.rest + parameters.duration,
-        {"fine": lambda t: height if t >= parameters.rest else 0.0},
+        {"fine": lambda t: height if t >= begin else 0.0},
         ((min(0.0, height), max(0.0, height)),),
         ("response",),
     )

@@ -25,8 +25,8 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import PlantParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
+from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
@@ -61,10 +61,6 @@ FaultName = Literal[
 class MusclePlant(Protocol):
     """What frame and instruments need of a muscle."""
 
-    @property
-    def parameters(self) -> PlantParameters:
-        """Its numbers."""
-
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds."""
 
@@ -79,6 +75,10 @@ class MusclePlant(Protocol):
 
     def clamp(self, length_metre: float) -> None:
         """Hold the end at a position, m from rest."""
+
+    @property
+    def parameters(self) -> MuscleParameters:
+        """Its numbers."""
 
     @property
     def current(self) -> float:
@@ -121,6 +121,9 @@ class MuscleLaboratorySettings(LaboratorySettings, ABC):
 class Frame:
     """The muscle with its load or stage: a `sim_devices.world.Plant`.
 
+    No command of a host breaks the muscle: a diode in the muscle's wires blocks a reversed voltage, a suppressor
+    holds a higher one at the largest that the muscle takes, and the stage has an end stop to either side.
+
     Parameters
     ----------
     muscle : MusclePlant
@@ -140,6 +143,15 @@ class Frame:
         self.t7: EmulatedT7 | None = None
         self._fastened = False
 
+    def apply(self, voltage: float) -> None:
+        """Apply the voltage of the supply, V, to the muscle's wires."""
+        self.muscle.apply(min(max(voltage, 0.0), self.muscle.parameters.maximum_voltage))
+
+    @property
+    def current(self) -> float:
+        """Current through the muscle, A."""
+        return self.muscle.current
+
     def hang(self, newton: float) -> None:
         """Take the end off the stage, if it is there, and hang a load on it."""
         self._fastened = False
@@ -155,7 +167,8 @@ class Frame:
             self.muscle.blow(self.t7.dio_level(FAN_LINE))
         if self._fastened and self.drum is not None:
             # A servo on its way is due every 20 ms, so that the world advances in pieces as short as that.
-            self.muscle.clamp(self.drum.position_after(dt))
+            reach = self.muscle.parameters.reach
+            self.muscle.clamp(min(max(self.drum.position_after(dt), -reach), reach))
         self.muscle.advance(dt)
 
 
@@ -195,7 +208,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.supply = EmulatedRoboteq(
             "supply",
             self.world,
-            self.muscle,
+            self.frame,
             battery_voltage=settings.battery_voltage,
             watchdog=settings.supply_watchdog,
             rng=supply,

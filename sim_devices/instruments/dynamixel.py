@@ -5,9 +5,12 @@ load on the shaft.
 
 Assumptions, where the e-Manual is silent:
 
-- Packets that are addressed to the servo, or to all, feed its bus watchdog. When it expires the shaft stops
-  at that instant, goal position and goal velocity become the present ones, and the torque stays on; besides
-  goals, register 98 itself takes nothing but 0 then.
+- Every instruction packet on the bus feeds the bus watchdog, those for other servos as well. When it expires the
+  shaft stops at that instant, goal position and goal velocity become the present ones, and the torque stays on;
+  besides goals, register 98 itself takes nothing but 0 then.
+- In extended position mode with a homing offset other than 0 the shaft runs away instead, at full speed, until the
+  torque goes off or the register is cleared and a goal written (ROBOTIS DynamixelSDK, issue 584; a later firmware is
+  said to cure it).
 - Switching the torque on starts a motion to the goal position in its register. A goal written while
   the torque is off is kept.
 - A hardware error stays until a reboot. The first load at or beyond the allowed output counts as overload
@@ -22,7 +25,7 @@ Assumptions, where the e-Manual is silent:
 - The internal temperature follows the square of the output with one time constant.
 - A write is checked as a whole before any of it is stored; one that begins within an item has the wrong length.
 
-Not emulated: time-based profiles (drive mode bit 2 is out of range), protocol 1.0, and indirect addresses.
+Not emulated: time-based profiles (drive mode bit 2 is out of range), and protocol 1.0.
 """
 
 from __future__ import annotations
@@ -50,7 +53,6 @@ from sim_devices.instruments.dynamixel_table import (
     FULL_PWM,
     GOALS,
     HIGHEST_GOAL,
-    ITEM_OF_BYTE,
     ITEMS,
     POSITION,
     PWM,
@@ -58,10 +60,10 @@ from sim_devices.instruments.dynamixel_table import (
     VELOCITY_UNIT,
     WATCHDOG_EXPIRED,
     WATCHDOG_UNIT,
+    ControlTable,
     ErrorNumber,
     HardwareError,
     Item,
-    check_value,
 )
 from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
 from sim_devices.world import World
@@ -164,6 +166,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._hardware_error = HardwareError(0)
         self._registered: tuple[int, bytes] | None = None
         self._watchdog_due = self._restart_due = self._step_due = self._overload_due = math.inf
+        self._attended_at = -math.inf
+        self._table = ControlTable(self._values, self._readings)
         self._power_on()
         world.add(self)
 
@@ -215,11 +219,28 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     def answering(self) -> bool:
         """Whether packets reach the servo and it is not restarting."""
         with self.world.at_present():
-            return self.plugged_in and math.isinf(self._restart_due)
+            return self._reachable
+
+    def hear(self) -> bool:
+        """Take note of an instruction packet on the bus, for whichever servo; return whether it got here."""
+        self.world.advance()
+        if self._reachable:
+            self._attend_at(self._clock.now())
+        return self._reachable
 
     def attend(self) -> None:
-        """Come up to the clock's present time and feed the bus watchdog: a packet has arrived."""
+        """Come up to the clock's present time and feed the bus watchdog."""
         with self.world.at_present():
+            self._attend_at(self._clock.now())
+
+    @property
+    def _reachable(self) -> bool:
+        return self.plugged_in and self._restart_due == math.inf
+
+    def _attend_at(self, now: float) -> None:
+        # Once an instant is enough: what is written at that instant acts by itself.
+        if now != self._attended_at:
+            self._attended_at = now
             self._follow()
             self._protect()
             self._feed()
@@ -230,16 +251,9 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         Raises `RequestRefusedError` if there are none to return, or one of the addresses is not defined.
         """
         with self.world.lock:
-            self.attend()
-            if length == 0:
-                raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
-            data = bytearray()
-            while len(data) < length:
-                item = ITEM_OF_BYTE.get(address + len(data))
-                if item is None:
-                    raise RequestRefusedError(ErrorNumber.ACCESS)
-                data += self._encoded(item)[address + len(data) - item.address :]
-            return bytes(data[:length])
+            if self._clock.now() != self._attended_at:
+                self.attend()
+            return self._table.read(address, length)
 
     def write_bytes(self, address: int, data: bytes) -> None:
         """Write whole items of the control table.
@@ -249,7 +263,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """
         with self.world.lock:
             self.attend()
-            for item, value in self._decoded(address, data):
+            for item, value in self._checked(address, data):
                 self._store(item, value)
 
     def read_item(self, address: int) -> int:
@@ -266,7 +280,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         """Keep a write for `action`; it is checked now and then. Errors are those of `write_bytes`."""
         with self.world.lock:
             self.attend()
-            self._decoded(address, data)
+            self._checked(address, data)
             self._registered = (address, data)
 
     def action(self) -> None:
@@ -336,6 +350,13 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         with self.world.at_present():
             self._follow()
             self._raise_error(error)
+
+    def power_cycle(self) -> None:
+        """Interrupt the supply: RAM and the number of turns are lost, no answer for `REBOOT_TIME`."""
+        with self.world.at_present():
+            self._follow()
+            self._switch_off()
+            self._restart_due = self.world.time + REBOOT_TIME
 
     def supply(self, volts: float) -> None:
         """Change the input voltage, V; it must be positive."""
@@ -500,33 +521,11 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             return self._angle, 0.0
         return self._trajectory.at(self.world.time)
 
-    def _encoded(self, item: Item) -> bytes:
-        reading = self._readings.get(item.address)
-        value = self._values[item.address] if reading is None else round(reading())
-        bits = 8 * item.size
-        low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if item.signed else (0, (1 << bits) - 1)
-        return min(max(value, low), high).to_bytes(item.size, "little", signed=item.signed)
-
-    def _decoded(self, address: int, data: bytes) -> list[tuple[Item, int]]:
+    def _checked(self, address: int, data: bytes) -> list[tuple[Item, int]]:
         """Return the items that data for an address are, after checking them all."""
-        if not data:
-            raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
-        written = []
-        while data:
-            item = ITEMS.get(address)
-            if item is None:
-                inside = address in ITEM_OF_BYTE
-                raise RequestRefusedError(ErrorNumber.DATA_LENGTH if inside else ErrorNumber.ACCESS)
-            if not item.writable or (item.in_eeprom and self._values[64]):
-                raise RequestRefusedError(ErrorNumber.ACCESS)
-            if len(data) < item.size:
-                raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
-            value = int.from_bytes(data[: item.size], "little", signed=item.signed)
-            check_value(self._values, item, value)
-            if address == 64 and value and self._shut_down:
-                raise RequestRefusedError(ErrorNumber.RESULT_FAIL)
-            written.append((item, value))
-            address, data = address + item.size, data[item.size :]
+        written = self._table.decode(address, data)
+        if self._shut_down and any(item.address == 64 and value for item, value in written):
+            raise RequestRefusedError(ErrorNumber.RESULT_FAIL)
         return written
 
     def _store(self, item: Item, value: int) -> None:
@@ -587,11 +586,14 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._schedule()
 
     def _halt(self) -> None:
-        """Stop the shaft where it is, and hold."""
+        """Stop the shaft where it is, and hold; or run away, as the firmware does with a homing offset."""
         self._values[116] = self._counts(self._angle)
         self._values[104] = 0
-        self._trajectory = Trajectory(self.world.time, self._angle, self._angle)
-        self._velocity = 0.0
+        now, angle, speed = self.world.time, self._angle, 0.0
+        if self._values[11] == EXTENDED and self._values[20]:
+            speed = math.copysign(self._top_speed, self._values[20])
+        self._trajectory = Trajectory.at_velocity(now, angle, 0.0, speed, math.inf)
+        self._velocity = speed
         self._schedule()
 
     def _command(self) -> None:

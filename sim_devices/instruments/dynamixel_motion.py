@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 STALL_TORQUE_PER_VOLT = 2.5 / 12.0
@@ -44,7 +45,7 @@ class Trajectory:
     pieces: tuple[tuple[float, float, float], ...] = ()
     """Duration (s), velocity at its beginning (rad/s) and acceleration (rad/s²) of each piece."""
 
-    @property
+    @cached_property
     def end(self) -> float:
         """When it has ended, s."""
         return self.start + sum(duration for duration, _, _ in self.pieces)

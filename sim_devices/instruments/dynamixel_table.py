@@ -5,13 +5,16 @@ Addresses, sizes, units, ranges and defaults are those of the ROBOTIS e-Manual, 
 Assumption: profile velocity, profile acceleration, goal PWM, goal velocity, and the goal position of position mode
 beyond their limit registers are limit errors; everything else out of range is a range error.
 
+A byte of indirect data that stands for another one of them is the memory of that one.
+
 Kept in the table without effect: baud rate, return delay, secondary id, LED, and all gains but the position P gain.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
@@ -41,6 +44,11 @@ FULL_PWM = 885
 
 VELOCITY, POSITION, EXTENDED, PWM = 1, 3, 4, 16
 """Values of the operating mode (11)."""
+
+INDIRECT = ((168, 224, 28), (578, 634, 28))
+"""Blocks of the indirect addresses: first address, first byte of their data, and how many there are."""
+
+_HIGHEST_ADDRESS = 661
 
 GOALS = (100, 104, 116)
 """Goal PWM, goal velocity and goal position."""
@@ -158,11 +166,137 @@ ITEMS = {
         _reading(140, 4, signed=True),  # position trajectory
         _reading(144, 2),  # present input voltage, 0.1 V
         _reading(146, 1),  # present temperature, °C
+        *(
+            # As delivered, each points to its own byte of data.
+            _setting(first + 2 * place, 2, data + place, _EEPROM_END, _HIGHEST_ADDRESS)
+            for first, data, count in INDIRECT
+            for place in range(count)
+        ),
+        *(_setting(data + place, 1, 0, 0, 255) for _, data, count in INDIRECT for place in range(count)),
     )
 }
-"""The control table by address, without the indirect addresses (168 to 251 and 578 to 661)."""
+"""The control table by address, with the indirect addresses and their data."""
+
+_INDIRECT_ADDRESS_OF = {data + place: first + 2 * place for first, data, count in INDIRECT for place in range(count)}
+"""Where the address is kept that a byte of indirect data stands for."""
 
 ITEM_OF_BYTE = {item.address + offset: item for item in ITEMS.values() for offset in range(item.size)}
+
+
+_FORMATS = {
+    (size, signed): "<" + (code if signed else code.upper())
+    for size, code in ((1, "b"), (2, "h"), (4, "i"))
+    for signed in (False, True)
+}
+"""How an item is carried, by its size and whether it is signed."""
+
+
+_Block = tuple[struct.Struct, list[tuple[int, Callable[[], float] | None, int, int]]]
+"""Whole items: their form, and address, reading, lowest and highest value of each."""
+
+
+class ControlTable:
+    """The control table as bytes: reading and writing across items, and the indirect data.
+
+    Parameters
+    ----------
+    values : mapping of int to int
+        The present values of the items that are kept, by address.
+    readings : mapping of int to callable
+        How the other items get their value, by address; it is rounded.
+    """
+
+    def __init__(self, values: Mapping[int, int], readings: Mapping[int, Callable[[], float]]) -> None:
+        self._values = values
+        self._readings = readings
+        self._blocks: dict[tuple[int, int], _Block] = {}
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return bytes of the table.
+
+        Raises `RequestRefusedError` if there are none to return, or one of the addresses is not defined.
+        """
+        if length == 0:
+            raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
+        block = self._block(address, length)
+        if block is not None:
+            return self._measured(block)
+        # Each item is measured once, so that its bytes belong together.
+        measured: dict[int, bytes] = {}
+        data = bytearray()
+        for byte in range(address, address + length):
+            meant = self._meant(byte)
+            item = ITEM_OF_BYTE.get(meant)
+            if item is None:
+                raise RequestRefusedError(ErrorNumber.ACCESS)
+            if item.address not in measured:
+                measured[item.address] = self._measured(self._block_of([item]))
+            data.append(measured[item.address][meant - item.address])
+        return bytes(data)
+
+    def decode(self, address: int, data: bytes) -> list[tuple[Item, int]]:
+        """Return the items and values that data for an address are.
+
+        Raises `RequestRefusedError` if an item is not defined, incomplete, read-only or locked by the torque, or a
+        value is out of its range.
+        """
+        if not data:
+            raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
+        meant = [self._meant(byte) for byte in range(address, address + len(data))]
+        written, start = [], 0
+        while start < len(data):
+            first = meant[start]
+            item = ITEMS.get(first)
+            if item is None:
+                raise RequestRefusedError(ErrorNumber.DATA_LENGTH if first in ITEM_OF_BYTE else ErrorNumber.ACCESS)
+            if not item.writable or (item.in_eeprom and self._values[64]):
+                raise RequestRefusedError(ErrorNumber.ACCESS)
+            end = start + item.size
+            if meant[start:end] != list(range(first, first + item.size)):
+                raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
+            value = int.from_bytes(data[start:end], "little", signed=item.signed)
+            check_value(self._values, item, value)
+            written.append((item, value))
+            start = end
+        return written
+
+    def _meant(self, address: int) -> int:
+        """Return the address that a byte stands for, which is another one only for indirect data."""
+        kept = _INDIRECT_ADDRESS_OF.get(address)
+        return address if kept is None else self._values[kept]
+
+    def _block(self, address: int, length: int) -> _Block | None:
+        """Return form and sources of addresses that are whole items and no indirect data; None for others."""
+        known = self._blocks.get((address, length))
+        if known is not None:
+            return known
+        items, end = [], address
+        while end < address + length and end in ITEMS and end not in _INDIRECT_ADDRESS_OF:
+            items.append(ITEMS[end])
+            end += ITEMS[end].size
+        if not items or end != address + length:
+            return None
+        block = self._blocks[address, length] = self._block_of(items)
+        return block
+
+    def _block_of(self, items: Sequence[Item]) -> _Block:
+        form = struct.Struct("<" + "".join(_FORMATS[item.size, item.signed][1:] for item in items))
+        return form, [(item.address, self._readings.get(item.address), *_range(item)) for item in items]
+
+    def _measured(self, block: _Block) -> bytes:
+        """Return the bytes of whole items."""
+        form, sources = block
+        kept, values = self._values, []
+        for address, reading, low, high in sources:
+            value = kept[address] if reading is None else round(reading())
+            values.append(low if value < low else high if value > high else value)
+        return form.pack(*values)
+
+
+def _range(item: Item) -> tuple[int, int]:
+    """Return the lowest and the highest value that the bytes of an item can carry."""
+    bits = 8 * item.size
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if item.signed else (0, (1 << bits) - 1)
 
 
 def check_value(values: Mapping[int, int], item: Item, value: int) -> None:

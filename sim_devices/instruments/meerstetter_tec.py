@@ -421,7 +421,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         self._error, self._error_instance, self._error_parameter = error_number, 1, parameter
         self._watchdog_due = math.inf
         if self._values[6310] > 0.0:
-            self._recovery_due = self.world.time + self._values[6310]
+            # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
+            self._recovery_due = self.world.time + max(self._values[6310], RESET_DELAY)
         self._apply()
 
     def _shut_down(self) -> None:

@@ -1,37 +1,37 @@
 """Emulated Roboteq SDC2160: a brushed motor controller as a PWM voltage supply, with its CANopen objects.
 
-The instrument is its object dictionary, its command watchdog and its protections; the plant behind it is the
-load that it heats. Sources: Roboteq CANBus Networking Manual V2.0 (objects, their types and scales), the
-electronic data sheet `roboteq_motor_controllers_v60.eds` (communication objects and their defaults), Roboteq
-Advanced Digital Motor Controller User Manual V1.8 (watchdog `RWD`, limits `ALIM` and `MXPF`), CiA 301
-(abort codes, heartbeat, NMT states).
+The instrument is its objects, its command watchdog and its protections; the plant behind it is the load that it
+heats, at the first motor output. Sources: Roboteq CANBus Networking Manual V2.0 (objects), Roboteq Advanced Digital
+Motor Controller User Manual V1.8 (watchdog `RWD`, limits `ALIM` and `MXPF`), CiA 301 (heartbeat).
+
+Runtime commands feed the watchdog, however they arrive, CAN included (User Manual V1.8, RWD): these are the objects
+0x2000 to 0x20FF. Queries and all other traffic do not. "As soon as a valid command is received, motor operation will
+resume at whichever speed motors were running prior to the watchdog timeout": any command of any channel does.
 
 The duty cycle is the applied power / 1000. With an LC filter the load sees the average, duty cycle × battery
 voltage; without one a resistive load is heated by the RMS voltage, battery voltage × √(duty cycle).
 
 Assumptions, where the manuals are silent or were not at hand:
 
-- Only runtime commands (objects 0x2000 to 0x20FF) feed the watchdog: the user manual says so of the serial
-  commands with `!`, of which these objects are the CANopen form. Queries do not.
-- After the watchdog has expired, the first command of the channel that is not 0 resumes the previous power,
-  and its own value counts only when it is sent again. This is the worst reading of "motor operation will
-  resume at whichever speed motors were running prior"; a command of 0 resumes nothing.
+- The first command of the channel after an expiry that is not 0 resumes the previous power, and its own value
+  counts only when it is sent again, which is the worst reading of the manual. A command of 0 resumes nothing on its
+  own channel, an emergency stop on none.
 - The power follows the command at once (a real device has a ramp), and is 0 as long as a fault stands.
 - The amps limit acts when the power is applied, by scaling it down, and holds until it is applied anew.
 - A command beyond ±1000 ‰ is refused rather than clipped.
 - The device starts its node by itself (autostart); a reset by NMT clears command and emergency stop.
-- Flags have 16 bits (0x2111, 0x2112, according to the manual; the data sheet says 8) and 32 bits (0x2122).
+- A reset by NMT brings the PDOs back to their configuration as delivered.
 - The wording of device name, hardware and software version.
 
-Kept in the dictionary without effect: the consumer heartbeat times (0x1016).
+Kept in the dictionary without effect: consumer heartbeat times (0x1016), encoder counters (0x2003), and, as no script
+runs, user variables (0x2005).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Literal, Protocol
 
 import numpy as np
@@ -40,10 +40,21 @@ from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import VoltageSupply
 from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.roboteq_objects import (
+    CHANNELS,
+    DICTIONARY,
+    FORMATS,
+    INDICES,
+    PDOS,
+    VARIABLES,
+    AbortCode,
+    ChannelFlag,
+    Entry,
+    Fault,
+    NodeState,
+)
+from sim_devices.instruments.roboteq_pdo import ProcessDataObjects, is_configuration
 from sim_devices.world import World
-
-CHANNELS = 2
-"""Motor outputs of an SDC2160; the load is connected to the first."""
 
 DEVICE_TYPE = 0x000F0191
 """Object 0x1000: device profile 401 (electronic data sheet)."""
@@ -65,99 +76,6 @@ _INTERNAL_VOLTAGE = 118  # 0.1 V
 _FIVE_VOLTS = 5000  # mV
 _TEMPERATURES = (32, 30)  # °C: processor, power stage
 _LONGEST_HEARTBEAT_BACKLOG = 4
-
-
-class Fault(IntFlag):
-    """Bits of the fault flags, object 0x2112."""
-
-    OVERHEAT = 0x01
-    OVER_VOLTAGE = 0x02
-    UNDER_VOLTAGE = 0x04
-    SHORT_CIRCUIT = 0x08
-    EMERGENCY_STOP = 0x10
-    SETUP = 0x20
-    MOSFET = 0x40
-    DEFAULT_CONFIGURATION = 0x80
-
-
-class ChannelFlag(IntFlag):
-    """Bits of the channel flags, object 0x2122."""
-
-    AMPS_LIMIT = 0x01
-    STALL = 0x02
-    LOOP_ERROR = 0x04
-    SAFETY_STOP = 0x08
-    FORWARD_LIMIT = 0x10
-    REVERSE_LIMIT = 0x20
-    AMPS_TRIGGER = 0x40
-
-
-class NodeState(IntEnum):
-    """NMT states as a heartbeat reports them (CiA 301)."""
-
-    BOOT_UP = 0
-    STOPPED = 4
-    OPERATIONAL = 5
-    PRE_OPERATIONAL = 127
-
-
-class AbortCode(IntEnum):
-    """Why an SDO transfer ends (CiA 301, SDO abort codes)."""
-
-    TOGGLE = 0x0503_0000
-    COMMAND = 0x0504_0001
-    UNSUPPORTED = 0x0601_0000
-    WRITE_ONLY = 0x0601_0001
-    READ_ONLY = 0x0601_0002
-    NO_OBJECT = 0x0602_0000
-    LENGTH = 0x0607_0010
-    NO_SUBINDEX = 0x0609_0011
-    VALUE = 0x0609_0030
-
-
-Kind = Literal["S8", "U8", "S16", "U16", "S32", "U32", "text"]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One row of the object dictionary."""
-
-    kind: Kind
-    """Type of the value."""
-    readable: bool = True
-    writable: bool = False
-    """Which ways it can be transferred."""
-
-
-def _dictionary() -> dict[tuple[int, int], Entry]:
-    command = {"readable": False, "writable": True}
-    rows: dict[tuple[int, int], Entry] = {
-        (0x1000, 0): Entry("U32"),
-        (0x1001, 0): Entry("U8"),
-        (0x1008, 0): Entry("text"),
-        (0x1009, 0): Entry("text"),
-        (0x100A, 0): Entry("text"),
-        (0x1016, 0): Entry("U8"),
-        **{(0x1016, sub): Entry("U32", writable=True) for sub in range(1, 5)},
-        (0x1017, 0): Entry("U16", writable=True),
-        **{(0x1018, sub): Entry("U32" if sub else "U8") for sub in range(4)},
-        **{(index, 0): Entry("U8", **command) for index in (0x200C, 0x200D, 0x200E)},
-        **{(0x210D, sub): Entry("U16") for sub in (1, 2, 3)},
-        **{(0x210F, sub): Entry("S8") for sub in (1, 2)},
-        (0x2111, 0): Entry("U16"),
-        (0x2112, 0): Entry("U16"),
-    }
-    for channel in range(1, CHANNELS + 1):
-        rows[0x2000, channel] = Entry("S32", **command)
-        rows |= {(index, channel): Entry("S16") for index in (0x2100, 0x2101, 0x2102, 0x210C)}
-        rows[0x2122, channel] = Entry("U32")
-    return rows
-
-
-DICTIONARY = _dictionary()
-"""The emulated part of the object dictionary, by index and subindex."""
-
-_INDICES = frozenset(index for index, _ in DICTIONARY)
 
 
 class HeatingLoad(Protocol):
@@ -192,6 +110,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         CANopen node, 1 to 126.
     bitrate : int
         Speed of the bus, bit/s.
+    send_rates : sequence of int
+        Interval of each TPDO, ms; 0 for never (`^CTPS`).
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
@@ -210,6 +130,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         power_limit: int = _FULL,
         node: int = 1,
         bitrate: int = 125_000,
+        send_rates: Sequence[int] = (0,) * PDOS,
         rng: np.random.Generator | None = None,
     ) -> None:
         super().__init__(name, world, rng)
@@ -226,6 +147,9 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         # The objects have no serial number.
         self._identity = Identity("Roboteq", "SDC2160", "unknown", self._texts[0x100A])
         self._commands = [0] * CHANNELS
+        self._counters = [0] * CHANNELS
+        self._variables = [0] * VARIABLES
+        self._pdos = ProcessDataObjects(node, send_rates, world.clock.now())
         self._held = False
         self._trips = Fault(0)
         self._channel_trips = ChannelFlag(0)
@@ -237,6 +161,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._heartbeat_milliseconds = 100
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = False
+        self._quiet_until = -math.inf
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
         self._readings: dict[int, Callable[[int], int]] = {
@@ -248,6 +173,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             0x2100: self._amps,
             0x2101: lambda sub: 0 if self._held else self._commands[sub - 1],
             0x2102: lambda sub: self._power if sub == 1 else 0,
+            0x2104: lambda sub: self._counters[sub - 1],
+            0x2106: lambda sub: self._variables[sub - 1],
             0x210C: lambda sub: round(self._amps(sub) * abs(self._power) / _FULL),
             0x210D: lambda sub: (_INTERNAL_VOLTAGE, self._battery_reading(), _FIVE_VOLTS)[sub - 1],
             0x210F: lambda sub: _TEMPERATURES[sub - 1],
@@ -283,7 +210,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         """
         row = DICTIONARY.get((index, sub))
         if row is None:
-            raise RequestRefusedError(AbortCode.NO_SUBINDEX if index in _INDICES else AbortCode.NO_OBJECT)
+            raise RequestRefusedError(AbortCode.NO_SUBINDEX if index in INDICES else AbortCode.NO_OBJECT)
         return row
 
     def read_object(self, index: int, sub: int = 0) -> int | str:
@@ -296,7 +223,10 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self.world.advance()
             if not row.readable:
                 raise RequestRefusedError(AbortCode.WRITE_ONLY)
-            return self._texts[index] if row.kind == "text" else self._readings[index](sub)
+            if row.kind == "text":
+                return self._texts[index]
+            reading = self._readings.get(index)
+            return self._pdos.read(index, sub) if reading is None else reading(sub)
 
     def write_object(self, index: int, value: int, sub: int = 0) -> None:
         """Set an object.
@@ -309,17 +239,21 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             self.world.advance()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
+            self._quiet_until = -math.inf
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
                 self._heartbeat_milliseconds = value
                 self._heartbeat_since = self.world.time
+            elif is_configuration(index):
+                self._pdos.write(index, sub, value)
             else:
                 self._command(index, sub, value)
 
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
         with self.world.at_present():
+            self._quiet_until = -math.inf
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -329,29 +263,71 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
             elif command in (129, 130):
                 self._restart(power=command == 129)
 
-    def next_heartbeat(self) -> float:
-        """Return the laboratory time (s) of the next heartbeat; infinity if none is sent."""
-        if self._boot_up_due:
-            return self._clock.now()
-        period = 1e-3 * self._heartbeat_milliseconds
-        return self._heartbeat_since + period if period > 0.0 else math.inf
+    @property
+    def quiet(self) -> bool:
+        """Whether it has nothing to say by itself at the clock's present time."""
+        return self._clock.now() < self._quiet_until
 
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
 
-        The line hands over what was sent meanwhile only when the host speaks, as nothing arrives on it
-        unasked; a host that was silent for an hour finds no hour of heartbeats.
+        A host that did not look at its line for an hour finds no hour of heartbeats there.
         """
-        now = self._clock.now()
+        period = 1e-3 * self._heartbeat_milliseconds
+        # A sum of periods may be short of the instant by its rounding.
+        count = math.floor((self._clock.now() - self._heartbeat_since) / period + 1e-6) if period else 0
+        if not (count or self._boot_up_due):
+            return []
         due = [NodeState.BOOT_UP] if self._boot_up_due else []
         self._boot_up_due = False
-        period = 1e-3 * self._heartbeat_milliseconds
-        if period > 0.0:
-            # A sum of periods may be short of the instant by its rounding.
-            count = math.floor((now - self._heartbeat_since) / period + 1e-6)
+        if count:
             self._heartbeat_since += count * period
             due += [self._state] * min(count, _LONGEST_HEARTBEAT_BACKLOG)
         return due if self.plugged_in else []
+
+    def next_heartbeat(self) -> float:
+        """Return when the next heartbeat or boot-up message is due, s; infinity if none is."""
+        if not self.plugged_in:
+            return math.inf
+        if self._boot_up_due:
+            return self._heartbeat_since
+        return (
+            self._heartbeat_since + 1e-3 * self._heartbeat_milliseconds if self._heartbeat_milliseconds else math.inf
+        )
+
+    # Process data.
+
+    def receive_process_data(self, identifier: int, data: bytes) -> None:
+        """Obey an RPDO; other frames, short ones, and values that are refused, change nothing."""
+        objects = self._pdos.received(identifier)
+        forms = [FORMATS[DICTIONARY[key].kind] for key in objects]
+        if self._state is not NodeState.OPERATIONAL or len(data) < sum(form.size for form in forms):
+            return
+        for (index, sub), form in zip(objects, forms, strict=True):
+            with suppress(RequestRefusedError):
+                self.write_object(index, form.unpack(data[: form.size])[0], sub)
+            data = data[form.size :]
+
+    def process_data(self, *, synchronous: bool) -> list[tuple[int, bytes]]:
+        """Take identifier and data of the TPDOs that a SYNC asks for, or that are due by their send rates."""
+        pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
+        if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
+            return []
+        return [(identifier, b"".join(map(self._encoded, objects))) for identifier, objects in pdos]
+
+    def next_process_data(self) -> float:
+        """Return when the next TPDO is due by its send rate, s; infinity if none is."""
+        return self._pdos.next_due() if self._state is NodeState.OPERATIONAL and self.plugged_in else math.inf
+
+    def next_message(self) -> float:
+        """Return when it next says something by itself, s; until then it is quiet, unless it is disturbed."""
+        instant = min(self.next_heartbeat(), self.next_process_data())
+        # A sum of periods may be short of the instant by its rounding.
+        self._quiet_until = instant - 1e-6
+        return instant
+
+    def _encoded(self, key: tuple[int, int]) -> bytes:
+        return FORMATS[DICTIONARY[key].kind].pack(self.read_object(*key))
 
     # Faults.
 
@@ -391,6 +367,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         with self.world.at_present():
             self.heartbeats()
             self.plugged_in = True
+            self._quiet_until = -math.inf
 
     def _corrupted(self, answer: bytes) -> bytes:
         """Cut the adapter's line in its middle."""
@@ -476,8 +453,12 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         if index == 0x2000:
             if abs(value) > _FULL:
                 raise RequestRefusedError(AbortCode.VALUE)
-            if not (sub == 1 and self._held and value != 0):
+            if not (self._held and value != 0):
                 self._commands[sub - 1] = value
+        elif index == 0x2003:
+            self._counters[sub - 1] = value
+        elif index == 0x2005:
+            self._variables[sub - 1] = value
         elif index == 0x200C:
             self._trips |= Fault.EMERGENCY_STOP
         elif index == 0x200D:
@@ -491,10 +472,14 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def _restart(self, *, power: bool) -> None:
         if power:
             self._commands = [0] * CHANNELS
+            self._counters = [0] * CHANNELS
+            self._variables = [0] * VARIABLES
             self._held = False
             self._trips &= ~Fault.EMERGENCY_STOP
             self._watchdog_due = math.inf
             self._apply()
+        self._pdos.reset(self.world.time)
+        self._quiet_until = -math.inf
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = True
         self._heartbeat_since = self.world.time

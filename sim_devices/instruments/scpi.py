@@ -142,9 +142,11 @@ class EmulatedTextInstrument(EmulatedInstrument):
 
     def _action(self, message: str) -> Action | None:
         """Return what a message makes the instrument do, or None if it is unknown."""
-        known = self._actions.get(_normal(message))
+        normal = _normal(message)
+        known = self._actions.get(normal)
         if known is None and isinstance(self.table, ActuatorTable):
-            numbers = template(self.table.setpoint.command).match(message.strip().removeprefix(":"))
+            # Of many spaces, a pattern tries every division.
+            numbers = template(self.table.setpoint.command).match(normal)
             return None if numbers is None else partial(self._set, numbers[VALUE])
         return known
 

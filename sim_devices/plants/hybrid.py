@@ -252,13 +252,20 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
 
 class PeltierTerminals:
-    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them."""
+    """The cooler of a hybrid cantilever with its two thermistors, as a TEC controller is wired to them.
+
+    A limiter in the wires holds a current beyond the cooler's rating at that rating, as the closed loop does.
+    """
 
     def __init__(self, plant: HybridCantilever) -> None:
         self._plant = plant
+        self._rating = plant.parameters.maximum_current
         self.regulate = plant.regulate
-        self.drive = plant.drive
         self.release = plant.release
+
+    def drive(self, current_ampere: float) -> None:
+        """Drive a constant current, A."""
+        self._plant.drive(min(max(current_ampere, -self._rating), self._rating))
 
     @property
     def plate_temperature(self) -> float:

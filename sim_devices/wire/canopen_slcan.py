@@ -4,14 +4,15 @@ The adapter speaks the ASCII protocol of the LAWICEL CAN232 (LAWICEL CAN232 manu
 carriage return, answered by a carriage return, or by BEL when they cannot be obeyed. `C` closes and `O` opens
 the channel, `L` opens it for listening, `Sn` selects the bit rate; `t` and `T` carry a frame with an 11-bit and
 a 29-bit identifier, `r` and `R` remote frames. Closing a closed channel, opening an open one and empty lines are
-obeyed, as python-can sends all of these.
+obeyed, as python-can sends all of these. Line feeds are passed over.
 
-The node serves SDO as in CiA 301: expedited download and upload, segmented upload of texts, aborts; network
-management commands and its heartbeat. It takes the simplified command bytes of Roboteq CANBus Networking Manual
-V2.0, whose bits e and s are 0, as well, and answers them by the standard ones.
+The node serves SDO as in CiA 301: expedited and segmented, download and upload, aborts; process data (PDO); network
+management commands and its heartbeat. It takes the command bytes of the examples in Roboteq CANBus Networking Manual
+V2.0 as well, whose bits e and s are clear: a download of that form is expedited, and a query that says its size (48h
+for two bytes) is answered by the same byte.
 
-Assumptions: a frame that is sent at another bit rate than that of the bus is lost without an error; segmented and
-block downloads are refused; a remote frame is not answered.
+Assumptions: a frame that is sent at another bit rate than that of the bus is lost without an error; block transfers
+are refused; a remote frame is not answered.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from __future__ import annotations
 import math
 import re
 import struct
+from functools import lru_cache
 
 from sim_devices.instruments.emulated import RequestRefusedError
-from sim_devices.instruments.roboteq import AbortCode, EmulatedRoboteq, Kind, NodeState
+from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.instruments.roboteq_objects import FORMATS, AbortCode, NodeState
 from sim_devices.wire import WireServer
 
 LONGEST_LINE = 64
@@ -43,19 +46,19 @@ BITRATES = {
 _OK = b"\r"
 _REFUSED = b"\a"
 _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7}))([0-8])((?:[0-9A-Fa-f]{2}){0,8})")
-_FORMATS: dict[Kind, str] = {"S8": "<b", "U8": "<B", "S16": "<h", "U16": "<H", "S32": "<i", "U32": "<I"}
+_NMT, _SYNC = 0x000, 0x080
 _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
 _SEGMENT = 7  # bytes in a segment
+_FRAMES = frozenset((b"t", b"T", b"r", b"R"))
 
 
 class CanopenSlcanServer(WireServer):
     """The serial side of an slcan adapter with one emulated controller on its bus."""
 
-    protocol = "CANopen over slcan"
-
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
         self._node = SdoServer(device)
+        self._answer_head = _line(_SDO_ANSWER + device.node, bytes(8))[:5]
         self._received = b""
         self._overrun = False
         self._bitrate = 0
@@ -65,8 +68,11 @@ class CanopenSlcanServer(WireServer):
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the adapter sends."""
         with self._device.world.lock:
-            *lines, rest = (self._received + data).split(b"\r")
-            sent = self._heartbeats()
+            received = self._received + data
+            if b"\n" in received:
+                received = received.replace(b"\n", b"")
+            *lines, rest = received.split(b"\r")
+            sent = self._sent_by_itself()
             for line in lines:
                 sent += _REFUSED if self._overrun or len(line) > LONGEST_LINE else self._obey(line)
                 self._overrun = False
@@ -76,25 +82,46 @@ class CanopenSlcanServer(WireServer):
             return sent
 
     def unsolicited(self) -> bytes:
-        """Return the heartbeats since they were last sent."""
-        with self._device.world.at_present():
-            return self._heartbeats()
+        """Return heartbeats, boot-up message and TPDOs since the last call, which pass while the channel is open."""
+        if self._device.quiet:
+            return b""
+        with self._device.world.lock:
+            return self._sent_by_itself()
 
     def next_unsolicited(self) -> float:
-        """Return the laboratory time (s) of the next heartbeat that the host sees; infinity if it sees none."""
-        return self._device.next_heartbeat() if self._on_the_bus() and self._device.plugged_in else math.inf
+        """Return when the node next sends something by itself, s; infinity while nothing passes."""
+        device = self._device
+        with device.world.lock:
+            if not self._on_the_bus():
+                return math.inf
+            return device.next_message()
 
-    def _heartbeats(self) -> bytes:
-        """Return the heartbeats since the last request of the host."""
-        states = self._device.heartbeats()
-        if not self._on_the_bus():
+    def _sent_by_itself(self) -> bytes:
+        device = self._device
+        if device.quiet:
             return b""
-        return b"".join(_line(_HEARTBEAT + self._device.node, bytes((state,))) for state in states)
+        states = device.heartbeats()
+        frames = device.process_data(synchronous=False)
+        device.next_message()
+        if not (states or frames) or not self._on_the_bus():
+            return b""
+        sent = b"".join(_line(_HEARTBEAT + device.node, bytes((state,))) for state in states)
+        return sent + b"".join(_line(*frame) for frame in frames)
 
     def _on_the_bus(self) -> bool:
         return self._open and self._bitrate == self._device.bitrate
 
     def _obey(self, line: bytes) -> bytes:
+        kind = line[:1]
+        if kind in _FRAMES:
+            frame = _frame(line)
+            if frame is None or not self._open or self._listening:
+                return _REFUSED
+            identifier, data = frame
+            sent = b"z\r" if kind in b"tr" else b"Z\r"
+            if data is not None and self._device.plugged_in and self._on_the_bus():
+                sent += self._answer(identifier, data)
+            return sent
         if line == b"":
             return _OK
         if line in (b"O", b"L"):
@@ -114,31 +141,24 @@ class CanopenSlcanServer(WireServer):
             return b"F00\r"
         if line == b"Z0" and not self._open:
             return _OK
-        match = _FRAME.fullmatch(line)
-        if match is None or not self._open or self._listening:
-            return _REFUSED
-        short, identifier, long, _, length, data = match.groups()
-        remote = (short or long) in (b"r", b"R")
-        if len(data) != (0 if remote else 2 * int(length)):
-            return _REFUSED
-        sent = b"Z\r" if long else b"z\r"
-        if short == b"t" and self._on_the_bus():
-            sent += self._frame(int(identifier, 16), bytes.fromhex(data.decode("ascii")))
-        return sent
+        return _REFUSED
 
-    def _frame(self, identifier: int, data: bytes) -> bytes:
-        """Put a frame on the bus; return the lines of the node's answer."""
+    def _answer(self, identifier: int, data: bytes) -> bytes:
+        """Have the node look at a frame; return the lines of its answer."""
         device = self._device
-        if not device.plugged_in:
-            return b""
-        if identifier == 0 and len(data) == 2 and data[1] in (0, device.node):
-            device.manage(data[0])
-            return self._heartbeats()
         # CiA 301: an SDO has eight bytes, and a stopped node serves none.
-        if identifier == _SDO_REQUEST + device.node and len(data) == 8 and device.state is not NodeState.STOPPED:
-            answer = self._node.answer(data)
-            if answer:
-                return device.transmit(_line(_SDO_ANSWER + device.node, answer))
+        if identifier == _SDO_REQUEST + device.node:
+            if len(data) == 8 and device.state is not NodeState.STOPPED:
+                answer = self._node.answer(data)
+                if answer:
+                    return device.transmit(b"%s%s\r" % (self._answer_head, answer.hex().upper().encode("ascii")))
+        elif identifier == _SYNC:
+            return b"".join(_line(*frame) for frame in device.process_data(synchronous=True))
+        elif identifier != _NMT:
+            device.receive_process_data(identifier, data)
+        elif len(data) == 2 and data[1] in (0, device.node):
+            device.manage(data[0])
+            return self._sent_by_itself()
         return b""
 
 
@@ -147,62 +167,97 @@ class SdoServer:
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
+        self._numbers: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
+        """Index, subindex, form, and beginning of the answer, by the first four bytes of a query for a number."""
         self._multiplexer = bytes(3)
         self._text: bytes | None = None
+        self._incoming: bytes | None = None
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes:
         """Return the eight bytes that answer eight bytes; none answer an abort."""
         command = request[0]
         specifier = command >> 5
-        if specifier == 4:
-            self._text = None
-            return b""
-        if specifier != 3:
-            self._text = None
+        if specifier not in (0, 3):
+            # What was under way has ended.
+            self._text = self._incoming = None
+            if specifier == 4:
+                return b""
             self._multiplexer = request[1:4]
         try:
+            if specifier == 0:
+                return self._download_segment(command, request[1:])
             if specifier == 1:
                 return self._download(command, request[4:])
             if specifier == 2:
-                return self._upload()
+                return self._upload(request)
             if specifier == 3:
-                return self._segment(command)
+                return self._upload_segment(command)
             raise RequestRefusedError(AbortCode.COMMAND)
         except RequestRefusedError as error:
-            self._text = None
+            self._text = self._incoming = None
             return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
 
     def _object(self) -> tuple[int, int]:
-        return int.from_bytes(self._multiplexer[:2], "little"), self._multiplexer[2]
+        multiplexer = self._multiplexer
+        return multiplexer[0] | multiplexer[1] << 8, multiplexer[2]
 
     def _download(self, command: int, data: bytes) -> bytes:
         index, sub = self._object()
         row = self._device.entry(index, sub)
         if not row.writable:
             raise RequestRefusedError(AbortCode.READ_ONLY)
-        expedited, sized = bool(command & 2), bool(command & 1)
-        if not expedited and sized:
-            raise RequestRefusedError(AbortCode.UNSUPPORTED)
-        form = _FORMATS[row.kind]
-        size = struct.calcsize(form)
-        # Without the bit s the size is not said; the simplified form of the maker says it all the same.
-        if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
-            raise RequestRefusedError(AbortCode.LENGTH)
-        value: int = struct.unpack(form, data[:size])[0]
-        self._device.write_object(index, value, sub)
+        expedited, sized = command & 2, command & 1
+        size = FORMATS[row.kind].size
+        if sized and not expedited:
+            if int.from_bytes(data, "little") != size:
+                raise RequestRefusedError(AbortCode.LENGTH)
+            self._incoming, self._toggle = b"", 0
+        else:
+            # Without the bit s the size is not said; the simplified form of the maker says it all the same.
+            if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
+                raise RequestRefusedError(AbortCode.LENGTH)
+            self._write(data[:size])
         return b"\x60" + self._multiplexer + bytes(4)
 
-    def _upload(self) -> bytes:
+    def _download_segment(self, command: int, data: bytes) -> bytes:
+        if self._incoming is None:
+            raise RequestRefusedError(AbortCode.COMMAND)
+        if command >> 4 & 1 != self._toggle:
+            raise RequestRefusedError(AbortCode.TOGGLE)
+        self._incoming += data[: _SEGMENT - (command >> 1 & 7)]
+        if command & 1:
+            whole, self._incoming = self._incoming, None
+            self._write(whole)
+        self._toggle ^= 1
+        return bytes((0x20 | command & 0x10,)) + bytes(7)
+
+    def _write(self, data: bytes) -> None:
+        index, sub = self._object()
+        form = FORMATS[self._device.entry(index, sub).kind]
+        if len(data) != form.size:
+            raise RequestRefusedError(AbortCode.LENGTH)
+        value: int = form.unpack(data)[0]
+        self._device.write_object(index, value, sub)
+
+    def _upload(self, request: bytes) -> bytes:
+        known = self._numbers.get(request[:4])
+        if known is not None:
+            index, sub, form, head = known
+            return (head + form.pack(self._device.read_object(index, sub))).ljust(8, b"\0")
         index, sub = self._object()
         value = self._device.read_object(index, sub)
         if isinstance(value, str):
             self._text, self._toggle = value.encode("ascii", "replace"), 0
             return b"\x41" + self._multiplexer + struct.pack("<I", len(self._text))
-        data = struct.pack(_FORMATS[self._device.entry(index, sub).kind], value)
-        return bytes((0x43 | (4 - len(data)) << 2,)) + self._multiplexer + data.ljust(4, b"\0")
+        form = FORMATS[self._device.entry(index, sub).kind]
+        # The maker's form of the query says the size, and has the bits e and s clear in the answer.
+        command = (0x40 if request[0] & 0x0C else 0x43) | (4 - form.size) << 2
+        head = bytes((command,)) + self._multiplexer
+        self._numbers[request[:4]] = index, sub, form, head
+        return (head + form.pack(value)).ljust(8, b"\0")
 
-    def _segment(self, command: int) -> bytes:
+    def _upload_segment(self, command: int) -> bytes:
         if self._text is None:
             raise RequestRefusedError(AbortCode.COMMAND)
         if command >> 4 & 1 != self._toggle:
@@ -212,6 +267,21 @@ class SdoServer:
         self._toggle ^= 1
         self._text = rest or None
         return bytes((head,)) + part.ljust(_SEGMENT, b"\0")
+
+
+@lru_cache(maxsize=256)
+def _frame(line: bytes) -> tuple[int, bytes | None] | None:
+    """Return identifier and data of a line; no data for frames that nobody answers, None if it makes no sense."""
+    match = _FRAME.fullmatch(line)
+    if match is None:
+        return None
+    short, identifier, long, _, length, data = match.groups()
+    remote = (short or long) in (b"r", b"R")
+    if len(data) != (0 if remote else 2 * int(length)):
+        return None
+    if long or remote:
+        return 0, None
+    return int(identifier, 16), bytes.fromhex(data.decode("ascii"))
 
 
 def _line(identifier: int, data: bytes) -> bytes:

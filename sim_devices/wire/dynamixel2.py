@@ -20,6 +20,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
+from functools import lru_cache
 
 from sim_devices.instruments.dynamixel import LOWEST_FIRMWARE_THAT_CLEARS, EmulatedMX28
 from sim_devices.instruments.dynamixel_table import ErrorNumber
@@ -72,30 +73,52 @@ _FOR_ALL = frozenset(
 )
 
 
-def _crc_row(index: int) -> int:
+def _crc_of_byte(index: int) -> int:
     crc = index << 8
     for _ in range(8):
         crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
     return crc & 0xFFFF
 
 
-_CRC_TABLE = tuple(_crc_row(index) for index in range(256))
+_CRC_OF_BYTE = [_crc_of_byte(index) for index in range(256)]
+
+_CRC_OF_WORD = tuple(
+    _CRC_OF_BYTE[first >> 8] ^ (first << 8 & 0xFF00) ^ second for first in _CRC_OF_BYTE for second in _CRC_OF_BYTE
+)
+"""CRC of two bytes, by both of them: half the steps of a table of bytes."""
 
 
 def crc16(data: bytes) -> int:
     """Return the CRC of a packet: polynomial 0x8005, initial value 0, highest bit first."""
+    # With the initial value 0, zeros in front change nothing.
+    words = data if len(data) % 2 == 0 else b"\0" + data
     crc = 0
-    for byte in data:
-        crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
+    for word in struct.unpack(f">{len(words) // 2}H", words):
+        crc = _CRC_OF_WORD[crc ^ word]
     return crc
 
 
 def frame(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """Return a packet."""
-    body = bytes((instruction,)) + parameters
-    body = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+    body = (b"%c%s" % (instruction, parameters)).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
     packet = _HEADER + struct.pack("<BH", servo_id, len(body) + 2) + body
-    return packet + struct.pack("<H", crc16(packet))
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+def _content(packet: bytes) -> tuple[int, int, bytes]:
+    """Return id, instruction and parameters of a packet."""
+    body = packet[_HEAD:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+    return packet[4], body[0], body[1:]
+
+
+@lru_cache(maxsize=256)
+def _whole_instruction(data: bytes) -> tuple[int, int, bytes] | None:
+    """Return the content of data that are exactly one good packet; None if they are anything else."""
+    if len(data) < _HEAD + _LOWEST_LENGTH or len(data) > LONGEST_FRAME or not data.startswith(_HEADER):
+        return None
+    if int.from_bytes(data[5:_HEAD], "little") != len(data) - _HEAD or data.find(_HEADER, 1, len(data) - 2) > 0:
+        return None
+    return _content(data) if crc16(data[:-2]) == int.from_bytes(data[-2:], "little") else None
 
 
 class Dynamixel2Server(WireServer):
@@ -128,8 +151,13 @@ class Dynamixel2Server(WireServer):
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the servos send."""
         with self._world.lock:
+            if not self._received:
+                # As a rule, one whole packet comes at once.
+                whole = _whole_instruction(data)
+                if whole is not None:
+                    return self._serve(*whole)
             self._received += data
-            return b"".join(self._serve(packet) for packet in self._packets())
+            return b"".join(self._serve(*_content(packet)) for packet in self._packets())
 
     def _packets(self) -> Iterator[bytes]:
         """Take the whole packets with a good CRC out of what was received."""
@@ -163,23 +191,19 @@ class Dynamixel2Server(WireServer):
             yield packet
         self._received = received[start:]
 
-    def _serve(self, packet: bytes) -> bytes:
-        body = packet[_HEAD:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
-        number, instruction, parameters = packet[4], body[0], body[1:]
+    def _serve(self, number: int, instruction: int, parameters: bytes) -> bytes:
         if instruction == Instruction.STATUS:
             return b""
-        present = {servo.bus_id: servo for servo in self._servos if servo.answering}
-        addressed = [servo for bus_id, servo in sorted(present.items()) if number in (BROADCAST, bus_id)]
-        for servo in addressed:
-            servo.attend()
+        # Every instruction packet feeds the bus watchdogs of all (e-Manual, Bus Watchdog).
+        present = {servo.bus_id: servo for servo in self._servos if servo.hear()}
         if instruction in _FOR_ALL:
             if number != BROADCAST:
                 return b""
             return self._serve_several(present, Instruction(instruction), parameters)
         if number == BROADCAST:
-            answers = [self._serve_one(servo, instruction, parameters, to_all=True) for servo in addressed]
+            answers = [self._serve_one(present[one], instruction, parameters, to_all=True) for one in sorted(present)]
             return b"".join(answers) if instruction == Instruction.PING else b""
-        return b"".join(self._serve_one(servo, instruction, parameters) for servo in addressed)
+        return self._serve_one(present[number], instruction, parameters) if number in present else b""
 
     def _serve_one(self, servo: EmulatedMX28, instruction: int, parameters: bytes, *, to_all: bool = False) -> bytes:
         # Level and id as they were when the packet came: it may change both.

@@ -124,14 +124,15 @@ def feedback(bank: RegisterBank, body: bytes) -> bytes:
         _check_range(address, number)
         words = _WORDS[number]
         if kind == _FRAME_READ:
+            # Before it is read: the readings of some registers are bursts, which take their time.
+            if len(values) + words.size > _MOST_FEEDBACK:
+                raise RegisterError(ILLEGAL_VALUE, "the reply is longer than a packet")
             values += words.pack(*bank.read_registers(address, number))
         elif len(body) < position + words.size:
             raise RegisterError(ILLEGAL_VALUE, "count and data do not agree")
         else:
             bank.write_registers(address, list(words.unpack_from(body, position)))
             position += words.size
-    if len(values) > _MOST_FEEDBACK:
-        raise RegisterError(ILLEGAL_VALUE, "the reply is longer than a packet")
     return values
 
 

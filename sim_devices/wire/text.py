@@ -35,6 +35,9 @@ class TextServer(WireServer):
             return b"".join(self._serve(message) for message in messages)
 
     def _serve(self, message: bytes) -> bytes:
+        if len(message) > LONGEST_MESSAGE:
+            self._instrument.report(INPUT_OVERRUN)
+            return b""
         answer = self._instrument.obey(message.decode(self._encoding, "replace"))
         if answer is None:
             return b""

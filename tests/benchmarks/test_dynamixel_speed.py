@@ -1,4 +1,7 @@
-"""Round trips of the servo's feedback block over a pty, beside the maker's software. Prints, asserts no time."""
+"""Round trips of the servo's feedback block, over a pty and in process, beside the maker's software.
+
+Prints, asserts no time.
+"""
 
 import statistics
 import subprocess
@@ -7,9 +10,14 @@ import time
 import warnings
 
 import pytest
+import serial
 
-from bench.clock import WallClock
+from bench.clock import VirtualClock, WallClock
 from drivers.dynamixel import DynamixelMX28
+from sim_devices import protocol_emulated
+from sim_devices.instruments.dynamixel import EmulatedMX28
+from sim_devices.wire.dynamixel2 import Dynamixel2Server
+from sim_devices.world import World
 
 pytestmark = pytest.mark.benchmark
 
@@ -85,3 +93,50 @@ def test_feedback_over_a_pty(port, capsys):
         print(f"  DynamixelMX28.measure       {statistics.median(ours):7.0f} round trips/s")
         print(f"  dynamixel-sdk readTxRx      {statistics.median(theirs):7.0f} round trips/s ({timeouts} timeouts)")
         print(f"  ratio                       {ratio:7.2f}")
+
+
+class Nothing:
+    def advance(self, dt):
+        pass
+
+
+def cpu_microseconds(function):
+    """Return the CPU time of a call, µs: the least of a few runs."""
+    times = []
+    for _ in range(2 * REPEATS):
+        begin = time.process_time()
+        for _ in range(ROUND_TRIPS):
+            function()
+        times.append((time.process_time() - begin) / ROUND_TRIPS)
+    return 1e6 * min(times)
+
+
+def test_feedback_in_process(capsys):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="dynamixel_sdk")
+        sdk = pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed")
+
+    class UrlPort(sdk.PortHandler):
+        def setupPort(self, cflag_baud):
+            self.ser = serial.serial_for_url(self.port_name, baudrate=cflag_baud, timeout=0)
+            self.is_open = True
+            self.tx_time_per_byte = 1e4 / cflag_baud
+            return True
+
+    clock = VirtualClock()
+    address = protocol_emulated.register(
+        "speed-servo", Dynamixel2Server([EmulatedMX28("servo", World(Nothing(), clock))]), clock
+    )
+    try:
+        settings = DynamixelMX28.Settings(port=address, baudrate=1_000_000, position_limits=(0.0, 6.0))
+        servo = DynamixelMX28.connect("servo", settings, clock)
+        handler, port = sdk.PacketHandler(2.0), UrlPort(address)
+        assert port.setBaudRate(1_000_000)
+        ours = cpu_microseconds(servo.measure)
+        theirs = cpu_microseconds(lambda: handler.readTxRx(port, 1, 126, 21))
+        servo.close()
+        port.closePort()
+    finally:
+        protocol_emulated.unregister(address)
+    with capsys.disabled():
+        print(f"\nfeedback in process, CPU: DynamixelMX28.measure {ours:.1f} µs, dynamixel-sdk {theirs:.1f} µs")

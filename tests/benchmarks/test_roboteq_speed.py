@@ -4,8 +4,10 @@ import os
 import statistics
 import subprocess
 import sys
+import time
 import tty
 
+import can
 import pytest
 
 from bench.clock import Stopwatch, VirtualClock, WallClock
@@ -71,6 +73,17 @@ def rate(read):
     return ROUND_TRIPS / watch.seconds()
 
 
+def cpu_microseconds(function):
+    """Return the CPU time of a call, µs: the least of a few runs."""
+    times = []
+    for _ in range(2 * BATCHES):
+        begin = time.process_time()
+        for _ in range(ROUND_TRIPS):
+            function()
+        times.append((time.process_time() - begin) / ROUND_TRIPS)
+    return 1e6 * min(times)
+
+
 def rate_of_the_driver(port, clock):
     settings = RoboteqSupply.Settings(port=port, output="average", voltage_limits=(0, 12), heartbeat=60, timeout=10.0)
     supply = RoboteqSupply.connect("supply", settings, clock)
@@ -112,3 +125,49 @@ def test_round_trips_beside_the_stock_client(terminal, capsys):
             f"\nSDO round trips over a pseudo-terminal: driver {mine:.0f}/s, canopen {stock:.0f}/s, "
             f"ratio {mine / stock:.2f}; driver in process {within:.0f}/s"
         )
+
+
+@pytest.mark.benchmark
+def test_cpu_in_process_beside_the_stock_client(capsys):
+    """A glance is six requests; the stock client reads its frames in a thread of its own."""
+    canopen = pytest.importorskip("canopen")
+    clock = VirtualClock()
+    device = EmulatedRoboteq("supply", World(Nothing(), clock), Nothing(), watchdog=0.0)
+    address = register("cpu-supply", CanopenSlcanServer(device), clock)
+    try:
+        settings = RoboteqSupply.Settings(port=address, output="average", voltage_limits=(0, 12), watchdog=0)
+        supply = RoboteqSupply.connect("supply", settings, clock)
+        supply.set(6.0).wait()
+        one = cpu_microseconds(lambda: supply._line.read(_VOLTS, 2))
+        glance = cpu_microseconds(supply.glance)
+        supply.close()
+        stock = cpu_of_canopen(canopen, address)
+    finally:
+        unregister(address)
+    with capsys.disabled():
+        print(
+            f"\nCPU in process: a request {one:.1f} µs, a glance of six {glance:.1f} µs; "
+            f"a request by canopen and python-can {stock:.1f} µs"
+        )
+
+
+def cpu_of_canopen(canopen, address):
+    """Return the CPU time of a request of the stock client without its thread, µs."""
+    bus = can.interface.Bus(interface="slcan", channel=address, bitrate=125_000, sleep_after_open=0)
+    network = canopen.Network(bus)
+
+    class Client(canopen.sdo.SdoClient):
+        def read_response(self):
+            while self.responses.empty():
+                message = bus.recv(0)
+                if message is not None:
+                    network.notify(message.arbitration_id, message.data, message.timestamp)
+            return self.responses.get_nowait()
+
+    client = Client(0x601, 0x581, canopen.ObjectDictionary())
+    client.network = network
+    network.subscribe(0x581, client.on_response)
+    try:
+        return cpu_microseconds(lambda: client.upload(0x210D, 2))
+    finally:
+        bus.shutdown()

@@ -2,11 +2,14 @@
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from emulated_bench import Bench, OnABench, serial_port, tcp_port
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
 from bench.contracts.faults import SilentInstrumentContract
@@ -15,7 +18,8 @@ from bench.errors import DeviceConnectionError, DeviceError
 from drivers.labjack_t7 import T7HighVoltageSupply
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
-from sim_devices.instruments.roboteq import ChannelFlag, EmulatedRoboteq, Fault
+from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.instruments.roboteq_objects import ChannelFlag, Fault
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
@@ -487,6 +491,59 @@ def test_command_that_was_lost_until_the_watchdog_expired_does_not_resume(bench,
     bench.device.set(3.0)
     assert bench.server.lose_next == b""
     assert bench.plant.voltage == pytest.approx(3.0, abs=resolution(3.0, output))
+
+
+SUPPLY_CALLS = st.one_of(
+    st.tuples(st.just("set"), st.sampled_from([0.0, 3.0, 6.0, 12.0])),
+    st.tuples(st.just("sleep"), st.sampled_from([0.05, 0.5, 0.9, 0.995, 0.999, 1.0, 1.5, 100.0])),
+    st.tuples(st.sampled_from(["drop_next_answer", "corrupt_next_answer"]), st.none()),
+    st.tuples(st.sampled_from(["measure", "glance", "safe", "release", "emergency_stop"]), st.none()),
+    st.tuples(st.sampled_from(["connect", "recover"]), st.none()),
+)
+
+
+@given(st.lists(SUPPLY_CALLS, max_size=25))
+def test_power_that_was_dropped_never_comes_back(calls):
+    with ExitStack() as stack:
+        bench = switching(True, "average", stack)
+        load, supply = bench.plant, bench.device
+        for call, value in calls:
+            held = load.voltage
+            bench.instrument.world.advance()
+            dropped = load.voltage != held
+            asked = value if call == "set" else 0.0
+            before = len(load.applied)
+            with suppress(DeviceError):
+                if call == "sleep":
+                    bench.clock.sleep(value)
+                elif call in ("connect", "recover"):
+                    supply.close()
+                    supply = bench.connect(getattr(RoboteqSupply, call))
+                    stack.callback(supply.close)
+                elif call == "set":
+                    supply.set(value)
+                elif call in ("drop_next_answer", "corrupt_next_answer"):
+                    getattr(bench.instrument, call)()
+                else:
+                    getattr(supply, call)()
+            bench.instrument.world.advance()
+            for _, volts in load.applied[before:]:
+                # What was dropped stays off; nothing but a set-point brings a voltage.
+                assert volts in (0.0, pytest.approx(asked, abs=0.02)) or (volts == held and not dropped)
+                dropped = dropped or volts == 0.0
+            assert bench.instrument.read_object(0x2101, 2) == 0
+
+
+@over_the_wire
+def test_other_channel_that_someone_drove_is_not_resumed(bench):
+    bench.instrument.write_object(0x2000, 700, 2)
+    bench.device.set(6.0)
+    assert bench.instrument.read_object(0x2101, 2) == 700
+    bench.clock.sleep(2.0)
+    commands = [request[13:] for request in bench.requests if request.startswith(b"t601823002002")]
+    assert commands == [b"00000000\r"]
+    bench.device.set(3.0)
+    assert bench.instrument.read_object(0x2101, 2) == 0
 
 
 @over_the_wire

@@ -1,10 +1,27 @@
-"""What the tests of several drivers share."""
+"""What the tests of several drivers share: the class `Script` of a module at its `PORT`, and a TCP port."""
 
 import socket
 import threading
 from contextlib import contextmanager
 
 import pytest
+
+from bench.clock import VirtualClock
+from sim_devices.protocol_emulated import register, unregister
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def script(request, clock):
+    """The scripted instrument at the other end of a driver's line: the class `Script` of a module, at its `PORT`."""
+    script, name = request.module.Script(), request.module.PORT.removeprefix("emulated://")
+    register(name, script, clock)
+    yield script
+    unregister(name)
 
 
 @contextmanager

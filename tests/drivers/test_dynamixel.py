@@ -12,15 +12,33 @@ from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28
 from drivers.dynamixel.mx28 import MX28Settings
-from drivers.dynamixel.protocol2 import ServoLine, frame
+from drivers.dynamixel.protocol2 import RefusedError, ServoLine, frame
 from drivers.dynamixel.protocol2 import crc as driver_crc
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
 PORT = "emulated://scripted-servo"
 COUNT = 2.0 * math.pi / 4096
-SIGNED = {116, 126, 128, 132}
-SIZES = {0: 2, 6: 1, 9: 1, 10: 1, 11: 1, 40: 4, 44: 4, 63: 1, 64: 1, 68: 1, 70: 1, 98: 1, 100: 2, 108: 4, 112: 4}
+SIGNED = {20, 116, 126, 128, 132}
+SIZES = {
+    0: 2,
+    6: 1,
+    9: 1,
+    10: 1,
+    11: 1,
+    12: 1,
+    20: 4,
+    40: 4,
+    44: 4,
+    63: 1,
+    64: 1,
+    68: 1,
+    70: 1,
+    98: 1,
+    100: 2,
+    108: 4,
+    112: 4,
+}
 SIZES |= {116: 4, 122: 1, 123: 1, 124: 2, 126: 2, 128: 4, 132: 4, 136: 4, 140: 4, 144: 2, 146: 1}
 
 
@@ -160,6 +178,70 @@ def test_answers_of_the_maker(script, clock):
     line.order(0x03, bytes.fromhex("740000020000"))
 
 
+# Requests and replies as published: of an XL330, recorded from hardware (ScrapMeta/microduck-diy, Reachy Mini); from
+# a replayed fixture (pkinney/robotis); and of the e-Manual, Protocol 2.0. They test packets, not the MX-28's table.
+EXCHANGES = [
+    ("hardware", 1, 0x01, "", "FFFFFD00 01 0300 01 194E", "FFFFFD00 01 0700 55 00B00435 B754", 0, "B00435"),
+    (
+        "hardware",
+        1,
+        0x02,
+        "00000200",
+        "FFFFFD00 01 0700 02 00000200 2151",
+        "FFFFFD00 01 0600 55 00B004 D47B",
+        0,
+        "B004",
+    ),
+    ("hardware", 1, 0x02, "07000100", "FFFFFD00 01 0700 02 07000100 22B7", "FFFFFD00 01 0500 55 0001 56A1", 0, "01"),
+    ("hardware", 1, 0x02, "FFFF0100", "FFFFFD00 01 0700 02 FFFF0100 055B", "FFFFFD00 01 0400 55 07 B08C", 7, "00"),
+    (
+        "hardware",
+        15,
+        0x02,
+        "92000100",
+        "FFFFFD00 0F 0700 02 92000100 3FD3",
+        "FFFFFD00 0F 0500 55 801B 0C71",
+        128,
+        "1B",
+    ),
+    ("fixture", 1, 0x01, "", "FFFFFD00 01 0300 01 194E", "FFFFFD00 01 0700 55 00B00431 ACD4", 0, "B00431"),
+    (
+        "fixture",
+        1,
+        0x03,
+        "740056F9FFFF",
+        "FFFFFD00 01 0900 03 740056F9FFFF 833D",
+        "FFFFFD00 01 0400 55 06 B50C",
+        6,
+        "",
+    ),
+    ("fixture", 1, 0x03, "400001", "FFFFFD00 01 0600 03 400001 DB66", "FFFFFD00 01 0400 55 00 A10C", 0, ""),
+    ("fixture", 1, 0x03, "400000", "FFFFFD00 01 0600 03 400000 DEE6", "FFFFFD00 01 0400 55 00 A10C", 0, ""),
+    ("fixture", 1, 0x02, "3F000100", "FFFFFD00 01 0700 02 3F000100 2B57", "FFFFFD00 01 0500 55 0035 ED21", 0, "35"),
+    ("fixture", 1, 0x02, "40000100", "FFFFFD00 01 0700 02 40000100 3CDB", "FFFFFD00 01 0500 55 0001 56A1", 0, "01"),
+    ("manual", 1, 0x08, "", "FFFFFD00 01 0300 08 2F4E", "FFFFFD00 01 0400 55 00 A10C", 0, ""),
+    ("manual", 1, 0x10, "0144584C22", "FFFFFD00 01 0800 10 0144584C22 B1DC", "FFFFFD00 01 0400 55 00 A10C", 0, ""),
+]
+
+
+@pytest.mark.parametrize(
+    ("servo_id", "instruction", "parameters", "sent", "replied", "error", "content"), [row[1:] for row in EXCHANGES]
+)
+def test_published_exchanges(script, clock, servo_id, instruction, parameters, sent, replied, error, content):
+    line = ServoLine("servo", make_settings(id=servo_id), clock)
+    script.right_answer = lambda _data: bytes.fromhex(replied)
+    expected = bytes.fromhex(content)
+    if error & 0x7F:
+        with pytest.raises(RefusedError) as caught:
+            line.ask(instruction, bytes.fromhex(parameters), len(expected))
+        assert caught.value.code == error
+    else:
+        assert line.ask(instruction, bytes.fromhex(parameters), len(expected)) == expected
+        # With the alert the data are good.
+        assert line.alert is (error == 0x80)
+    assert script.received == [bytes.fromhex(sent)]
+
+
 @given(st.integers(0, 252), st.binary(max_size=30))
 def test_content_survives_the_stuffing(servo_id, content):
     script, clock = Script(), VirtualClock()
@@ -214,6 +296,18 @@ def test_servo_that_does_not_answer_everything_is_made_to(script, clock, level):
     servo = connect(clock)
     assert script.values[68] == 2
     assert servo.measure()["servo_position"] == pytest.approx(1000 * COUNT)
+
+
+@pytest.mark.parametrize("offset", [1, -1024])
+def test_homing_offset_is_refused_with_the_watchdog(script, clock, offset):
+    script.values[20] = offset
+    with pytest.raises(
+        ConfigurationError, match=rf"servo: watchdog: .* offset of {offset} counts, .* zero_counts"
+    ) as caught:
+        connect(clock)
+    assert "without end" in str(caught.value)
+    assert script.orders() == []
+    connect(clock, watchdog=0)
 
 
 def test_wrong_device(script, clock):

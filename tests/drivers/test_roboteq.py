@@ -6,8 +6,6 @@ import math
 import threading
 
 import pytest
-from can import Message
-from can.interfaces.slcan import slcanBus
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -16,7 +14,7 @@ from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
 from drivers.roboteq.canopen import NodeLine
-from drivers.roboteq.supply import _VOLTS
+from drivers.roboteq.supply import _POWER, _VOLTS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
@@ -96,6 +94,8 @@ class Script(WireServer):
             value, size = self.objects[key]
             raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
             return bytes((0x43 | (4 - size) << 2,)) + data[1:4] + raw.ljust(4, b"\0")
+        if key[0] == 0x2000 and (0x2102, key[1]) not in self.objects:
+            return b"\x80" + data[1:4] + (0x06090011).to_bytes(4, "little")
         if key[0] == 0x2000 and self.follow:
             self.objects[0x2102, key[1]] = (int.from_bytes(data[4:], "little", signed=True), 2)
         if key[0] == 0x1017:
@@ -151,10 +151,9 @@ def test_bytes_of_connecting(script, connect):
     connect()
     sent = [data.hex(" ").upper() for _, data in script.received]
     assert {identifier for identifier, _ in script.received} == {0x601}
-    assert sent[0] == "40 00 10 00 00 00 00 00"
-    assert sent[1:3] == ["40 08 10 00 00 00 00 00", "60 00 00 00 00 00 00 00"]
+    assert sent[:2] == ["40 08 10 00 00 00 00 00", "60 00 00 00 00 00 00 00"]
     assert "23 00 20 01 00 00 00 00" in sent
-    assert script.orders() == [(0x2000, 1, 0)]
+    assert script.orders() == [(0x2000, 1, 0), (0x2000, 2, 0), (0x2000, 3, 0)]
 
 
 def test_bytes_of_a_set_point_and_a_measurement(script, supply):
@@ -194,7 +193,7 @@ def test_node_and_channel(script, connect):
 def test_channel_that_is_not_there(script, connect):
     with pytest.raises(ConfigurationError, match=r"supply: channel: the controller does not have channel 3"):
         connect(channel=3)
-    assert script.orders() == []
+    assert script.orders() == [(0x2000, 3, 0)]
 
 
 def test_identity(script, supply):
@@ -247,13 +246,34 @@ def test_controller_without_a_name_is_known_by_its_type(script, connect):
 
 
 def test_lost_segment_is_asked_for_again_with_the_whole_text(script, connect):
-    script.instead = [None, None, b"z\r"]
+    script.instead = [None, b"z\r"]
     assert connect().identity.model == "motor controller"
-    assert [data[0] for _, data in script.received[:5]] == [0x40, 0x40, 0x60, 0x40, 0x60]
+    assert [data[0] for _, data in script.received[:5]] == [0x40, 0x60, 0x80, 0x40, 0x60]
+    # The client ends the transfer (CiA 301): timed out.
+    assert script.received[2][1] == bytes.fromhex("8008100000000405")
+
+
+def test_answer_that_comes_after_the_abort_is_not_taken_for_the_next(script, connect):
+    late = line(0x581, bytes.fromhex("07584C4154450000"))
+    original = script.obey
+    waiting = []
+
+    def obey(text):
+        sent = original(text)
+        if text.startswith(b"t601880"):
+            waiting.append(late)
+            return b"z\r"
+        return (waiting.pop() if waiting else b"") + sent
+
+    script.obey = obey
+    script.instead = [None, b"z\r"]
+    script.texts[0x1008] = b"Roboteq SDC2160"
+    assert connect().identity.model == "SDC2160"
+    assert waiting == []
 
 
 def test_wrong_toggle_bit(script, connect):
-    script.instead = [None, None, line(0x581, bytes.fromhex("11526F0000000000"))]
+    script.instead = [None, line(0x581, bytes.fromhex("11526F0000000000"))]
     with pytest.raises(DeviceError, match="answered 11 52"):
         connect()
 
@@ -340,6 +360,47 @@ def test_zero_comes_first_after_a_gap(script, connect, clock, watchdog, pause, z
     clock.sleep(pause)
     supply.set(3.0)
     assert [value for _, _, value in script.orders()] == ([0, 125] if zero else [125])
+
+
+def test_zero_goes_to_every_channel_back_to_back(script, connect, clock):
+    script.objects |= {(0x2102, 2): (0, 2), (0x2102, 3): (0, 2)}
+    script.objects |= {(index, 2): script.objects[index, 1] for index in (0x2100, 0x2122)}
+    supply = connect(channel=2)
+    assert script.orders() == [(0x2000, 2, 0), (0x2000, 1, 0), (0x2000, 3, 0)]
+    supply.set(6.0)
+    for call, last in ((lambda: supply.set(3.0), [(0x2000, 2, 125)]), (supply.safe, [(0x200E, 0, 2)])):
+        clock.sleep(2.0)
+        script.received.clear()
+        call()
+        zeros = [(0x2000, 2, 0), (0x2000, 1, 0), (0x2000, 3, 0)]
+        assert script.orders() == zeros + last
+    script.aborts[0x2000, 1] = 0x08000000
+    with pytest.raises(DeviceError, match="refused 0"):
+        connect(RoboteqSupply.recover, channel=2)
+
+
+def test_command_that_would_arrive_too_late_is_not_sent_again(script, supply, clock):
+    supply.set(6.0)
+    clock.sleep(0.9)
+    script.received.clear()
+    script.instead = [None] * 5 + [b"z\r"]
+    with pytest.raises(DeviceError, match="output was dropped"):
+        supply.measure()
+    assert script.orders() == [(0x2000, 1, 250), (0x2000, 1, 0)]
+
+
+def test_line_that_is_slower_than_the_watchdog(script, connect, clock):
+    supply = connect(watchdog=0.005)
+    original = script.answer
+
+    def answer(data):
+        clock.sleep(0.01)
+        return original(data)
+
+    script.answer = answer
+    with pytest.raises(DeviceError, match=r"no command arrives within the watchdog of 0\.005 s"):
+        supply.set(6.0)
+    assert script.orders()[-1] == (0x2000, 1, 0)
 
 
 def test_reading_after_a_gap_sends_zero_and_raises(script, supply, clock):
@@ -490,6 +551,34 @@ def test_late_answers_are_passed_over(script, supply):
     assert supply.measure()["supply_voltage"] == 0.0
 
 
+def test_answers_to_a_request_that_was_sent_again_are_waited_for(script, supply, clock):
+    """The first answer comes with that of the resend, and again with the next question for the same object."""
+    stale = line(0x581, bytes.fromhex("4B022101E8030000"))
+    script.instead = [b"z\r", lambda right: right]
+    assert supply._read(_POWER, 1) == 0
+    supply._line._adapter._port._received += stale
+    assert supply._read(_POWER, 1) == 0
+    script.instead = [b"z\r", lambda right: right]
+    assert supply._read(_POWER, 1) == 0
+    before = clock.now()
+    assert supply._read(_POWER, 1) == 0
+    assert clock.now() - before == pytest.approx(0.1, abs=0.01)
+    before = clock.now()
+    assert supply._read(_POWER, 1) == 0
+    assert clock.now() - before < 0.01
+
+
+@pytest.mark.parametrize(
+    "ends", [(b"\r", b"\r"), (b"\n", b"\r"), (b"\r\n", b"\r\n"), (b"\n", b"\n"), (b"", b"\r"), (b"z\r\n", b"\n\r")]
+)
+def test_acknowledgements_and_line_ends_of_all_adapters(script, supply, ends):
+    acknowledgement, end = ends
+    script.instead = [lambda right: acknowledgement + right[:-1] + end] * 5
+    script.objects[0x2102, 1] = (500, 2)
+    assert supply.measure() == {"supply_voltage": 12.0, "supply_current": 1.2}
+    assert len(script.received) == 5
+
+
 def test_answer_that_came_too_late_for_an_earlier_reading_is_not_taken_for_the_next(script, supply):
     supply._line._adapter.serialPortOrig._received += line(0x581, bytes.fromhex("4B022101E8030000"))
     assert supply.measure()["supply_voltage"] == 0.0
@@ -557,12 +646,13 @@ def test_silence_among_heartbeats_ends_as_well(script, supply, clock):
 
 
 def test_heartbeats_that_never_end_do_not_prolong_the_timeout(script, supply, clock, monkeypatch):
-    def frame():
+    def heartbeat(*, wait=True):
+        if not wait:
+            return None
         clock.sleep(0.04)
-        return Message(arbitration_id=0x701, is_extended_id=False, data=b"\x05")
+        return b"t701105"
 
-    monkeypatch.setattr(supply._line._adapter, "frame", frame)
-    monkeypatch.setattr(supply._line._adapter, "waiting_frames", list)
+    monkeypatch.setattr(supply._line._adapter, "line", heartbeat)
     before = clock.now()
     with pytest.raises(DeviceConnectionError, match="no answer within"):
         supply.measure()
@@ -573,7 +663,7 @@ def test_nonsense_without_an_end_does_not_pile_up(script, supply):
     script.instead = [b"x" * 5000] * 3
     with pytest.raises(DeviceConnectionError, match="no answer within"):
         supply.measure()
-    assert len(supply._line._adapter._buffer) <= 64
+    assert len(supply._line._adapter._rest) <= 64
     supply.measure()
 
 
@@ -586,9 +676,12 @@ def test_wrong_node_names_those_that_are_heard(script, connect):
         connect(node=7)
 
 
-def test_error_of_the_adapter_is_named(script, supply):
-    script.instead = [b"\a"] * 3
-    with pytest.raises(DeviceConnectionError, match="the adapter reports an error"):
+def test_errors_of_the_adapter_are_counted_and_named(script, supply):
+    script.instead = [b"\a", b"\a\a", b""]
+    with pytest.raises(DeviceConnectionError, match=r"the adapter reports an error \(3 BEL\)"):
+        supply.measure()
+    script.silent = True
+    with pytest.raises(DeviceConnectionError, match=r"3 requests; check"):
         supply.measure()
 
 
@@ -604,7 +697,7 @@ def test_heartbeat_that_becomes_stale(script, connect, clock):
         supply.measure()
     with pytest.raises(DeviceConnectionError, match="no heartbeat"):
         supply.set(6.0)
-    assert script.orders()[-1] == (0x2000, 1, 0)
+    assert script.orders() == [(0x2000, channel, 0) for channel in (1, 2, 3)]
     script.before = line(0x702, b"\x05") + line(0x701, b"\x05\x05") + line(0x700, b"\x05")
     with pytest.raises(DeviceConnectionError, match="no heartbeat"):
         supply.measure()
@@ -748,7 +841,8 @@ def test_emergency_stop_of_before_is_refused_and_recovered(script, connect):
     script.answer = answer
     script.received.clear()
     supply = connect(RoboteqSupply.recover)
-    assert script.orders() == [(0x2000, 1, 0), (0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
+    zeros = [(0x2000, channel, 0) for channel in (1, 2, 3)]
+    assert script.orders() == [*zeros, (0x2000, 1, 0), (0x200D, 0, 1), (0x2000, 1, 0)]
     assert math.isnan(supply.setpoint)
 
 
@@ -769,12 +863,6 @@ def test_several_threads_wait_for_each_other(script, supply):
     for thread in threads:
         thread.join()
     assert failures == []
-
-
-def test_python_can_still_reads_where_the_driver_does():
-    """The driver replaces this method of python-can; were it renamed, the wire would be polled."""
-    assert callable(vars(slcanBus).get("_read"))
-    assert isinstance(Message(arbitration_id=1, data=b"").data, bytearray)
 
 
 @pytest.mark.parametrize(

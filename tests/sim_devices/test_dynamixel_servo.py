@@ -139,6 +139,22 @@ def test_packets_of_the_maker(pair, sent, replied):
     assert pair[0].receive(packet(sent)) == b"".join(map(packet, replied))
 
 
+@pytest.mark.parametrize(
+    ("sent", "replied"),
+    [
+        # Recorded from an XL330 (ScrapMeta/microduck-diy): its id; an address that does not exist; a wrong CRC.
+        ("01 07 00 02 07 00 01 00 22 B7", ["01 05 00 55 00 01 56 A1"]),
+        ("01 07 00 02 FF FF 01 00 05 5B", ["01 04 00 55 07 B0 8C"]),
+        ("01 03 00 01 3A 6C", []),
+        # A replayed fixture (pkinney/robotis): torque on and off.
+        ("01 06 00 03 40 00 01 DB 66", [ACKNOWLEDGE]),
+        ("01 06 00 03 40 00 00 DE E6", [ACKNOWLEDGE]),
+    ],
+)
+def test_exchanges_with_real_servos(pair, sent, replied):
+    assert pair[0].receive(packet(sent)) == b"".join(map(packet, replied))
+
+
 def test_goals_of_the_maker_arrive(pair):
     server, first, second = pair
     server.receive(packet("FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87"))
@@ -565,7 +581,77 @@ def test_feedback_block_is_one_read():
     assert servo.read_bytes(133, 2) == b"\x08\x00"
 
 
-@pytest.mark.parametrize(("address", "length"), [(14, 1), (130, 30), (147, 1), (168, 2), (65535, 4), (126, 65535)])
+def test_indirect_addresses_as_delivered():
+    (servo,) = make_servos({})
+    for first, data, number in ((168, 224, 28), (578, 634, 28)):
+        for place in range(number):
+            assert servo.read_item(first + 2 * place) == data + place
+        servo.write_bytes(data, bytes(range(number)))
+        assert servo.read_bytes(data, number) == bytes(range(number))
+
+
+def test_example_of_the_maker_for_indirect_data():
+    """E-Manual, Indirect Address, Indirect Data: the LED, then a goal position in four bytes."""
+    servo = make_servo()
+    servo.write_item(168, 65)
+    servo.write_item(224, 1)
+    assert servo.read_item(65) == servo.read_bytes(224, 1)[0] == 1
+    for place in range(4):
+        servo.write_item(170 + 2 * place, 116 + place)
+    servo.write_bytes(225, struct.pack("<i", 1024))
+    assert servo.read_item(116) == 1024
+    servo.write_bytes(224, b"\x00" + struct.pack("<i", -5))
+    assert (servo.read_item(65), servo.read_item(116)) == (0, -5)
+
+
+def test_indirect_data_has_the_properties_of_what_it_stands_for():
+    servo = make_servo()
+    for first, data in ((168, 224), (578, 634)):
+        for place, address in enumerate((116, 117, 118, 119, 132, 133, 98, 147)):
+            servo.write_item(first + 2 * place, address)
+        assert servo.read_bytes(data, 6) == servo.read_bytes(116, 4) + servo.read_bytes(132, 2)
+        assert refused(servo, data, struct.pack("<i", 2_000_000)) is ErrorNumber.DATA_RANGE
+        assert refused(servo, data, b"\x00\x00") is ErrorNumber.DATA_LENGTH
+        assert refused(servo, data + 1, b"\x00\x00\x00\x00") is ErrorNumber.DATA_LENGTH
+        assert refused(servo, data + 4, b"\x00\x00") is ErrorNumber.ACCESS
+        assert refused(servo, data + 6, b"\x80") is ErrorNumber.DATA_RANGE
+        with pytest.raises(RequestRefusedError) as caught:
+            servo.read_bytes(data, 8)
+        assert caught.value.reason is ErrorNumber.ACCESS
+
+
+@pytest.mark.parametrize("value", [0, 63, 662, 65535])
+def test_eeprom_cannot_be_reached_indirectly(value):
+    assert refused_item(make_servo(), 168, value) is ErrorNumber.DATA_RANGE
+
+
+def test_indirect_addresses_are_lost_in_a_restart():
+    servo = make_servo()
+    servo.write_item(168, 65)
+    servo.power_cycle()
+    wait(servo, REBOOT_TIME)
+    assert servo.read_item(168) == 224
+
+
+def test_power_cycle_is_a_reboot_without_being_asked():
+    servo = make_servo()
+    server = Dynamixel2Server([servo])
+    servo.write_item(64, 1)
+    servo.write_item(116, 20_000)
+    wait(servo, 10.0)
+    servo.write_item(98, 10)
+    turned = servo.read_item(132)
+    servo.power_cycle()
+    assert server.receive(frame(1, Instruction.PING)) == b""
+    wait(servo, REBOOT_TIME)
+    assert (servo.read_item(64), servo.read_item(98)) == (0, 0)
+    assert servo.read_item(132) == turned % 4096 != turned
+
+
+@pytest.mark.parametrize(
+    ("address", "length"),
+    [(14, 1), (130, 30), (147, 1), (167, 2), (252, 1), (577, 2), (660, 3), (65535, 4), (126, 65535)],
+)
 def test_reading_what_is_not_defined(address, length):
     (servo,) = make_servos({})
     with pytest.raises(RequestRefusedError) as caught:
@@ -982,7 +1068,33 @@ def test_expired_watchdog_takes_no_goals_until_it_is_cleared():
     assert servo.read_item(132) == 3000
 
 
-def test_any_packet_for_it_feeds_the_watchdog():
+@pytest.mark.parametrize(
+    ("offset", "mode", "runs"), [(0, 4, False), (100, 4, True), (-100, 4, True), (100, 1, False)]
+)
+def test_expired_watchdog_with_a_homing_offset_makes_it_run_away(offset, mode, runs):
+    """ROBOTIS DynamixelSDK, issue 584."""
+    servo = make_servo()
+    servo.write_item(20, offset)
+    servo.write_item(11, mode)
+    arm(servo, 10)
+    clock = servo.world.clock
+    clock.sleep(0.2)
+    servo.world.advance()
+    start = servo.position
+    clock.sleep(100.0)
+    servo.world.advance()
+    turned = servo.position - start
+    assert (abs(turned) > 500.0) is runs
+    assert turned * offset >= 0.0
+    assert refused(servo, 116, bytes(4)) is ErrorNumber.DATA_RANGE
+    servo.write_item(64, 0)
+    start = servo.position
+    clock.sleep(1.0)
+    servo.world.advance()
+    assert servo.position == start
+
+
+def test_any_packet_on_the_bus_feeds_the_watchdog():
     servos = make_servos({"bus_id": 1}, {"bus_id": 2})
     server = Dynamixel2Server(servos)
     for servo in servos:
@@ -993,7 +1105,13 @@ def test_any_packet_for_it_feeds_the_watchdog():
         clock.sleep(0.15)
         server.receive(frame(1, instruction, bytes.fromhex("84000400") if instruction == 2 else b""))
     servos[0].world.advance()
-    assert [servo._values[98] for servo in servos] == [10, -1]
+    # Those for the other servo as well (e-Manual, Bus Watchdog: all instruction packets); a damaged one does not.
+    assert [servo._values[98] for servo in servos] == [10, 10]
+    clock.sleep(0.15)
+    server.receive(frame(1, 1)[:-1] + b"\x00")
+    clock.sleep(0.1)
+    servos[0].world.advance()
+    assert [servo._values[98] for servo in servos] == [-1, -1]
 
 
 def test_watchdog_is_idle_without_torque():

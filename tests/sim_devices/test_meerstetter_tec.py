@@ -350,6 +350,14 @@ def test_an_error_that_resets_itself_brings_the_output_back(tec, clock, plate):
     assert tec.read_parameter(105) == 0
 
 
+def test_an_automatic_restart_takes_time_while_its_cause_stays(tec, clock):
+    tec.write_parameter(6310, 1e-40)
+    run(tec)
+    tec.write_parameter(4011, -200.0)
+    clock.sleep(10.0)
+    assert tec.read_parameter(105) == 138
+
+
 @pytest.mark.parametrize(
     ("settings", "number"),
     [

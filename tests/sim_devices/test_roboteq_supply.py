@@ -17,7 +17,8 @@ from bench.clock import VirtualClock, WallClock
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.emulated import RequestRefusedError
-from sim_devices.instruments.roboteq import DICTIONARY, AbortCode, ChannelFlag, EmulatedRoboteq, Fault, NodeState
+from sim_devices.instruments.roboteq import EmulatedRoboteq
+from sim_devices.instruments.roboteq_objects import DICTIONARY, AbortCode, ChannelFlag, Fault, NodeState
 from sim_devices.wire.canopen_slcan import BITRATES, LONGEST_LINE, CanopenSlcanServer
 from sim_devices.world import World
 
@@ -311,7 +312,7 @@ class TestInstrument:
 # What the manual prints, with the standard command bytes where it leaves the bits e and s clear.
 VECTORS = [
     ("battery 24.0 V", b"t6018400D210200000000\r", b"t58184B0D2102F0000000\r"),
-    ("simplified query", b"t6018480D21020A000000\r", b"t58184B0D2102F0000000\r"),
+    ("simplified query", b"t6018480D21020A000000\r", b"t5818480D2102F0000000\r"),
     ("emergency stop", b"t60182F0C200001000000\r", b"t5818600C200000000000\r"),
     ("simplified emergency stop", b"t60182C0C200001000000\r", b"t5818600C200000000000\r"),
     ("command 500", b"t601823002001F4010000\r", b"t58186000200100000000\r"),
@@ -328,7 +329,9 @@ VECTORS = [
     ("read-only", b"t60182B02210100000000\r", b"t58188002210102000106\r"),
     ("wrong length", b"t60182F00200101000000\r", b"t58188000200110000706\r"),
     ("out of range", b"t601823002001E9030000\r", b"t58188000200130000906\r"),
-    ("segmented download", b"t60182100200104000000\r", b"t58188000200100000106\r"),
+    ("segmented download", b"t60182100200104000000\r", b"t58186000200100000000\r"),
+    ("segmented download of a wrong length", b"t60182100200105000000\r", b"t58188000200110000706\r"),
+    ("segment of no download", b"t60180000000000000000\r", b"t58188000000001000405\r"),
     ("block upload", b"t6018A00D210200000000\r", b"t5818800D210201000405\r"),
     ("segment of nothing", b"t60186000000000000000\r", b"t58188000000001000405\r"),
     ("abort", b"t6018800D210200000000\r", b""),
@@ -339,10 +342,73 @@ VECTORS = [
 ]
 
 
+# Sent and replied, from Roboteq CANBus Networking Manual V2.0, p. 39 to 41 (SDO examples 1 to 3), whose command bytes
+# have the bits e and s clear; the second as its data bytes say, the text misprints its identifier as 601Ch.
+SDO_EXAMPLES = [
+    ({}, b"t6018200320020A000000\r", b"t58186003200200000000\r"),
+    ({"node": 12}, b"t60C82C0C200001000000\r", b"t58C8600C200000000000\r"),
+    ({"battery_voltage": 40.0}, b"t6018480D21020A000000\r", b"t5818480D210290010000\r"),
+]
+
+# The same manual, p. 32: other objects for TPDO1 of node 1.
+MAPPING_EXAMPLE = [
+    b"t601823001801810100C0\r",
+    b"t60182F001A0000000000\r",
+    b"t601823001A0110010021\r",
+    b"t601823001A0210020021\r",
+    b"t601823001A0310010D21\r",
+    b"t601823001A0408010F21\r",
+    b"t60182F001A0004000000\r",
+    b"t60182300180181010040\r",
+]
+
+
 class TestAdapter:
+    @pytest.mark.parametrize(("changes", "sent", "replied"), SDO_EXAMPLES)
+    def test_examples_of_the_maker(self, clock, changes, sent, replied):
+        device, _ = make_device(clock, **changes)
+        server = CanopenSlcanServer(device)
+        server.receive(b"S4\rO\r")
+        assert server.receive(sent) == b"z\r" + replied
+
+    def test_counter_of_the_example_was_set(self, server, device):
+        server.receive(SDO_EXAMPLES[0][1])
+        assert (device.read_object(0x2104, 1), device.read_object(0x2104, 2)) == (0, 10)
+
     @pytest.mark.parametrize(("sent", "received"), [row[1:] for row in VECTORS], ids=[row[0] for row in VECTORS])
     def test_bytes(self, server, sent, received):
         assert server.receive(sent) == b"z\r" + received
+
+    def test_segmented_download(self, server, load):
+        assert server.receive(b"t60182100200104000000\r").endswith(b"t58186000200100000000\r")
+        assert server.receive(b"t60180AF4010000000000\r").endswith(b"t58182000000000000000\r")
+        assert load.applied == []
+        assert server.receive(b"t60181D00000000000000\r").endswith(b"t58188000200110000706\r")
+        assert server.receive(b"t60182100200104000000\r").endswith(b"t58186000200100000000\r")
+        assert server.receive(b"t601807F4010000000000\r").endswith(b"t58182000000000000000\r")
+        assert load.voltage == 12.0
+
+    def test_segmented_download_in_two_segments(self, server, load):
+        server.receive(b"t60182100200104000000\r")
+        assert server.receive(b"t60180AF4010000000000\r").endswith(b"t58182000000000000000\r")
+        assert server.receive(b"t60181B00000000000000\r").endswith(b"t58183000000000000000\r")
+        assert load.voltage == 12.0
+
+    def test_wrong_toggle_bit_ends_the_segmented_download(self, server, load):
+        server.receive(b"t60182100200104000000\r")
+        assert server.receive(b"t601817F4010000000000\r") == b"z\rt58188000200100000305\r"
+        assert server.receive(b"t601807F4010000000000\r") == b"z\rt58188000200101000405\r"
+        assert load.applied == []
+
+    def test_abort_of_the_host_ends_the_segmented_download(self, server, load):
+        server.receive(b"t60182100200104000000\r")
+        assert server.receive(b"t60188000200100000405\r") == b"z\r"
+        assert server.receive(b"t601807F4010000000000\r") == b"z\rt58188000200101000405\r"
+        assert load.applied == []
+
+    def test_line_feeds_are_passed_over(self, server):
+        assert server.receive(b"\nt6018400D210200000000\r\n") == b"z\rt58184B0D2102F0000000\r"
+        assert server.receive(b"t6018400D210200000000\r") == b"z\rt58184B0D2102F0000000\r"
 
     def test_device_name_in_segments(self, server):
         assert server.receive(b"t60184008100000000000\r") == b"z\rt5818410810000F000000\r"
@@ -414,6 +480,33 @@ class TestAdapter:
         clock.sleep(1.0)
         assert server.receive(b"O\r") == b"\r"
 
+    def test_heartbeats_come_on_an_idle_line(self, server, device, clock):
+        assert server.unsolicited() == b""
+        for due in (0.1, 0.2, 0.3):
+            assert server.next_unsolicited() == pytest.approx(due)
+            clock.sleep_until(server.next_unsolicited())
+            assert server.unsolicited() == b"t701105\r"
+            assert server.unsolicited() == b""
+        clock.sleep(0.05)
+        device.power_cycle()
+        assert server.next_unsolicited() == clock.now()
+        assert server.unsolicited() == b"t701100\r"
+        assert server.next_unsolicited() == pytest.approx(0.45)
+
+    def test_no_heartbeat_is_due_while_none_passes(self, server, device, clock):
+        device.write_object(0x1017, 0)
+        assert server.next_unsolicited() == math.inf
+        device.write_object(0x1017, 50)
+        server.receive(b"C\r")
+        assert server.next_unsolicited() == math.inf
+        server.receive(b"O\r")
+        device.unplug()
+        assert server.next_unsolicited() == math.inf
+        clock.sleep(1.0)
+        assert server.unsolicited() == b""
+        device.plug_in()
+        assert server.next_unsolicited() == pytest.approx(clock.now() + 0.05)
+
     def test_network_management(self, server, device, clock):
         query = b"t6018400D210200000000\r"
         assert server.receive(b"t00020201\r") == b"z\r"
@@ -476,8 +569,123 @@ class TestAdapter:
         server.receive(b"S4\rO\r")
         request = bytes((command,)) + struct.pack("<HB", *key) + data
         answer = server.receive(b"t6018%s\r" % request.hex().encode())[2:]
-        if command >> 5 in (0, 1, 2, 5, 6, 7):
+        # A segment of either direction does not name its object.
+        if command >> 5 in (1, 2, 5, 6, 7):
             assert bytes.fromhex(answer[7:13].decode()) == request[1:4]
+
+
+class TestProcessData:
+    def test_configuration_as_delivered(self, device):
+        for number in range(4):
+            assert device.read_object(0x1800 + number, 1) == 0x40000181 + 0x100 * number
+            assert device.read_object(0x1400 + number, 1) == 0x201 + 0x100 * number
+            for mapping, index, first in ((0x1A00, 0x2106, 1), (0x1600, 0x2005, 9)):
+                assert device.read_object(mapping + number, 0) == 2
+                for place in (1, 2):
+                    expected = index << 16 | (first + 2 * number + place - 1) << 8 | 32
+                    assert device.read_object(mapping + number, place) == expected
+            for parameters in (0x1800, 0x1400):
+                assert device.read_object(parameters + number, 0) == 2
+                assert device.read_object(parameters + number, 2) == 255
+
+    def test_mapping_of_the_example_is_sent_after_each_sync(self, server, device):
+        for sent in MAPPING_EXAMPLE:
+            assert server.receive(sent).endswith(b"t581860%s00000000\r" % sent[7:13])
+        assert server.receive(b"t0800\r") == b"z\r"
+        assert server.receive(b"t60182F00180200000000\r").endswith(b"t58186000180200000000\r")
+        device.write_object(COMMAND, 500, 1)
+        amps = device.read_object(0x2100, 1).to_bytes(2, "little").hex().upper().encode()
+        frame = b"t1817%s00007600%02X\r" % (amps, device.read_object(0x210F, 1))
+        assert server.receive(b"t0800\rt0800\r") == b"z\r" + frame + b"z\r" + frame
+        device.write_object(0x1800, 3, 2)
+        assert server.receive(b"t0800\r" * 7) == b"z\rz\rz\r" + frame + b"z\rz\rz\r" + frame + b"z\r"
+        device.manage(128)
+        assert server.receive(b"t0800\r" * 3) == b"z\r" * 3
+
+    def test_send_rate(self, clock):
+        device, _ = make_device(clock, send_rates=(50, 0, 200, 0))
+        server = CanopenSlcanServer(device)
+        server.receive(b"S4\rO\r")
+        device.write_object(0x1017, 0)
+        for instant, frames in ((0.05, (1,)), (0.1, (1,)), (0.15, (1,)), (0.2, (1, 3))):
+            assert server.next_unsolicited() == pytest.approx(instant)
+            clock.sleep_until(server.next_unsolicited())
+            assert server.unsolicited() == b"".join(b"t%d818%s\r" % (number, b"0" * 16) for number in frames)
+            assert server.unsolicited() == b""
+        clock.sleep(3600.0)
+        assert len(server.unsolicited()) == 2 * 22
+        server.receive(b"t00020201\r")
+        assert server.next_unsolicited() == math.inf
+        clock.sleep(1.0)
+        assert server.unsolicited() == b""
+
+    def test_variables_come_in_and_are_no_power(self, server, device, load):
+        assert server.receive(b"t2018F401000018FCFFFF\r") == b"z\r"
+        assert (device.read_object(0x2106, 9), device.read_object(0x2106, 10)) == (500, -1000)
+        assert server.receive(b"t5018F40100000C000000\r") == b"z\r"
+        assert (device.read_object(0x2106, 15), device.read_object(0x2106, 16)) == (500, 12)
+        server.receive(b"t2017F4010000000000\r")
+        server.receive(b"t2028F4010000F4010000\r")
+        assert device.read_object(0x2106, 9) == 500
+        assert load.applied == []
+
+    def test_command_that_comes_in_feeds_the_watchdog(self, server, device, clock):
+        for index, sub, value in ((0x1400, 1, 0x80000201), (0x1600, 0, 0), (0x1600, 1, 0x20000120), (0x1600, 0, 1)):
+            device.write_object(index, value, sub)
+        device.write_object(0x1400, 0x201, 1)
+        for _ in range(10):
+            server.receive(b"t2014F4010000\r")
+            clock.sleep(0.9)
+        assert device.power == 500
+        server.receive(b"t2014E9030000\r")
+        assert device.power == 500
+        clock.sleep(1.1)
+        assert device.power == 0
+
+    @pytest.mark.parametrize(
+        ("index", "sub", "value", "code"),
+        [
+            (0x1A00, 0, 0, AbortCode.UNSUPPORTED),
+            (0x1A00, 1, 0x21000110, AbortCode.UNSUPPORTED),
+            (0x1800, 1, 0x1_0000_0, AbortCode.VALUE),
+            (0x1800, 2, 252, AbortCode.VALUE),
+            (0x1800, 0, 2, AbortCode.READ_ONLY),
+            (0x1800, 3, 2, AbortCode.NO_SUBINDEX),
+            (0x1804, 1, 2, AbortCode.NO_OBJECT),
+        ],
+    )
+    def test_configuration_that_is_refused(self, device, index, sub, value, code):
+        with pytest.raises(RequestRefusedError) as caught:
+            device.write_object(index, value, sub)
+        assert caught.value.reason == code
+
+    @pytest.mark.parametrize(
+        ("base", "entries", "code"),
+        [
+            (0x1A00, [0x20000120], AbortCode.NOT_MAPPABLE),
+            (0x1A00, [0x21000120], AbortCode.NOT_MAPPABLE),
+            (0x1A00, [0x30000020], AbortCode.NOT_MAPPABLE),
+            (0x1A00, [0x10080020], AbortCode.NOT_MAPPABLE),
+            (0x1600, [0x21000110], AbortCode.NOT_MAPPABLE),
+            (0x1A00, [0x21060120, 0x21060220, 0x21000110], AbortCode.MAPPING_TOO_LONG),
+            (0x1A00, [0] * 9, AbortCode.VALUE),
+        ],
+    )
+    def test_mapping_that_is_refused(self, device, base, entries, code):
+        device.write_object(base - 0x200, 1 << 31, 1)
+        device.write_object(base, 0, 0)
+        for place, entry in enumerate(entries[:8]):
+            device.write_object(base, entry, 1 + place)
+        with pytest.raises(RequestRefusedError) as caught:
+            device.write_object(base, len(entries), 0)
+        assert caught.value.reason == code
+
+    def test_restart_brings_the_configuration_back(self, server, device):
+        for sent in MAPPING_EXAMPLE:
+            server.receive(sent)
+        assert device.read_object(0x1A00, 0) == 4
+        device.power_cycle()
+        assert (device.read_object(0x1A00, 0), device.read_object(0x1800, 1)) == (2, 0x40000181)
 
 
 class Bus:

@@ -23,11 +23,11 @@ from rigs.muscles.laboratory import (
     SMALaboratory,
     SMALaboratorySettings,
 )
-from sim_devices.instruments.dynamixel_table import VELOCITY_UNIT
+from sim_devices.instruments.dynamixel_table import EXTENDED, VELOCITY_UNIT
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
-PROFILE_VELOCITY = 112
-"""Item of the servo's control table."""
+OPERATING_MODE, TORQUE_ENABLE, PROFILE_VELOCITY, GOAL_POSITION = 11, 64, 112, 116
+"""Items of the servo's control table."""
 
 RIGS = ("sma", "mckibben", "coiled-polymer")
 PORTS = ("supply", "load_cell", "stage")
@@ -113,6 +113,23 @@ class TestFrame:
         assert bench.muscle.position > -1e-3
         # The stage stands still where it was.
         assert bench.frame.drum.position == pytest.approx(-6e-3, abs=8e-6)
+
+    @pytest.mark.parametrize("turns", [-256, 256])
+    def test_the_stage_has_end_stops(self, turns):
+        bench = laboratory()
+        bench.operate(STAGE, 0.0)
+        for item, value in ((OPERATING_MODE, EXTENDED), (TORQUE_ENABLE, 1), (GOAL_POSITION, turns * 4095)):
+            bench.servo.write_item(item, value)
+        wait(bench, 300.0)
+        assert abs(bench.frame.drum.position) > 6.0
+        assert bench.muscle.parameters.reach == pytest.approx(abs(bench.muscle.position), rel=1e-3)
+
+    @pytest.mark.parametrize(("command", "volts"), [(-1000, 0.0), (1000, 5.0), (300, 3.0)])
+    def test_the_muscle_gets_no_voltage_that_it_does_not_take(self, command, volts):
+        bench = laboratory(battery_voltage=10.0)
+        bench.supply.write_object(0x2000, command, 1)
+        assert bench.muscle.voltage == volts
+        assert bench.supply.voltage == command / 100
 
     def test_how_time_is_split_hardly_matters_while_the_stage_moves(self):
         moving, standing = [], []

@@ -552,6 +552,13 @@ class TestBehindAController:
         clock.sleep(1.0)
         assert tec.measure()["tec_current"] == 0.0
 
+    def test_a_current_beyond_the_rating_is_held_at_it(self):
+        plant, tec, _ = self.make()
+        tec.select_mode(TECMode.CURRENT)
+        for asked, held in ((4.0, PLAIN.maximum_current), (-4.0, -PLAIN.maximum_current)):
+            tec.set(asked)
+            assert plant.current == held
+
     def test_temperature_mode(self):
         plant, tec, clock = self.make()
         tec.write_parameter(2030, 0.15)

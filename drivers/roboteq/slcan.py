@@ -1,0 +1,92 @@
+"""An slcan adapter on a serial line: python-can opens and closes its channel; frames pass as lines of text.
+
+Source: LAWICEL CAN232 manual V3.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+
+import serial
+from can import CanError
+from can.interfaces.slcan import slcanBus
+
+from drivers.serial_line import SerialSettings
+
+_MOST_READS = 4096
+_LONGEST_LINE = 64
+
+
+class SlcanAdapter(slcanBus):
+    """The slcan adapter of python-can, in lines instead of messages, which reads what has arrived, not byte by byte.
+
+    The only wait is the port's own timeout, so the port decides which clock it uses. An empty read means silence
+    for the whole timeout. Adapters differ in how they acknowledge a line: by a carriage return, by a line feed, or
+    not at all. So an acknowledgement is not waited for.
+
+    Attributes
+    ----------
+    refusals : int
+        How often the adapter has answered with BEL since it was opened.
+    """
+
+    def __init__(self, settings: SerialSettings, bitrate: int) -> None:
+        self.refusals = 0
+        self._lines: deque[bytes] = deque()
+        self._rest = b""
+        try:
+            super().__init__(
+                settings.port,
+                tty_baudrate=settings.baudrate,
+                bitrate=bitrate,
+                sleep_after_open=0,
+                timeout=settings.timeout,
+            )
+            self._port = self.serialPortOrig
+            self._port.write_timeout = settings.timeout
+        except BaseException:
+            self._abandon()
+            raise
+
+    def transmit(self, line: bytes) -> None:
+        """Send a line, which has its end."""
+        self._port.write(line)
+
+    def line(self, *, wait: bool = True) -> bytes | None:
+        """Return the next line with a standard data frame, without its end.
+
+        None after the silence of the port's timeout; without `wait`, if none has arrived.
+        """
+        lines = self._lines
+        for _ in range(_MOST_READS):
+            if lines:
+                return lines.popleft()
+            received = self._port.read_all() or (self._port.read(1) if wait else b"")
+            if not received:
+                return None
+            self._take(received)
+        return None
+
+    def release(self) -> None:
+        """Close the channel and the port, in any state."""
+        with suppress(CanError, serial.SerialException, OSError):
+            self.shutdown()
+        self._abandon()
+
+    def _take(self, received: bytes) -> None:
+        """Divide what has come into lines, and keep those with a frame."""
+        text = self._rest + received
+        if b"\n" in text:
+            text = text.replace(b"\n", b"\r")
+        if b"\a" in text:
+            self.refusals += text.count(b"\a")
+            text = text.replace(b"\a", b"\r")
+        *lines, rest = text.split(b"\r")
+        self._rest = rest if len(rest) <= _LONGEST_LINE else b""
+        self._lines.extend([line for line in lines if line[:1] == b"t"])
+
+    def _abandon(self) -> None:
+        port = getattr(self, "serialPortOrig", None)
+        if port is not None:
+            port.close()

@@ -1,0 +1,125 @@
+"""pymodbus and mbpoll on the served LabJack T7, which takes two connections."""
+
+import asyncio
+import re
+import socket
+import struct
+
+import pytest
+from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
+from served import PATIENCE, address
+from test_load_cell import mbpoll, needs_mbpoll
+
+AIN0, DAC0, FIO0, TEST, SERIAL = 0, 1000, 2000, 55100, 60028
+TEST_REQUEST = bytes.fromhex("0000 0000 0006 01 03 d73c 0002")
+TEST_ANSWER = bytes.fromhex("0000 0000 0007 01 03 04 00112233")
+
+
+@pytest.fixture
+def place(sma):
+    """Host and port."""
+    return address(sma.port("t7"))
+
+
+@pytest.fixture
+def client(place):
+    with ModbusTcpClient(place[0], port=place[1], timeout=PATIENCE, retries=0) as client:
+        yield client
+
+
+def real(client, register):
+    words = client.read_holding_registers(register, count=2, device_id=1).registers
+    return client.convert_from_registers(words, client.DATATYPE.FLOAT32)
+
+
+def exchange(connection, data, length):
+    connection.sendall(data)
+    answer = b""
+    while len(answer) < length and (piece := connection.recv(4096)):
+        answer += piece
+    return answer
+
+
+def test_an_output_reads_back(client):
+    words = client.convert_to_registers(2.5, client.DATATYPE.FLOAT32)
+    assert not client.write_registers(DAC0, words, device_id=1).isError()
+    assert real(client, DAC0) == 2.5
+
+
+def test_a_digital_line_switches_the_fan(client, sma):
+    for level in (1, 0):
+        assert not client.write_register(FIO0, level, device_id=1).isError()
+        assert sma.control.state()["fan"] == level
+
+
+def test_an_input_follows_the_wire(client, sma):
+    sma.control.operate("load", 1.0)
+    sma.control.advance(10.0)
+    shares, positions = [], []
+    for newtons in (1.0, 9.0):
+        sma.control.operate("load", newtons)
+        sma.control.advance(10.0)
+        shares.append(real(client, AIN0) / real(client, AIN0 + 2))
+        positions.append(sma.control.state()["position"])
+    # 0.5 to 4.5 V of 5 V over a stroke of 35 mm.
+    assert (shares[1] - shares[0]) / 0.8 * 35e-3 == pytest.approx(positions[1] - positions[0], abs=2e-4)
+    assert positions[1] - positions[0] > 2e-4
+
+
+def test_a_refusal_is_an_exception_frame(client):
+    words = client.convert_to_registers(3.0, client.DATATYPE.FLOAT32)
+    refused = client.write_registers(40_000, words, device_id=1)
+    assert refused.isError()
+    assert client.read_holding_registers(55_000, count=1, device_id=1).registers == [2370]
+
+
+def test_asyncio_reads_at_the_same_time(place):
+    async def read():
+        clients = [AsyncModbusTcpClient(place[0], port=place[1], timeout=PATIENCE, retries=0) for _ in range(2)]
+        try:
+            for client in clients:
+                assert await client.connect()
+            answers = await asyncio.gather(
+                *(client.read_holding_registers(TEST, count=2, device_id=1) for client in clients for _ in range(20))
+            )
+            return {tuple(answer.registers) for answer in answers}
+        finally:
+            for client in clients:
+                client.close()
+
+    assert asyncio.run(read()) == {(0x0011, 0x2233)}
+
+
+@needs_mbpoll
+def test_mbpoll_reads(place):
+    code, output = mbpoll(
+        "-m", "tcp", "-p", place[1], "-0", "-r", TEST, "-t", "4:hex", "-c", 2, "-1", "-o", 10, place[0]
+    )
+    assert code == 0, output
+    assert re.findall(r"0x([0-9A-F]{4})", output) == ["0011", "2233"]
+
+
+@needs_mbpoll
+def test_mbpoll_writes(place, client):
+    code, output = mbpoll(
+        "-m", "tcp", "-p", place[1], "-0", "-r", DAC0, "-t", "4:float", "-B", "-1", "-o", 10, place[0], 1.25
+    )
+    assert code == 0, output
+    assert real(client, DAC0) == 1.25
+
+
+def test_a_place_is_free_again_after_a_disconnection_in_mid_frame(place):
+    for _ in range(5):
+        with socket.create_connection(place, PATIENCE) as first, socket.create_connection(place, PATIENCE) as second:
+            first.sendall(TEST_REQUEST[:9])
+            assert exchange(second, TEST_REQUEST, 13) == TEST_ANSWER
+
+
+def test_a_connection_that_is_reset_leaves_its_place(place):
+    for _ in range(5):
+        connection = socket.create_connection(place, PATIENCE)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.sendall(TEST_REQUEST * 20)
+        connection.close()
+    with socket.create_connection(place, PATIENCE) as connection:
+        assert exchange(connection, TEST_REQUEST, 13) == TEST_ANSWER
