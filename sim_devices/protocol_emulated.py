@@ -147,7 +147,11 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             return
         end = math.inf if self._timeout is None else self._clock.now() + self._timeout
         while len(self._received) < size:
-            instant = end if self._line is None else min(end, self._line.next_unsolicited())
+            instant = end
+            if self._line is not None:
+                due = self._line.next_unsolicited()
+                # What is overdue and has not come does not come.
+                instant = min(end, due) if due > self._clock.now() else end
             if instant == math.inf:
                 raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
             self._clock.sleep_until(instant)
