@@ -63,7 +63,11 @@ class ControllerSetup:
                 f"controller {self.name} needs a model with memory, such as a Preisach model; this one is "
                 f"{self.model.name}"
             )
-        return self.model.operator.inverse(self.policy)
+        operator = self.model.operator
+        inverse = operator.inverse(self.policy)
+        # Its kernels are compiled before anything moves, not at the first target.
+        inverse.invert(operator.initial_state(), 0.5 * sum(operator.output_range()))
+        return inverse
 
     @property
     def spans(self) -> Spans:

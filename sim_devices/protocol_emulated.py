@@ -86,7 +86,6 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             known = ", ".join(_SCHEME + other for other in sorted(_sockets)) or "none"
             raise SerialException(f"no emulated instrument at {_SCHEME}{self._name}; there are: {known}")
         self._received = bytearray()
-        self._unasked = 0  # bytes that came by themselves since the last request
         self._plug_in()
         self.is_open = True
 
@@ -148,7 +147,11 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             return
         end = math.inf if self._timeout is None else self._clock.now() + self._timeout
         while len(self._received) < size:
-            instant = end if self._line is None else min(end, self._line.next_unsolicited())
+            instant = end
+            if self._line is not None:
+                due = self._line.next_unsolicited()
+                # What is overdue and has not come does not come.
+                instant = min(end, due) if due > self._clock.now() else end
             if instant == math.inf:
                 raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
             self._clock.sleep_until(instant)
@@ -158,10 +161,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def _hear(self) -> None:
         if self._line is not None:
-            heard = self._line.unsolicited()
-            if heard:
-                self._received += heard
-                self._unasked += len(heard)
+            self._received += self._line.unsolicited()
 
     def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
         """Return what was received up to `expected`, or `size` bytes; what there is after the timeout on the clock.
@@ -191,9 +191,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         self._clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
         self._hear()
         answer = self._receive(sent)
-        # What the instrument has sent by itself takes its time on the line as well.
-        self._clock.sleep((self._unasked + len(answer)) * _BITS_PER_BYTE / self._baudrate)
-        self._unasked = 0
+        self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
 

@@ -19,7 +19,7 @@ class Controller(unittest.TestCase):
         """The answer is that of the device specification."""
         with serial.serial_for_url(self.rig.port("tec"), 57600, timeout=10) as line:
             line.write(b"#0115AA?IF257D\r")
-            assert line.read_until(b"\r").startswith(b"!0115AATEC-1091")
+            assert line.read_until(b"\r").startswith(b"!0115AA8065-TEC SW")
 
 
 if __name__ == "__main__":

@@ -179,12 +179,14 @@ def test_the_drift_is_that_of_an_independent_kalman_filter():
     estimator = DriftEstimator(noise=noise, agility=agility)
     reference = KalmanFilter(dim_x=2, dim_z=1)
     reference.H, reference.R = np.array([[1.0, 0.0]]), np.array([[noise**2]])
-    for k, time in enumerate(np.cumsum(steps := rng.choice([0.1, 0.25, 0.5], 500))):
-        dt = steps[k]
+    times = np.cumsum(rng.choice([0.1, 0.25, 0.5], 500))
+    for k, time in enumerate(times):
         value = 30.0 + math.exp(-time / 20.0) + noise * rng.standard_normal()
         if k == 0:
             reference.x, reference.P = np.array([value, 0.0]), np.diag([noise**2, (1e6 * noise) ** 2])
         else:
+            # Of the times themselves: the first readings cancel all but the last digits.
+            dt = time - times[k - 1]
             reference.F = np.array([[1.0, dt], [0.0, 1.0]])
             reference.Q = agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
             reference.predict()

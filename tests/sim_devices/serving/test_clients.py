@@ -10,7 +10,7 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 IDENTIFY = b"#0115AA?IF257D\r"
-IDENTITY = b"!0115AATEC-1091"
+IDENTITY = b"!0115AA8065-TEC SW"
 PING = bytes.fromhex("fffffd0001030001194e")
 PONG = bytes.fromhex("fffffd00010700550000")
 READ_PRODUCT = bytes.fromhex("0003ea600002")  # PRODUCT_ID, a float

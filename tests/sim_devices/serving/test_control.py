@@ -13,7 +13,7 @@ from sim_devices.serving.process import serve
 from sim_devices.serving.requests import REQUESTS, parse_request
 
 IDENTIFY = b"#0115AA?IF257D\r"
-IDENTITY = b"!0115AATEC-1091"
+IDENTITY = b"!0115AA8065-TEC SW"
 
 
 @pytest.fixture
