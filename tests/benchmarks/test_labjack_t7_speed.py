@@ -3,6 +3,7 @@
 import time
 from statistics import median
 
+import numpy as np
 import pytest
 
 from bench.clock import VirtualClock
@@ -13,6 +14,7 @@ from drivers.labjack_t7.registers import AIN, TEST, LabJackT7, Span
 pytestmark = pytest.mark.benchmark
 
 RATE = 20e3
+BLOCK = 50
 
 
 def microseconds(call, count=2000, repeats=9):
@@ -62,6 +64,26 @@ def test_twenty_kilohertz(rig, capsys):
     assert supply.setpoint != 0.0
     with capsys.disabled():
         print(f"\nreading and writing at 20 kHz: {cost:.1f} µs a sample, {1e6 / RATE / cost:.1f} times real time")
+
+
+def test_blocks_of_samples(rig, capsys):
+    sensor, supply, clock = rig.devices["displacement"], rig.devices["piezo"], rig.clock
+    supply.set(0.0)
+    count, start = 0, clock.now()
+    found = {}
+    for name, amplitude in (("constant", 0.0), ("below a step of the DAC", 2e-3), ("sine of 5 V at 400 Hz", 5.0)):
+        setpoints = amplitude * np.sin(2 * np.pi * np.arange(BLOCK) / BLOCK)
+
+        def block(setpoints=setpoints):
+            nonlocal count
+            clock.sleep_until(start + count / RATE)
+            count += BLOCK
+            assert supply.play(setpoints, 1 / RATE, sensor).shape == (BLOCK, 1)
+
+        found[name] = microseconds(block, 40) / BLOCK
+    with capsys.disabled():
+        costs = (f"{name} {cost:.1f} µs ({1e6 / RATE / cost:.1f} times)" for name, cost in found.items())
+        print(f"\nblocks of {BLOCK} at 20 kHz, CPU time a sample:", ", ".join(costs))
 
 
 def test_a_glance_of_the_whole_rig(rig, capsys):
