@@ -223,7 +223,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._stream_index = 0
         self._stream_settling = 0.0
         self._dacs = [0.0, 0.0]
-        self._tdacs = [0.0] * _TDACS
+        self._tdac_codes = [0] * _TDACS
         self._dio_state = 0
         self._dio_direction = 0
         self._dio_inhibit = 0
@@ -265,7 +265,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def tdac_volts(self, number: int) -> float:
         """Return the voltage in V at an output of an LJTick-DAC, 0 to 22, in its steps."""
-        return TDAC_STEP * round(self._tdacs[number] / TDAC_STEP)
+        return TDAC_STEP * self._tdac_codes[number]
 
     def dio_level(self, number: int, *, pulled_down: bool = False) -> bool:
         """Return the level of a digital line, 0 to 22.
@@ -277,7 +277,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return bool(levels >> number & 1)
 
     def add_follower(self, follow: Callable[[], None]) -> None:
-        """Call `follow()` now, after every request that touches an output, and when the watchdog acts.
+        """Call `follow()` now, after every request that may change an output, and when the watchdog acts.
 
         A load at the outputs reads them then; the world stands at that instant.
         """
@@ -507,8 +507,10 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._dacs[number] = min(max(value, 0.0), _DAC_TOP)
 
     def _set_tdac(self, number: int, value: float) -> None:
-        self._touched = True
-        self._tdacs[number] = value if -_TDAC_TOP <= value <= _TDAC_TOP else math.copysign(_TDAC_TOP, value)
+        code = round(min(max(value, -_TDAC_TOP), _TDAC_TOP) / TDAC_STEP)
+        if code != self._tdac_codes[number]:
+            self._tdac_codes[number] = code
+            self._touched = True
 
     def _read_dio(self, number: int) -> float:
         self._touched = True
