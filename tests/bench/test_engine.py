@@ -1,5 +1,6 @@
 import math
 import sqlite3
+import sys
 import threading
 
 import numpy as np
@@ -648,7 +649,9 @@ class TestControl:
             plan(control(Integrator(50.0), **keys), Nothing())
 
     @pytest.mark.timeout(60)
-    def test_a_protocol_that_controls_for_ever_has_no_plan(self):
+    def test_a_protocol_that_controls_for_ever_has_no_plan(self, monkeypatch):
+        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "_LONGEST_PLAN", 10_000)
+
         def endless(parameters):
             message = next(control(Integrator(50.0)).generator(parameters))
             while True:
