@@ -243,10 +243,10 @@ def _print_end(values: Mapping[str, Any], console: Console) -> None:
         f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
         highlight=False,
     )
-    console.print(f"runs, models and recordings: {values['folder']}", highlight=False, soft_wrap=True)
+    console.print(f"runs, models and recordings: {values['folder']}", highlight=False, markup=False, soft_wrap=True)
     for folder in dict.fromkeys(str(Path(path).parent) for path in values["figures"]):
-        console.print(f"figures: {folder}", highlight=False, soft_wrap=True)
+        console.print(f"figures: {folder}", highlight=False, markup=False, soft_wrap=True)
     if values["recordings"]:
         console.print("open a recording with `rerun FILE`:", highlight=False)
     for path in values["recordings"]:
-        console.print(f"  {path}", highlight=False, soft_wrap=True)
+        console.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)

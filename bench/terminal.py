@@ -52,13 +52,15 @@ class ProgressDisplay:
         self._console = console
         self._shown = [(i, signal) for i, signal in enumerate(signals) if signal.name in shown]
         self._progress = Progress(
-            TextColumn("[bold]{task.description}[/] {task.fields[phase]}"),
+            # Names and phases are the protocol's: no markup.
+            TextColumn("{task.description}", style="bold", markup=False),
+            TextColumn("{task.fields[phase]}", markup=False),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            TextColumn("[cyan]{task.fields[readings]}"),
+            TextColumn("{task.fields[readings]}", style="cyan", markup=False),
             console=console,
             transient=False,
             disable=not console.is_terminal,

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import typer
+from rich.markup import escape
 
 from bench import registry
 from bench.cli import models, records, runs
@@ -54,6 +55,6 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except BenchError as error:
         fail(error)
     except sqlite3.Error as error:
-        error_console.print(f"[bold red]error:[/] the journal cannot be written: {error}", highlight=False)
+        error_console.print("[bold red]error:[/] the journal cannot be written:", escape(str(error)), highlight=False)
         sys.exit(1)
     sys.exit(0)

@@ -114,12 +114,12 @@ def identify_(
     print_rows(f"{model} from {file.name}", certificate_lines(found))
     if out is not None:
         found.file.save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
+        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
     if figures is not None:
         from bench.results.report import draw_identification
 
         for path in draw_identification(found, figures):
-            console.print(f"figure: {path}", highlight=False, soft_wrap=True)
+            console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
     write_json(json_file, found.summary())
 
 
@@ -165,7 +165,7 @@ def predict_(
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
         )
-    console.print(f"{inputs.size} rows: {out}", highlight=False, soft_wrap=True)
+    console.print(f"{inputs.size} rows: {out}", highlight=False, markup=False, soft_wrap=True)
     write_json(json_file, result)
 
 
@@ -214,7 +214,7 @@ def compare_(
     if figures is not None:
         from bench.results.report import draw_comparison
 
-        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, soft_wrap=True)
+        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, markup=False, soft_wrap=True)
     write_json(json_file, result.to_json())
 
 

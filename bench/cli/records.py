@@ -66,5 +66,5 @@ def export(
 
     paths = export_run(run, format_.value, out)
     for path in paths:
-        console.print(f"{path}", highlight=False, soft_wrap=True)
+        console.print(f"{path}", highlight=False, markup=False, soft_wrap=True)
     write_json(json_file, {"files": [str(path) for path in paths]})

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.markdown import Markdown
+from rich.markup import escape
 from rich.table import Table
 
 from bench.cli.console import (
@@ -181,7 +182,7 @@ def run(
     )
     if outcome.pace is not None and not outcome.pace.is_reached:
         console.print(f"clock: {outcome.pace}", highlight=False)
-    console.print(f"record: {result.folder}", highlight=False, soft_wrap=True)
+    console.print(f"record: {result.folder}", highlight=False, markup=False, soft_wrap=True)
     write_json(
         json_file,
         {
@@ -198,7 +199,10 @@ def run(
     for name, state in outcome.safe_state.items():
         if state != SAFE:
             error_console.print(
-                f"[bold red]error:[/] {name} is NOT in its safe state:", state, highlight=False, soft_wrap=True
+                "[bold red]error:[/]",
+                escape(f"{name} is NOT in its safe state: {state}"),
+                highlight=False,
+                soft_wrap=True,
             )
     if outcome.error is not None:
         if not isinstance(outcome.error, BenchError):

@@ -72,7 +72,7 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         _print_control(control, record, controlled, console)
         _print_comparison(comparison, models, record, console)
     for path in [*figures, *more]:
-        console.print(f"figure: {path}", highlight=False, soft_wrap=True)
+        console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
     return {
         "run": record.meta["run"],
         "status": record.status,

@@ -48,7 +48,7 @@ def identify(
         ModelFile(
             "hybrid", found.model, provenance={"sources": [run.name for run in (steps, static, loops, step)]}
         ).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
+        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
     write_json(
         json_file,
         {

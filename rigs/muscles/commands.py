@@ -44,7 +44,7 @@ def identify_muscle(
     print_rows(f"{model} from {len(series)} series of lengths", rows)
     if out is not None:
         muscle.muscle_file(model, found, [force_run, *length_runs]).save(out)
-        console.print(f"model: {out}", highlight=False, soft_wrap=True)
+        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
     write_json(
         json_file,
         {

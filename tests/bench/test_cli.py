@@ -177,6 +177,22 @@ class TestRun:
             assert np.max(np.abs(steps["tec_temperature"] - steps["tec_setpoint"])) < 0.2
             assert np.ptp(steps["curvature"]) > 1500
 
+    def test_a_name_is_never_markup(self, bench, tmp_path):
+        folder = tmp_path / "runs[" / "red]"
+        script = tmp_path / "x[" / "red].py"
+        script.parent.mkdir()
+        script.write_text(
+            "from bench.protocol import Dwell, Phase, ProtocolParameters, Step, protocol\n"
+            "@protocol(needs=('tec',))\n"
+            "def hold(parameters: ProtocolParameters):\n"
+            "    'Hold [/red].'\n"
+            "    yield Phase('[/red] phase')\n"
+            "    yield Step({'tec': 30.0}, Dwell(1.0), label='[/red]')\n"
+        )
+        code, out, err = bench("run", script, *FAST, "--out", folder)
+        assert (code, err) == (0, "")
+        assert f"record: {folder}" in out
+
     def test_same_seed_gives_the_same_record(self, bench, tmp_path):
         journals = []
         for name, seed in (("a", 3), ("b", 3), ("c", 4)):

@@ -191,8 +191,8 @@ SIGNALS = (Signal("tec_temperature", "°C", "t", 2), Signal("force", "N", "f"))
 class TestDisplay:
     def show(self, **keys):
         console = Console(file=io.StringIO(), width=160, **keys)
-        with ProgressDisplay(console, "stairs", SIGNALS, ("tec_temperature",), 2) as display:
-            display.event(Event(0.0, "INFO", "phase", "climb"))
+        with ProgressDisplay(console, "x[/red].py", SIGNALS, ("tec_temperature",), 2) as display:
+            display.event(Event(0.0, "INFO", "phase", "climb [/red]"))
             display.event(Event(3661.0, "INFO", "note", "there [bold]now"))
             display.event(Event(5.0, "WARN", "pause", "paused"))
             display.event(Event(6.0, "ERROR", "interlock", "too hot"))
@@ -213,6 +213,8 @@ class TestDisplay:
     def test_at_a_terminal_a_bar_with_readings(self):
         shown = self.show(force_terminal=True)
         assert "2/2" in shown
+        assert "x[/red].py" in shown
+        assert "climb [/red]" in shown
         assert "tec_temperature 20.12 °C" in shown
         assert "force" not in shown
 
