@@ -110,6 +110,10 @@ class ModbusClient(ABC):
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
 
     @abstractmethod
+    def wait_for(self, seconds: float) -> None:
+        """Wait so long for a reply from now on, s."""
+
+    @abstractmethod
     def close(self) -> None:
         """Release the line; may be called again."""
 
@@ -129,6 +133,10 @@ class _PortClient(ModbusClient):
 
     def __init__(self, port: Any) -> None:  # noqa: ANN401 - pyserial is untyped
         self._port = port
+
+    def wait_for(self, seconds: float) -> None:
+        """Wait so long for a reply from now on, s."""
+        self._port.timeout = seconds
 
     def close(self) -> None:
         """Release the line; may be called again."""

@@ -53,6 +53,8 @@ class Connection:
     ----------
     lock : threading.RLock
         Held for each request, as devices may be read by several threads.
+    timeout : float
+        Longest wait for a reply, s: the longest that one of its devices asked for.
     ended : bool
         Whether it has been closed, for all its devices.
     """
@@ -60,7 +62,8 @@ class Connection:
     def __init__(self, port: str, timeout: float) -> None:
         self.lock = threading.RLock()
         self.client = _open_client(port, timeout)
-        self._key = port, timeout
+        self.timeout = timeout
+        self._port = port
         self._users = 0
         self.ended = False
 
@@ -85,30 +88,32 @@ class Connection:
         """Close the connection for all its devices: each has to connect again, so that it is set up again."""
         with _registry:
             self.ended = True
-            if _connections.get(self._key) is self:
-                del _connections[self._key]
+            if _connections.get(self._port) is self:
+                del _connections[self._port]
         self.client.close()
 
-    def acquire(self) -> None:
-        """Begin the use by one more device."""
+    def acquire(self, timeout: float) -> None:
+        """Begin the use by one more device, which waits for a reply so long at most, s."""
         self._users += 1
+        if timeout > self.timeout:
+            with self.lock:
+                self.timeout = timeout
+                self.client.wait_for(timeout)
 
 
 _registry = threading.RLock()
-_connections: dict[tuple[str, float], Connection] = {}
+_connections: dict[str, Connection] = {}
 
 
 def share(port: str, timeout: float) -> Connection:
     """Return the open connection of this process to an instrument, or open one.
-
-    Devices that wait for a different time have different connections.
 
     Parameters
     ----------
     port : str
         Address as `tcp://HOST:PORT` or `emulated://NAME`.
     timeout : float
-        Longest wait for a connection or a reply, s.
+        Longest wait for a connection or a reply, s; of devices that differ, the longest counts for all.
 
     Raises
     ------
@@ -116,8 +121,8 @@ def share(port: str, timeout: float) -> Connection:
         If no connection can be made.
     """
     with _registry:
-        connection = _connections.get((port, timeout))
+        connection = _connections.get(port)
         if connection is None or not connection.is_open:
-            connection = _connections[port, timeout] = Connection(port, timeout)
-        connection.acquire()
+            connection = _connections[port] = Connection(port, timeout)
+        connection.acquire(timeout)
         return connection

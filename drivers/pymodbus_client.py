@@ -71,6 +71,10 @@ class PymodbusClient(ModbusClient):
             raise UnexpectedReplyError(request, expected, function, len(reply))
         return reply
 
+    def wait_for(self, seconds: float) -> None:
+        """Wait so long for a reply from now on, s."""
+        self._client.comm_params.timeout_connect = seconds
+
     def close(self) -> None:
         """Release the line; may be called again."""
         self._client.close()  # type: ignore[no-untyped-call]

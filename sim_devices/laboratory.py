@@ -7,12 +7,14 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
 from sim_devices import protocol_emulated
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
@@ -56,6 +58,14 @@ class Fault:
     summary: str
     inject: Callable[..., None]
     values: Mapping[str, float] = field(default_factory=dict)
+
+
+def tec_faults(tec: EmulatedTEC) -> dict[str, Fault]:
+    """Return the faults of a laboratory that a TEC controller protects itself from (5216G, error numbers)."""
+    return {
+        "tec-over-current": Fault("the TEC controller trips: error 100", partial(tec.trip, 100)),
+        "tec-over-temperature": Fault("the TEC controller trips: error 138", partial(tec.trip, 138)),
+    }
 
 
 class EmulatedLaboratory:

@@ -165,9 +165,8 @@ class LabJackT7:
     def __init__(self, name: str, port: str, timeout: float) -> None:
         self._name = name
         self._address = port
-        self._timeout = timeout
         try:
-            self._connection = self._share()
+            self._connection = self._share(timeout)
         except OSError as error:
             reason = f" ({error})" if str(error) else ""
             raise DeviceConnectionError(
@@ -178,8 +177,8 @@ class LabJackT7:
         self._lock = self._connection.lock
         self._connected = True
 
-    def _share(self) -> Connection:
-        connection = share(self._address, self._timeout)
+    def _share(self, timeout: float) -> Connection:
+        connection = share(self._address, timeout)
         if connection.is_new:
             return connection
         # The instrument may have restarted since the other devices last used it.
@@ -190,7 +189,7 @@ class LabJackT7:
             pass  # another instrument, as `identify` will say
         except OSError:
             connection.end()
-            return share(self._address, self._timeout)
+            return share(self._address, timeout)
         return connection
 
     def close(self) -> None:
@@ -367,7 +366,7 @@ class LabJackT7:
         self._connection.end()
         return DeviceConnectionError(
             self._name,
-            f"no reply from {self._address} within {self._timeout:g} s, or the connection broke; "
+            f"no reply from {self._address} within {self._connection.timeout:g} s, or the connection broke; "
             f"check cable and power, then connect again ({error})",
         )
 

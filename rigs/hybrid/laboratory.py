@@ -19,7 +19,7 @@ from bench.rig_file import LaboratorySettings
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
@@ -47,7 +47,6 @@ _CURRENT_LIMIT_PARAMETER = 2030
 _COLDEST_PARAMETER = 4010
 _COLDEST = -25.0
 """Below which the TEC controller switches itself off, °C; as delivered it would do so above the coldest used."""
-_OVER_CURRENT, _OBJECT_TOO_HOT = 100, 138
 
 FaultName = Literal[
     "none",
@@ -154,10 +153,7 @@ class HybridLaboratory(EmulatedLaboratory):
             "out-of-range": Fault(
                 "the displacement sensor sees the tip so much further (metres)", self._go_beyond, {"metres": 1e-3}
             ),
-            "tec-over-current": Fault("the TEC controller trips: error 100", partial(self.tec.trip, _OVER_CURRENT)),
-            "tec-over-temperature": Fault(
-                "the TEC controller trips: error 138", partial(self.tec.trip, _OBJECT_TOO_HOT)
-            ),
+            **tec_faults(self.tec),
             "amplifier-trips": Fault("the amplifier switches itself off, if it is on", self.amplifier.trip),
         }
         if settings.ambient_step:

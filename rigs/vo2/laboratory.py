@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -12,14 +11,12 @@ from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
-
-_OVER_CURRENT, _OBJECT_TOO_HOT = 100, 138
 
 
 class VO2LaboratorySettings(LaboratorySettings):
@@ -77,10 +74,7 @@ class VO2Laboratory(EmulatedLaboratory):
         super().__init__("VO2 laboratory", {"psd": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)}, clock)
         self.instruments = {"psd": self.t7, "tec": self.tec}
         self.faults = {
-            "tec-over-current": Fault("the TEC controller trips: error 100", partial(self.tec.trip, _OVER_CURRENT)),
-            "tec-over-temperature": Fault(
-                "the TEC controller trips: error 138", partial(self.tec.trip, _OBJECT_TOO_HOT)
-            ),
+            **tec_faults(self.tec),
             "displaced-spot": Fault(
                 "the laser spot stands where it would with so much more deflection (metres)",
                 self._displace,

@@ -33,9 +33,10 @@ def hang(sma):
 SERIAL = ("-m", "rtu", "-a", 1, "-b", 38_400, "-P", "none", "-0", "-B", "-1", "-o", 10)
 
 
-def mbpoll(*arguments):
+def mbpoll(port, register, kind, *values):
+    """Read a register, or write values from it on; return exit code and output."""
     finished = subprocess.run(
-        [shutil.which("mbpoll"), *map(str, arguments)],
+        [shutil.which("mbpoll"), *map(str, (*SERIAL, "-r", register, "-t", kind, port, *values))],
         capture_output=True,
         text=True,
         timeout=2 * PATIENCE,
@@ -88,26 +89,7 @@ def test_minimalmodbus_opens_the_line_again_after_half_a_frame(minimal):
 @needs_mbpoll
 def test_mbpoll_weighs(port, hang):
     hang(4.0)
-    code, output = mbpoll(
-        "-m",
-        "rtu",
-        "-a",
-        1,
-        "-b",
-        38400,
-        "-P",
-        "none",
-        "-0",
-        "-r",
-        GROSS,
-        "-t",
-        "4:float",
-        "-B",
-        "-1",
-        "-o",
-        10,
-        port,
-    )
+    code, output = mbpoll(port, GROSS, "4:float")
     assert code == 0, output
     shown = re.search(rf"\[{GROSS}\]:\s+(\S+)", output)
     assert float(shown[1]) == pytest.approx(4.0, abs=0.2)
@@ -115,27 +97,7 @@ def test_mbpoll_weighs(port, hang):
 
 @needs_mbpoll
 def test_mbpoll_writes(port, minimal):
-    code, output = mbpoll(
-        "-m",
-        "rtu",
-        "-a",
-        1,
-        "-b",
-        38400,
-        "-P",
-        "none",
-        "-0",
-        "-r",
-        MOTION_TIME,
-        "-t",
-        "4:int",
-        "-B",
-        "-1",
-        "-o",
-        10,
-        port,
-        900,
-    )
+    code, output = mbpoll(port, MOTION_TIME, "4:int", 900)
     assert code == 0, output
     cell = minimal()
     assert cell.read_long(MOTION_TIME) == 900

@@ -37,9 +37,17 @@ def served(monkeypatch):
         yield servers
 
 
-@pytest.mark.parametrize("name", ON_THE_T7)
-def test_the_devices_of_a_rig_share_one_of_two_connections(name, served):
-    with Rig(load_rig(name), VirtualClock(), 1) as rig:
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("hybrid", {}),
+        ("hybrid", {"devices.base.timeout": "30.0", "devices.tip.timeout": "20.0", "devices.piezo.timeout": "40.0"}),
+        ("sma", {}),
+    ],
+    ids=["hybrid", "hybrid, with a time-out each", "sma"],
+)
+def test_the_devices_of_a_rig_share_one_of_two_connections(name, overrides, served):
+    with Rig(load_rig(name, overrides), VirtualClock(), 1) as rig:
         on_the_t7 = [each for each, device in rig.devices.items() if isinstance(device, T7Device)]
         assert on_the_t7 == ON_THE_T7[name]
         assert set(rig.glance()) == {signal.name for signal in rig.signals}
