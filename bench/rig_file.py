@@ -135,6 +135,13 @@ class Driver(Protocol):
     def connect(cls, name: str, settings: Any, clock: Clock) -> Device:  # noqa: ANN401 - its own Settings
         """Open the instrument, check that it is the right one, and configure it; nothing moves."""
 
+    @classmethod
+    def rescue(cls, name: str, settings: Any, clock: Clock) -> None:  # noqa: ANN401 - its own Settings
+        """Open the line of an instrument in any state, bring it into its safe state, and release the line.
+
+        Nothing is configured. Raises DeviceError if the safe state is not confirmed.
+        """
+
 
 @dataclass(frozen=True)
 class DeviceEntry:
