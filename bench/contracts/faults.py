@@ -115,7 +115,7 @@ class RestartedActuatorContract(RestartedInstrumentContract):
         return device.limits.low, device.limits.high
 
     @pytest.fixture
-    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:  # type: ignore[override]
+    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:
         """Return the device with its output on."""
         device.set(set_points[0]).wait()
         return device
@@ -249,7 +249,7 @@ class ActuatorLineLostContract(LineLostContract):
     """
 
     @pytest.fixture
-    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:  # type: ignore[override]
+    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:
         """Return the device with its output on."""
         device.set(set_points[0]).wait()
         return device
