@@ -87,6 +87,16 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
+class SafetyTable(_Table):
+    """The table `[safety]`."""
+
+    rate: float = Field(default=5.0, ge=0.1, le=50, description="looks at the interlocks in a second on hardware, Hz")
+    reconnect: float = Field(default=10.0, ge=0, le=600, description="how long a lost line may be away, s")
+    patience: float = Field(
+        default=10.0, gt=0, le=600, description="how long a protocol may compute between two messages, s"
+    )
+
+
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
@@ -95,6 +105,7 @@ class _RigFileContent(_Table):
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
+    safety: SafetyTable = SafetyTable()
     dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
@@ -179,6 +190,7 @@ class RigFile:
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
+    safety: SafetyTable
     dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
@@ -365,6 +377,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         derived=derived,
         interlocks=tables.interlocks,
         telemetry=tables.telemetry,
+        safety=tables.safety,
         dashboard=tables.dashboard,
         laboratory=laboratory,
         laboratory_settings=settings,
