@@ -12,6 +12,7 @@ the PID set-up are left as the bench builder set them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum
 from functools import partial
@@ -21,7 +22,7 @@ from pydantic import Field, field_validator
 
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
@@ -39,6 +40,11 @@ from drivers.meerstetter.mecom import (
 
 _START_TIMEOUT = 5.0
 _RESET_DELAY = 0.3  # the device restarts 0.2 s after the command
+_LOOKS, _LOOK_INTERVAL = (
+    10,
+    0.02,
+)  # how often, and every how many s, the output is looked for after it was switched on
+_BLOCK = 5  # parameters read at once, as many as a measurement has
 _OUT_OF_RANGE = 7
 
 _OFF, _LIVE_ENABLE = 0, 2  # values of the output stage enable
@@ -145,6 +151,13 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     A measurement is one request for all its values and the status (`?VX`), so that they are of one instant. A device
     whose firmware does not know it is asked for one value after the other; `connect` finds out which.
 
+    The limits are in the RAM of the device, and a restart loses them. While the output is on, the status in each
+    measurement shows a restart, as the output is off after it. Before the output is switched on, all that `connect`
+    has configured is read back, which takes about 30 ms of the line at 57 600 Bd, and again before its last step, so
+    that an output without its limits is never on. What another program has changed is an error then too, and so is
+    at the next measurement an output that another program has switched. A set-point that it has changed while the
+    output is on is found by `reconnect` only, as each parameter more would lengthen each measurement.
+
     The device reports current and voltage by its own sign; whether a positive current heats is parameter
     3034, which the driver reads once and takes into account, as the role counts heating as positive. That
     it applies to the live current in the same way is an assumption.
@@ -156,6 +169,10 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         super().__init__(name, settings, clock, line)
         self._mode = settings.mode
         self._polarity = 1
+        self._on = False
+        """Whether the driver has switched the output on."""
+        self._configured: dict[Parameter, float] = {}
+        """What the parameters are that `connect` has written, and a change of the mode."""
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._reads_blocks = False
         self._names = tuple(signal.name for signal in self.signals)
@@ -177,8 +194,10 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         if mode is self._mode:
             return
         self.safe()
+        self._check_restart()
         self._write(_LIVE_CURRENT, 0.0)
-        self._write(_INPUT, _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT)
+        self._configured[_INPUT] = _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT
+        self._write(_INPUT, self._configured[_INPUT])
         self._mode = mode
         self._setpoint = math.nan
 
@@ -195,18 +214,31 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         The status completes when the device reports the temperature stable; at once in current mode.
         """
         self.check(value)
-        state = self._check()
+        if self._on:
+            self._check_output(self._read(_STATUS))
+        else:
+            self._check_unchanged()
         if self._mode is TECMode.TEMPERATURE:
             self._write(_LIVE_TARGET, value)
         else:
             self._write(_LIVE_CURRENT, self._polarity * value)
         self._setpoint = value
-        if state is not _State.RUN:
+        if not self._on:
             self._switch_on()
         if self._mode is TECMode.CURRENT:
             return Status.completed(self.name, self._clock)
         timeout = self._settings.stable_timeout
         return Status(self.name, self._clock, lambda: self._arrived(value), timeout=timeout)
+
+    @property
+    def watchdog(self) -> float | None:
+        """Silence of the host, s, after which the device switches its output off; None if it never does."""
+        return self._settings.watchdog or None
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were sent again since the device was connected."""
+        return self._line.repeats
 
     @property
     def output_enabled(self) -> bool:
@@ -217,7 +249,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V)."""
         # The status comes last: an error that comes up while the values are read invalidates them, too.
         measured, sink, current, voltage, status = self._read_block(self._measured)
-        self._judge(status)
+        self._check_output(status)
         values = (measured, sink, self._polarity * current, self._polarity * voltage)
         if not all(map(math.isfinite, values)):
             raise DeviceError(self.name, "reports a value that is not a number; check the sensors")
@@ -238,17 +270,32 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         Live enable and output stage enable are both switched off; if either fails, or the device still
         reports a running output, the emergency stop (`ES`, error 11 on the device) follows.
         """
-        failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
-        if failures or not self._is_off():
-            try:
-                self._line.order("ES")
-            except (DeviceError, RefusedError) as error:
-                failures.append(DeviceError(self.name, f"emergency stop: {error}"))
-            if not self._is_off():
-                raise self._unconfirmed("output", failures)
-        # The output is off, so whether the watchdog could be disarmed does not matter for safety.
-        with suppress(DeviceError):
-            self._write(_WATCHDOG, 0.0)
+        with self._line.in_haste():
+            failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
+            if failures or not self._is_off():
+                refused = attempt(self._stop_at_once)
+                failures += refused
+                # A line that is dead would not answer either whether the output is off.
+                dead = any(isinstance(failure, DeviceConnectionError) for failure in refused)
+                if dead or not self._is_off():
+                    raise self._unconfirmed("output", failures)
+            self._on = False
+            # The output is off, so whether the watchdog could be disarmed does not matter for safety. A device that
+            # has restarted would write it to its flash.
+            with suppress(DeviceError):
+                self._check_restart()
+                self._write(_WATCHDOG, 0.0)
+
+    def _stop_at_once(self) -> None:
+        try:
+            self._line.order("ES")
+        except RefusedError as error:
+            raise DeviceError(self.name, f"emergency stop: {error}") from None
+
+    def _renew_line(self) -> None:
+        before = self._line
+        super()._renew_line()
+        self._line.follow(before)
 
     def reset(self) -> None:
         """Restart the device and configure it again: clears an error whose cause is gone. The output is off.
@@ -320,18 +367,25 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         ):
             self._check_allowed(key, parameter, value)
         self._polarity = 1 if self._read(_POLARITY) else -1
+        # No automatic restart after an error: what tripped stays off until the operator has looked.
+        self._configured = {
+            _SAVING_OFF: 1,
+            _INPUT: _CONTROLLER_INPUT if self._mode is TECMode.TEMPERATURE else _LIVE_INPUT,
+            _CURRENT_LIMIT: settings.current_limit,
+            _VOLTAGE_LIMIT: settings.voltage_limit,
+            _STABLE_WINDOW: settings.stable_window,
+            _STABLE_TIME: settings.stable_time,
+            _RESTART_DELAY: 0.0,
+        }
         self._write(_SAVING_OFF, 1)
         self._write(_LIVE_ENABLED, _OFF)
         self._write(_ENABLE, _OFF)
         self._write(_LIVE_CURRENT, 0.0)
-        self._write(_INPUT, _CONTROLLER_INPUT if self._mode is TECMode.TEMPERATURE else _LIVE_INPUT)
-        self._write(_CURRENT_LIMIT, settings.current_limit)
-        self._write(_VOLTAGE_LIMIT, settings.voltage_limit)
-        self._write(_STABLE_WINDOW, settings.stable_window)
-        self._write(_STABLE_TIME, settings.stable_time)
-        # No automatic restart after an error: what tripped stays off until the operator has looked.
-        self._write(_RESTART_DELAY, 0.0)
+        for parameter, value in self._configured.items():
+            if parameter is not _SAVING_OFF:
+                self._write(parameter, value)
         self._write(_WATCHDOG, 0.0)
+        self._on = False
         self._setpoint = math.nan
 
     def _check_allowed(self, key: str, parameter: Parameter, value: float) -> None:
@@ -343,18 +397,73 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             )
 
     def _switch_on(self) -> None:
-        if self._mode is TECMode.TEMPERATURE:
-            self._write(_LIVE_TARGET_SELECTED, 1)
-        else:
-            self._write(_LIVE_VOLTAGE, self._settings.voltage_limit)
-        self._write(_WATCHDOG, self._settings.watchdog)
-        self._write(_ENABLE, _LIVE_ENABLE)
+        for parameter, value in self._output_settings().items():
+            # The set-point has been sent already.
+            if parameter not in (_LIVE_TARGET, _LIVE_CURRENT):
+                self._write(parameter, value)
+        # A device that restarts from here on is not enabled by the last step.
+        self._check_settings(self._configured | self._output_settings())
+        self._on = True
         self._write(_LIVE_ENABLED, 1)
-        self._check()
+        for _ in range(_LOOKS):
+            if self._check() is _State.RUN:
+                return
+            self._clock.sleep(_LOOK_INTERVAL)
+        self._check_output(self._read(_STATUS))
+
+    def _output_settings(self) -> dict[Parameter, float]:
+        """Return what the parameters are while the output is on, beside those that are configured."""
+        settings: dict[Parameter, float] = (
+            {_LIVE_TARGET: self._setpoint, _LIVE_TARGET_SELECTED: 1}
+            if self._mode is TECMode.TEMPERATURE
+            else {_LIVE_CURRENT: self._polarity * self._setpoint, _LIVE_VOLTAGE: self._settings.voltage_limit}
+        )
+        return settings | {_WATCHDOG: self._settings.watchdog, _ENABLE: _LIVE_ENABLE}
+
+    def _check_unchanged(self) -> None:
+        """Raise `DeviceError` unless the device is as the driver left it: not restarted, without an error."""
+        self._check_settings(self._configured | (self._output_settings() if self._on else {}))
+        self._check_output(self._read(_STATUS))
+
+    def _check_settings(self, expected: Mapping[Parameter, float]) -> None:
+        """Raise `DeviceError` if a parameter differs."""
+        parameters = list(expected)
+        for first in range(0, len(parameters), _BLOCK):
+            block = Block(self._settings.channel, *parameters[first : first + _BLOCK])
+            for parameter, found in zip(block.parameters, self._read_block(block), strict=True):
+                if found != (single(expected[parameter]) if parameter.real else expected[parameter]):
+                    self._check_restart()
+                    raise DeviceError(
+                        self.name,
+                        f"its {parameter.title} (parameter {parameter.number}) is {found:g} where "
+                        f"{expected[parameter]:g} was written; end the program that has changed it, then connect again",
+                    )
+
+    def _check_restart(self) -> None:
+        """Raise `DeviceRestartedError` if the device saves to its flash again, as it does after each restart."""
+        if not self._read(_SAVING_OFF):
+            raise DeviceRestartedError(
+                self.name,
+                f"the {self._identity.model} has restarted, and its limits and settings are lost; find out why its "
+                "power failed, then connect again",
+            )
+
+    def _check_output(self, status: float) -> None:
+        """Raise what is wrong with a device status, also if the output is on that was off, or off that was on."""
+        running = self._judge(status) is _State.RUN
+        if running is self._on:
+            return
+        self._check_restart()
+        raise DeviceError(
+            self.name,
+            f"its output is {'on' if running else 'off'} although it was switched {'on' if self._on else 'off'}; end "
+            "the program that has switched it, and bring the device into its safe state",
+        )
 
     def _arrived(self, target: float) -> bool:
         if self._read(_STABILITY) != _STABLE:
             if self._check() is not _State.RUN:
+                self._check_restart()
                 raise DeviceError(self.name, f"the output was switched off before it reached {target:g} °C")
             return False
         # The device may still report the previous target as stable; three windows leave room for noise.
