@@ -191,15 +191,9 @@ class LineActuator(LineDevice[SettingsT, LineT], Actuator):
         """Try everything that makes the device safe; raise `DeviceError` if that is not confirmed."""
 
     def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:
-        """Return the error for a part that may still be on, after everything was tried.
-
-        It is a `DeviceConnectionError` if the line failed, so that another one is tried.
-        """
+        """Return the error for a part that may still be on, after everything was tried."""
         reason = f" ({failures[0]})" if failures else ""
-        message = f"does not confirm that its {part} is off{reason}; disconnect its power supply"
-        if any(isinstance(failure, DeviceConnectionError) for failure in failures):
-            return DeviceConnectionError(self.name, message)
-        return DeviceError(self.name, message)
+        return DeviceError(self.name, f"does not confirm that its {part} is off{reason}; disconnect its power supply")
 
 
 class RecoverableDevice(LineActuator[SettingsT, LineT]):

@@ -278,7 +278,11 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 # A line that is dead would not answer either whether the output is off.
                 dead = any(isinstance(failure, DeviceConnectionError) for failure in refused)
                 if dead or not self._is_off():
-                    raise self._unconfirmed("output", failures)
+                    unconfirmed = self._unconfirmed("output", failures)
+                    if dead:
+                        # Another line is tried then.
+                        raise DeviceConnectionError(self.name, str(unconfirmed).removeprefix(f"{self.name}: "))
+                    raise unconfirmed
             self._on = False
             # The output is off, so whether the watchdog could be disarmed does not matter for safety. A device that
             # has restarted would write it to its flash.
@@ -436,7 +440,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                     raise DeviceError(
                         self.name,
                         f"its {parameter.title} (parameter {parameter.number}) is {found:g} where "
-                        f"{expected[parameter]:g} was written; end the program that has changed it, then connect again",
+                        f"{expected[parameter]:g} was written; end the program that changed it, then connect again",
                     )
 
     def _check_restart(self) -> None:
