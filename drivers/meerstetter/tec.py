@@ -47,7 +47,7 @@ _LOOKS, _LOOK_INTERVAL = (
 _BLOCK = 5  # parameters read at once, as many as a measurement has
 _OUT_OF_RANGE = 7
 
-_OFF, _LIVE_ENABLE = 0, 2  # values of the output stage enable
+_OFF, _STATIC_ON, _LIVE_ENABLE = 0, 1, 2  # values of the output stage enable
 _LIVE_INPUT, _CONTROLLER_INPUT = 1, 2  # values of the output stage input selection
 _STABLE = 2  # value of "temperature is stable"
 
@@ -151,12 +151,15 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     A measurement is one request for all its values and the status (`?VX`), so that they are of one instant. A device
     whose firmware does not know it is asked for one value after the other; `connect` finds out which.
 
-    The limits are in the RAM of the device, and a restart loses them. While the output is on, the status in each
-    measurement shows a restart, as the output is off after it. Before the output is switched on, all that `connect`
-    has configured is read back, which takes about 30 ms of the line at 57 600 Bd, and again before its last step, so
-    that an output without its limits is never on. What another program has changed is an error then too, and so is
-    at the next measurement an output that another program has switched. A set-point that it has changed while the
-    output is on is found by `reconnect` only, as each parameter more would lengthen each measurement.
+    The limits are in the RAM of the device, and a restart loses them. It brings "saving to flash off" back, which is
+    read before the output is switched on, and where a status is not the expected one. So a restart is found by the
+    status in the next measurement, as the output is off after it, and before the output goes on. A device whose
+    output would come back by itself (output stage enable "static on") is refused. No restart fits between the requests that
+    switch on without one of them staying unanswered: after one that did, all settings are read back before the last
+    step and after it.
+
+    An output that another program has switched is an error at the next measurement. A set-point or a limit that it
+    has changed is found by `reconnect` only, as each parameter more would lengthen each measurement.
 
     The device reports current and voltage by its own sign; whether a positive current heats is parameter
     3034, which the driver reads once and takes into account, as the role counts heating as positive. That
@@ -171,6 +174,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._polarity = 1
         self._on = False
         """Whether the driver has switched the output on."""
+        self._restarted = False
         self._configured: dict[Parameter, float] = {}
         """What the parameters are that `connect` has written, and a change of the mode."""
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
@@ -194,7 +198,6 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         if mode is self._mode:
             return
         self.safe()
-        self._check_restart()
         self._write(_LIVE_CURRENT, 0.0)
         self._configured[_INPUT] = _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT
         self._write(_INPUT, self._configured[_INPUT])
@@ -217,14 +220,17 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         if self._on:
             self._check_output(self._read(_STATUS))
         else:
-            self._check_unchanged()
+            self._check_restart()
+        repeats = self._line.repeats
         if self._mode is TECMode.TEMPERATURE:
             self._write(_LIVE_TARGET, value)
         else:
             self._write(_LIVE_CURRENT, self._polarity * value)
         self._setpoint = value
         if not self._on:
-            self._switch_on()
+            self._switch_on(repeats)
+        elif self._line.repeats != repeats:
+            self._check_output(self._read(_STATUS))
         if self._mode is TECMode.CURRENT:
             return Status.completed(self.name, self._clock)
         timeout = self._settings.stable_timeout
@@ -286,9 +292,9 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             self._on = False
             # The output is off, so whether the watchdog could be disarmed does not matter for safety. A device that
             # has restarted would write it to its flash.
-            with suppress(DeviceError):
-                self._check_restart()
-                self._write(_WATCHDOG, 0.0)
+            if not self._restarted:
+                with suppress(DeviceError):
+                    self._write(_WATCHDOG, 0.0)
 
     def _stop_at_once(self) -> None:
         try:
@@ -349,12 +355,19 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             self._reads_blocks = False
         else:
             self._reads_blocks = True
-        if math.isnan(self._read_block(block)[0]):
+        sink, enable = self._read_block(Block(self._settings.channel, _SINK_TEMPERATURE, _ENABLE))
+        if math.isnan(sink):
             channel = self._settings.channel
             raise DeviceError(
                 self.name,
                 f"channel {channel} reports no sink temperature: the {self._identity.model} has no such channel, or "
                 "its sink sensor is missing; check `channel` and the sensor",
+            )
+        if enable == _STATIC_ON:
+            raise DeviceError(
+                self.name,
+                f"its output stage enable (parameter {_ENABLE.number}) is static on, with which a restart may bring "
+                "the output back without its limits; save it as static off with the maker's service software",
             )
 
     def _configure(self) -> None:
@@ -389,7 +402,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             if parameter is not _SAVING_OFF:
                 self._write(parameter, value)
         self._write(_WATCHDOG, 0.0)
-        self._on = False
+        self._on = self._restarted = False
         self._setpoint = math.nan
 
     def _check_allowed(self, key: str, parameter: Parameter, value: float) -> None:
@@ -400,20 +413,29 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 f"{lowest:g} to {highest:g}"
             )
 
-    def _switch_on(self) -> None:
+    def _switch_on(self, repeats: int) -> None:
+        """Switch the output on; `repeats` is the number before the first request that belongs to it."""
         for parameter, value in self._output_settings().items():
             # The set-point has been sent already.
             if parameter not in (_LIVE_TARGET, _LIVE_CURRENT):
                 self._write(parameter, value)
-        # A device that restarts from here on is not enabled by the last step.
-        self._check_settings(self._configured | self._output_settings())
-        self._on = True
-        self._write(_LIVE_ENABLED, 1)
-        for _ in range(_LOOKS):
-            if self._check() is _State.RUN:
-                return
-            self._clock.sleep(_LOOK_INTERVAL)
-        self._check_output(self._read(_STATUS))
+        # A device that restarts from here on is not enabled by the last step alone.
+        if self._line.repeats != repeats:
+            self._check_settings(self._configured | self._output_settings())
+        try:
+            self._write(_LIVE_ENABLED, 1)
+            self._on = True
+            for _ in range(_LOOKS):
+                if self._check() is _State.RUN:
+                    break
+                self._clock.sleep(_LOOK_INTERVAL)
+            else:
+                self._check_output(self._read(_STATUS))
+            if self._line.repeats != repeats:
+                self._check_unchanged()
+        except BaseException:
+            attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
+            raise
 
     def _output_settings(self) -> dict[Parameter, float]:
         """Return what the parameters are while the output is on, beside those that are configured."""
@@ -445,7 +467,8 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
     def _check_restart(self) -> None:
         """Raise `DeviceRestartedError` if the device saves to its flash again, as it does after each restart."""
-        if not self._read(_SAVING_OFF):
+        self._restarted = self._restarted or not self._read(_SAVING_OFF)
+        if self._restarted:
             raise DeviceRestartedError(
                 self.name,
                 f"the {self._identity.model} has restarted, and its limits and settings are lost; find out why its "
