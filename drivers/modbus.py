@@ -196,7 +196,7 @@ class TcpClient(_PortClient):
             raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
         if length != expected + 1:
             raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
-        return self._receive(reply, size)[_MBAP.size :]
+        return self._receive(reply, size)[_MBAP.size : size]
 
 
 def _crc_table() -> tuple[int, ...]:

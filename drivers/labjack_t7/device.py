@@ -59,7 +59,7 @@ class T7Device(LineDevice[T7SettingsT, LabJackT7]):
 
     def _renew_line(self) -> None:
         # One that another device has just opened stays.
-        self._line.reopen()
+        self._line.renew()
 
     def reconnect(self) -> None:
         """Go on over another connection if the present one was lost; errors are those of `Device.reconnect`."""

@@ -293,6 +293,18 @@ class LabJackT7:
         connection = self._share()
         self._connection, self._client, self._lock = connection, connection.client, connection.lock
 
+    def renew(self) -> None:
+        """Check the instrument, over another connection if the present one does not answer; raises as `reopen`."""
+        try:
+            with self._lock:
+                if self._owner and not self._connection.ended:
+                    self._check_instrument(self._client)
+        except RefusedError:
+            pass  # another instrument, as `identify` will say
+        except OSError:
+            self._connection.end()
+        self.reopen()
+
     def _check_owner(self, found: int) -> None:
         if found == self._owner:
             return

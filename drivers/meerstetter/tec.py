@@ -154,9 +154,9 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     The limits are in the RAM of the device, and a restart loses them. It brings "saving to flash off" back, which is
     read before the output is switched on, and where a status is not the expected one. So a restart is found by the
     status in the next measurement, as the output is off after it, and before the output goes on. A device whose
-    output would come back by itself (output stage enable "static on") is refused. No restart fits between the requests that
-    switch on without one of them staying unanswered: after one that did, all settings are read back before the last
-    step and after it.
+    output would come back by itself (output stage enable "static on") is refused. No restart fits between the
+    requests that switch on without one of them staying unanswered: after one that did, all settings are read back
+    before the last step and after it.
 
     An output that another program has switched is an error at the next measurement. A set-point or a limit that it
     has changed is found by `reconnect` only, as each parameter more would lengthen each measurement.
