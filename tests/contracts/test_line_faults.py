@@ -1,6 +1,7 @@
 """What a restart, a lost line, a silent host and a disturbed line do to a TEC and to the devices on a T7."""
 
 import itertools
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ class Cooler(Laboratory):
     def connect(self):
         return MeerstetterTEC.connect("tec", MeerstetterTEC.Settings(port=self.address, **self.said), self.clock)
 
-    said = {
+    said: ClassVar = {
         "mode": TECMode.CURRENT, "temperature_limits": (5, 95), "voltage_limit": 15.0, "current_limit": CURRENT_LIMIT
     }  # fmt: skip
 
@@ -155,7 +156,7 @@ class Amplifier(Laboratory):
         settings = T7HighVoltageSupply.Settings(port=self.address, **self.said)
         return T7HighVoltageSupply.connect("hv", settings, self.clock)
 
-    said = {"line": LINE}
+    said: ClassVar = {"line": LINE}
 
     def output(self):
         self.world.advance()
