@@ -26,6 +26,7 @@ from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
 from bench.extras import MissingExtraError, needed_for
+from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
@@ -126,14 +127,18 @@ def carry_out(run: Run, console: Console) -> RunResult:
     else:
         attachment = attach(run.attach, rig_file.name)
         clock = attachment.clock
-        rig_file = replace(rig_file, laboratory=lambda *_: attachment)
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
+    guardian: RemoteStation | None = None
     with ExitStack() as stack:
-        station = LocalStation(Rig(rig_file, clock, run.seed))
+        if run.attach is None and rig_file.in_process:
+            station: Station = LocalStation(Rig(rig_file, clock, run.seed))
+        else:
+            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed)
+            station = guardian = RemoteStation(guarded, clock, dict)
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
         description = station.description
@@ -146,6 +151,8 @@ def carry_out(run: Run, console: Console) -> RunResult:
                 "run it in a terminal, where an operator can answer"
             )
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        if guardian is not None:
+            guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = _metadata(run, station, parameters, slots, expected, folder.name)
         signals = description.signals + trace_signals(run.protocol, description, slots)
