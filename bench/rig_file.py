@@ -52,7 +52,7 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -94,6 +94,9 @@ class SafetyTable(_Table):
     reconnect: float = Field(default=10.0, ge=0, le=600, description="how long a lost line may be away, s")
     patience: float = Field(
         default=10.0, gt=0, le=600, description="how long a protocol may compute between two messages, s"
+    )
+    order: tuple[str, ...] = Field(
+        default=(), description="devices that are made safe before the others, one after the other"
     )
 
 
@@ -205,6 +208,10 @@ class RigFile:
         """Whether every device is emulated in this process, so that time can stand while the process computes."""
         ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
         return self.emulated and all(port.startswith("emulated://") for port in ports)
+
+    def served_by(self, laboratory: Any) -> RigFile:  # noqa: ANN401 - without Settings
+        """Return the same rig with a `Laboratory` that is open already in place of its own."""
+        return replace(self, laboratory=lambda *_: laboratory)
 
 
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:

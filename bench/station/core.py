@@ -43,6 +43,8 @@ class StationCore:
         How far it is.
     cause : BenchError or None
         What tripped it.
+    late : bool
+        Whether that was a promise of the bench.
     """
 
     def __init__(self, watch: InterlockWatch, interval: float) -> None:
@@ -56,6 +58,7 @@ class StationCore:
         self._seen: float | None = None
         self.state = State.IDLE
         self.cause: BenchError | None = None
+        self.late = False
 
     @property
     def over(self) -> bool:
@@ -108,6 +111,7 @@ class StationCore:
     def advance(self, now: float) -> None:
         """Trip if the bench has broken its promise."""
         if self._lease() <= now:
+            self.late = True
             self.trip(
                 GuardianError(
                     f"the bench has not come back within the {self._promised:g} s that it promised ({self._why}); "
