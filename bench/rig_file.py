@@ -330,6 +330,9 @@ def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # no
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     *parents, last = key.split(".")
+    if parents in (["telemetry"], ["safety"]):
+        # Tables with defaults for every key, which a file may leave out.
+        content.setdefault(parents[0], {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
