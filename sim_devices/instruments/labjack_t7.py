@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -40,7 +39,7 @@ import numpy as np
 
 from bench.devices import Identity
 from sim_devices.instruments.emulated import LineFaults
-from sim_devices.instruments.registers import Register, RegisterInstrument, Service
+from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
@@ -206,7 +205,6 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.firmware = firmware
         self._sources = dict(inputs)
         self._normals = normals(rng)
-        self._service = Service(self._begin, self._end)
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
@@ -291,9 +289,6 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return self._expired_at is not None
 
     # The requests.
-
-    def _request(self) -> AbstractContextManager[None]:
-        return self._service
 
     def _begin(self) -> None:
         """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
