@@ -165,22 +165,22 @@ class TcpClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port.
+        The open port, with an `exchange` of its own.
     unit : int
         Unit identifier, 0 to 255.
     """
 
     def __init__(self, port: Any, unit: int = 1) -> None:  # noqa: ANN401 - pyserial is untyped
         super().__init__(port)
+        # Sends bytes, and returns what has come already, as it has in process.
+        self._exchange = port.exchange
         self._unit = unit
         self._transaction = 0
 
     def request(self, request: bytes, expected: int) -> bytes:
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
         transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
-        self._port.write(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
-        # What has come already, as it has in process.
-        reply: bytes = self._port.read_all()
+        reply: bytes = self._exchange(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
         size = _MBAP.size + expected
         if len(reply) == size and reply.startswith(
             _MBAP.pack(transaction, 0, expected + 1, self._unit) + request[:1]

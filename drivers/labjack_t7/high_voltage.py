@@ -113,6 +113,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
     def __init__(self, name: str, settings: T7HighVoltageSettings, clock: Clock, line: LabJackT7) -> None:
         super().__init__(name, settings, clock, line)
         self._limits = Limits(*settings.voltage_limits, "V")
+        self._low, self._high = settings.voltage_limits
         kind, number = settings.analog_output.split("dac")
         self._register = (TDAC if kind else DAC).of(int(number))
         self._encode = struct.Struct(f">{self._register.form}").pack
@@ -142,7 +143,8 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         The status is complete at once: an amplifier settles within the time of the reply. An amplifier that does
         not go on or went off by itself is a `DeviceError`.
         """
-        self.check(value)
+        if not self._low <= value <= self._high:
+            self.check(value)
         if not self._enabled:
             self._switch_on()
         elif self._clock.now() - self._looked >= _STATUS_AGE:

@@ -118,18 +118,6 @@ class _DetailedError(RegisterError):
 
 
 @dataclass
-class _Input:
-    range: float = 10.0
-    negative: int = SINGLE_ENDED
-    resolution: int = 0
-    settling: float = 0.0
-    feature: int = _EF_OFF
-    samples: int = 200
-    scan_rate: float = 6000.0
-    burst: Burst = _NO_BURST
-
-
-@dataclass
 class _Watchdog:
     enabled: int = 0
     timeout: int = 0
@@ -164,6 +152,30 @@ def _scale(volts: float, index: int) -> _Scale:
 
 _SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in range(1, len(CONVERSIONS) + 1)}
 """By range and resolution index."""
+
+
+def _ground() -> float:
+    return 0.0
+
+
+@dataclass
+class _Input:
+    source: Callable[[], float]
+    range: float = 10.0
+    negative: int = SINGLE_ENDED
+    resolution: int = 0
+    settling: float = 0.0
+    feature: int = _EF_OFF
+    samples: int = 200
+    scan_rate: float = 6000.0
+    burst: Burst = _NO_BURST
+    scale: _Scale = _SCALES[10.0, _DEFAULT_INDEX]
+
+    def set_up(self, volts: float, resolution: int) -> None:
+        """Take a range and a resolution index, and what a single conversion is made of then."""
+        self.range = volts
+        self.resolution = resolution
+        self.scale = _SCALES[volts, resolution or _DEFAULT_INDEX]
 
 
 class EmulatedT7(LineFaults, RegisterInstrument):
@@ -217,7 +229,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _start(self) -> None:
         """Set everything up that is not kept in the flash memory."""
-        self._inputs = [_Input() for _ in range(CHANNELS)]
+        self._inputs = [_Input(self._sources.get(channel, _ground)) for channel in range(CHANNELS)]
         self._stream_index = 0
         self._stream_settling = 0.0
         self._dacs = [0.0, 0.0]
@@ -312,7 +324,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _end(self, error: BaseException | None) -> None:
         try:
-            if isinstance(error, RegisterError):
+            if error is not None and isinstance(error, RegisterError):
                 self._last_error = error.detail if isinstance(error, _DetailedError) else 0
             if self._touched:
                 self._lead()
@@ -402,7 +414,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             return self._reading(channel)
 
     def _reading(self, channel: int) -> float:
-        return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
+        settings = self._inputs[channel]
+        return self._convert(settings, settings.scale)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -418,32 +431,27 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 raise RegisterError(DEVICE_FAILURE, f"a burst of {duration:g} s is too long")
             begin = self.world.time
             readings = []
+            scale = _SCALES[settings.range, self._stream_index or _DEFAULT_STREAM_INDEX]
             for sample in range(1, settings.samples + 1):
                 self.world.clock.sleep_until(begin + sample / settings.scan_rate)
                 self.world.advance()
-                readings.append(self._convert(channel, self._stream_index or _DEFAULT_STREAM_INDEX))
+                readings.append(self._convert(settings, scale))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 
-    def _convert(self, channel: int, index: int) -> float:
-        settings = self._inputs[channel]
-        source = self._sources.get(channel)
-        volts = 0.0 if source is None else source()
+    def _convert(self, settings: _Input, scale: _Scale) -> float:
+        volts = settings.source()
         if settings.negative != SINGLE_ENDED:
-            volts -= self._terminal(settings.negative)
-        noise, step, lowest, highest = _SCALES[settings.range, index]
+            volts -= self._inputs[settings.negative].source()
+        noise, step, lowest, highest = scale
         volts = round((volts + noise * next(self._normals)) / step) * step
         return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
-
-    def _terminal(self, channel: int) -> float:
-        source = self._sources.get(channel)
-        return 0.0 if source is None else source()
 
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default
         for each in RANGES:
             if math.isclose(wanted, each, rel_tol=1e-6):
-                self._inputs[channel].range = each
+                self._inputs[channel].set_up(each, self._inputs[channel].resolution)
                 return
         raise _DetailedError(ERROR_RANGE, f"AIN{channel}_RANGE: {value:g} is none of {RANGES}")
 
@@ -463,7 +471,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return value
 
     def _set_index(self, channel: int, value: float) -> None:
-        self._inputs[channel].resolution = self._checked_resolution(value)
+        self._inputs[channel].set_up(self._inputs[channel].range, self._checked_resolution(value))
 
     def _set_settling(self, channel: int, value: float) -> None:
         self._inputs[channel].settling = self._checked_settling(value, _LONGEST_SETTLING)

@@ -103,7 +103,7 @@ class ModbusTcpStream:
         self._line = bank if isinstance(bank, OnLine) else None
         self._closed = closed
         self._own = {FEEDBACK: Feedback()}
-        self._known: dict[bytes, _Known] = {}
+        self._known: dict[bytes, _Known | None] = {}
         self._received = b""
         self._is_open = True
 
@@ -156,10 +156,11 @@ class ModbusTcpStream:
         if key in self._known:
             return
         prepared = prepare(self._bank, frame[_HEADER.size :], _HEADER.size)
-        if prepared is None:
-            return
         if len(self._known) >= self._MOST_KNOWN:
             self._known.clear()
+        if prepared is None:
+            self._known[key] = None
+            return
         rest = frame[_KEY_END:] if prepared.same == prepared.size else b""
         head = _framed(frame, prepared.head, prepared.answered)[2:]
         self._known[key] = len(frame), rest, head, prepared.packet
