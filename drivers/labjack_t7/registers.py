@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.modbus import RefusedError, exception_text, read_frame, read_request, swapped, write_frame
+from drivers.modbus import FEEDBACK, RefusedError, exception_text, read_frame, read_request, swapped, write_frame
 from drivers.modbus_tcp import Connection, share
 
 Kind = Literal["F32", "U32", "U16"]
@@ -62,7 +62,7 @@ class Span(NamedTuple):
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
-    """Form of the reply: its function, the number of bytes of the values, and the values."""
+    """Form of the reply: its function, the number of bytes of the values (both skipped), and the values."""
     frame: bytes
     """Asks for them in function 76, among others."""
     values: struct.Struct
@@ -82,9 +82,33 @@ class Span(NamedTuple):
             address=register.address,
             request=read_request(register.address, words),
             size=2 + values.size,
-            reply=struct.Struct(f">xB{count}{register.form}"),
+            reply=struct.Struct(f">xx{count}{register.form}"),
             frame=read_frame(register.address, words),
             values=values,
+        )
+
+
+class Packet(NamedTuple):
+    """Spans to be read in one packet of function 76 again and again, in their order."""
+
+    name: str
+    """Names their registers."""
+    request: bytes
+    """Asks for them."""
+    size: int
+    """Bytes of the reply."""
+    reply: struct.Struct
+    """Form of the reply: its function and the values of all spans."""
+
+    @classmethod
+    def of(cls, spans: Sequence[Span]) -> Packet:
+        """Return the packet of spans."""
+        reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in spans))
+        return cls(
+            name=", ".join(f"reading register {span.address}" for span in spans),
+            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in spans),
+            size=reply.size,
+            reply=reply,
         )
 
 
@@ -202,19 +226,29 @@ class LabJackT7:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
         return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
 
-    def read_span(self, span: Span) -> list[float]:
+    def read_span(self, span: Span) -> tuple[float, ...]:
         """Get the values of neighbouring registers of one type."""
         if self._connection.ended or not self._connected:
             raise self._closed()
         try:
             with self._lock:
                 reply = self._client.request(span.request, span.size)
-            size, *values = span.reply.unpack(reply)
-            if size != span.size - 2:
-                raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
+            if reply[1] != span.size - 2:
+                raise OSError(f"the answer announces {reply[1]} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
             raise self._failure(error, f"reading register {span.address}") from error
-        return values
+        return span.reply.unpack(reply)
+
+    def read_packet(self, packet: Packet) -> tuple[float, ...]:
+        """Get the values of several spans in one request, one behind the other."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                reply = self._client.request(packet.request, packet.size)
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, packet.name) from error
+        return packet.reply.unpack(reply)
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
         """Get the values of several spans in one request; what is to be written at addresses goes first in it."""
@@ -282,7 +316,7 @@ class LabJackT7:
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""
-        return self.read_span(Span.of(register, count))
+        return list(self.read_span(Span.of(register, count)))
 
     def read_integer(self, register: Register) -> int:
         """Get the value of a UINT32 or UINT16 register."""

@@ -160,7 +160,6 @@ def _ground() -> float:
 
 @dataclass
 class _Input:
-    source: Callable[[], float]
     range: float = 10.0
     negative: int = SINGLE_ENDED
     resolution: int = 0
@@ -215,7 +214,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.world = world
         self.serial_number = serial_number
         self.firmware = firmware
-        self._sources = dict(inputs)
+        self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._normals = normals(rng)
         self._touched = False
         self._watchdog = _Watchdog()
@@ -229,7 +228,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _start(self) -> None:
         """Set everything up that is not kept in the flash memory."""
-        self._inputs = [_Input(self._sources.get(channel, _ground)) for channel in range(CHANNELS)]
+        self._inputs = [_Input() for _ in range(CHANNELS)]
         self._stream_index = 0
         self._stream_settling = 0.0
         self._dacs = [0.0, 0.0]
@@ -415,7 +414,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _reading(self, channel: int) -> float:
         settings = self._inputs[channel]
-        return self._convert(settings, settings.scale)
+        return self._convert(channel, settings, settings.scale)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -435,14 +434,14 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for sample in range(1, settings.samples + 1):
                 self.world.clock.sleep_until(begin + sample / settings.scan_rate)
                 self.world.advance()
-                readings.append(self._convert(settings, scale))
+                readings.append(self._convert(channel, settings, scale))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 
-    def _convert(self, settings: _Input, scale: _Scale) -> float:
-        volts = settings.source()
+    def _convert(self, channel: int, settings: _Input, scale: _Scale) -> float:
+        volts = self._sources[channel]()
         if settings.negative != SINGLE_ENDED:
-            volts -= self._inputs[settings.negative].source()
+            volts -= self._sources[settings.negative]()
         noise, step, lowest, highest = scale
         volts = round((volts + noise * next(self._normals)) / step) * step
         return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
