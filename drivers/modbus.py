@@ -67,6 +67,11 @@ def read_request(address: int, count: int) -> bytes:
     return _READ.pack(READ, address, count)
 
 
+def write_request(address: int, data: bytes) -> bytes:
+    """Return the request that sets registers from `address` on, two bytes each; its reply is its first 5 bytes."""
+    return _WRITE.pack(WRITE, address, len(data) // 2, len(data)) + data
+
+
 def read_frame(address: int, count: int) -> bytes:
     """Return the frame of function 76 that reads `count` registers, 1 to 255, from `address` on."""
     return _FRAME.pack(_FRAME_READ, address, count)
@@ -93,7 +98,7 @@ class ModbusClient(ABC):
 
     def write(self, address: int, data: bytes) -> None:
         """Set registers from `address` on, two bytes each."""
-        request = _WRITE.pack(WRITE, address, len(data) // 2, len(data)) + data
+        request = write_request(address, data)
         self._check_echo(self.request(request, _READ.size), request)
 
     def write_one(self, address: int, value: int) -> None:

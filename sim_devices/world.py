@@ -74,22 +74,28 @@ class World:
     def advance(self) -> None:
         """Bring the plant and everything due to the clock's present time."""
         with self.lock:
-            # A request from within `expire` sees that instant, not the end.
-            if self._advancing:
-                return
-            target = self.clock.now()
-            # Mostly nothing is due, and a fast loop asks several times for each sample.
-            for deadline, _ in self._timed:
-                if deadline() <= target:
-                    break
-            else:
-                self._advance_plant(target)
-                return
-            self._advancing = True
-            try:
-                self._advance_to(target)
-            finally:
-                self._advancing = False
+            self.advance_locked()
+
+    def advance_locked(self) -> None:
+        """Bring the plant and everything due to the clock's present time; the caller holds the lock."""
+        # A request from within `expire` sees that instant, not the end.
+        if self._advancing:
+            return
+        target = self.clock.now()
+        # Mostly nothing is due, and a fast loop asks several times for each sample.
+        for deadline, _ in self._timed:
+            if deadline() <= target:
+                break
+        else:
+            if target > self._time:
+                self._plant.advance(target - self._time)
+                self._time = target
+            return
+        self._advancing = True
+        try:
+            self._advance_to(target)
+        finally:
+            self._advancing = False
 
     def _advance_to(self, target: float) -> None:
         while True:

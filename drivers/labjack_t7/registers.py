@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.modbus import FEEDBACK, RefusedError, exception_text, read_frame, read_request, swapped, write_frame
+from drivers.modbus import (
+    FEEDBACK,
+    RefusedError,
+    exception_text,
+    read_frame,
+    read_request,
+    swapped,
+    write_frame,
+    write_request,
+)
 from drivers.modbus_tcp import Connection, share
 
 Kind = Literal["F32", "U32", "U16"]
@@ -110,6 +119,30 @@ class Packet(NamedTuple):
             size=reply.size,
             reply=reply,
         )
+
+
+class Target(NamedTuple):
+    """A register to be set again and again."""
+
+    address: int
+    head: bytes
+    """What stands before its value in the request."""
+    echo: bytes
+    """The reply."""
+    encode: Callable[[float], bytes]
+    """Returns a value as it is sent."""
+
+    @classmethod
+    def of(cls, register: Register) -> Target:
+        """Return the target of a register.
+
+        Raises `ValueError` if it can only be read.
+        """
+        if "W" not in register.access:
+            raise ValueError(f"{register.name} can only be read")
+        value = struct.Struct(f">{register.form}")
+        head = write_request(register.address, bytes(value.size))[: -value.size]
+        return cls(register.address, head, head[:-1], value.pack)
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -345,6 +378,18 @@ class LabJackT7:
                 self._client.write(address, data)
         except (RefusedError, OSError) as error:
             raise self._failure(error, f"writing register {address}") from error
+
+    def send(self, target: Target, value: float) -> None:
+        """Set a register."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                reply = self._client.request(target.head + target.encode(value), len(target.echo))
+            if reply != target.echo:
+                raise OSError(f"the answer {reply.hex(' ')} is none to the request {target.head.hex(' ')} …")
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, f"writing register {target.address}") from error
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type and read them back, in one request.

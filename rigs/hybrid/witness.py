@@ -48,7 +48,7 @@ class WitnessRegisters:
 
     def _read(self, packet: bytes) -> bytes:  # noqa: ARG002
         with self._world.lock:
-            self._world.advance()
+            self._world.advance_locked()
             return _VALUE.pack(self._plant.deflection)
 
     def write_registers(self, address: int, values: list[int]) -> None:  # noqa: ARG002

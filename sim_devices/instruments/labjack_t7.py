@@ -306,7 +306,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         world, dog = self.world, self._watchdog
         world.lock.acquire()
         try:
-            world.advance()
+            world.advance_locked()
             if not dog.enabled:
                 return
             if not dog.strict:
@@ -410,11 +410,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
         with self._request():
-            return self._reading(channel)
-
-    def _reading(self, channel: int) -> float:
-        settings = self._inputs[channel]
-        return self._convert(channel, settings, settings.scale)
+            return self._convert(channel)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -434,15 +430,16 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for sample in range(1, settings.samples + 1):
                 self.world.clock.sleep_until(begin + sample / settings.scan_rate)
                 self.world.advance()
-                readings.append(self._convert(channel, settings, scale))
+                readings.append(self._convert(channel, scale))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 
-    def _convert(self, channel: int, settings: _Input, scale: _Scale) -> float:
+    def _convert(self, channel: int, scale: _Scale | None = None) -> float:
+        settings = self._inputs[channel]
         volts = self._sources[channel]()
         if settings.negative != SINGLE_ENDED:
             volts -= self._sources[settings.negative]()
-        noise, step, lowest, highest = scale
+        noise, step, lowest, highest = scale or settings.scale
         volts = round((volts + noise * next(self._normals)) / step) * step
         return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
 
@@ -540,7 +537,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         """Return the emulated rows of `ljm_constants.json`."""
         inputs, dog = self._inputs, self._dog
         return (
-            Register("AIN#", 0, "F32", self._reading, None, CHANNELS),
+            Register("AIN#", 0, "F32", self._convert, None, CHANNELS),
             Register("DAC#", 1000, "F32", self._dacs.__getitem__, self._set_dac, len(self._dacs)),
             Register("DIO#", 2000, "U16", self._read_dio, self._set_dio, _DIOS),
             Register("DIO_STATE", 2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state")),
