@@ -106,7 +106,8 @@ def _deflection(rise: float, f: Filter) -> float:
     slope = 0.0
     for each in f.slopes:
         slope = slope * x + each
-    return total + slope / half * (rise - inside)
+    beyond: float = total + slope / half * (rise - inside)
+    return beyond
 
 
 @njit(cache=True)
