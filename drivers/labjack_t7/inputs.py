@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Annotated, Self, TypeVar
 
 import numpy as np
@@ -122,12 +121,7 @@ class T7InputDevice(T7Device[InputSettingsT]):
                 for span in _spans(register, settings.channels)
             ]
         )
-        one = len(self._conversions) == 1
-        self._read: Callable[[], Sequence[float]] = (
-            partial(line.read_span, self._conversions[0])
-            if one
-            else partial(line.read_packet, Packet.of(self._conversions))
-        )
+        self._packet = Packet.of(self._conversions)
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
@@ -176,10 +170,11 @@ class T7InputDevice(T7Device[InputSettingsT]):
             end = begin + len(device._settings.channels)
             parts.append((slice(begin, end), device._taken))
             begin = end
-        read = partial(self._line.read_packet, Packet.of(spans))
+        packet = Packet.of(spans)
 
         def glance() -> dict[str, float]:
-            voltages = read()
+            # Over the line of the moment, as it may have been renewed.
+            voltages = self._line.read_packet(packet)
             values: dict[str, float] = {}
             for part, taken in parts:
                 values.update(taken(voltages[part]))
@@ -227,6 +222,11 @@ class T7InputDevice(T7Device[InputSettingsT]):
     def _convert(self) -> Sequence[float]:
         """Get one conversion of each input in V."""
         return self._check(self._read())
+
+    def _read(self) -> tuple[float, ...]:
+        if len(self._conversions) == 1:
+            return self._line.read_span(self._conversions[0])
+        return self._line.read_packet(self._packet)
 
     def _check(self, voltages: Sequence[float]) -> Sequence[float]:
         """Return one voltage for each input; raise `DeviceError` for one that is not valid or over the range."""
