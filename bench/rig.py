@@ -125,7 +125,7 @@ class Rig:
         sources = self._sources(wanted)
         readers = {}
         for name, device in self.devices.items():
-            is_wanted = any(signal.name in sources for signal in device.signals)
+            is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
             if look is Look.MEASURE or (look is Look.SAMPLE and is_wanted):
                 readers[name] = device.measure
             elif look is not Look.PART or is_wanted:
