@@ -30,6 +30,7 @@ from bench.errors import (
     LimitError,
     SettleTimeoutError,
 )
+from bench.interlocks import InterlockWatch
 from bench.interrupts import Interrupts
 from bench.journal import Event, Journal, StepRecord
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
@@ -47,7 +48,7 @@ from bench.protocol.vocabulary import (
     Step,
 )
 from bench.rig import Rig
-from bench.safety import SAFE, InterlockWatch, make_safe
+from bench.safety import SAFE, make_safe
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)

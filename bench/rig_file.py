@@ -24,9 +24,16 @@ A rig file is TOML::
     expression = "2 * spot_position / length ** 2"
     ...
 
-    [[interlocks]]                                 # the run ends in the safe state outside of these
-    signal = "plate_sink_temperature"
+    [[interlocks]]                                 # the run ends in the safe state outside of these; what else
+    signal = "plate_sink_temperature"              # an interlock can watch and do is in `bench.interlocks`
     high = 60.0
+
+    [safety]                                       # on hardware; these are the defaults
+    rate = 5.0                                     # Hz, at which interlocks are looked at
+    reconnect = 10.0                               # s for which a line may be lost
+    patience = 10.0                                # s for which a protocol may compute
+    order = []                                     # devices in the order of their safe state
+    unattended = true                              # false: an operator stays with the rig
 
     [telemetry]
     period = 1.0                                   # s between two quick readings during holds
@@ -66,8 +73,8 @@ from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
+from bench.interlocks import Interlock
 from bench.layout import DashboardLayout
-from bench.safety import Interlock
 
 
 class _Table(BaseModel):
@@ -87,6 +94,30 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
+class SafetyTable(_Table):
+    """The table `[safety]`: how a rig is guarded while a run goes on."""
+
+    rate: float = Field(
+        default=5.0,
+        ge=0.1,
+        le=50,
+        description="looks at the interlocks of hardware, of their own, Hz",
+    )
+    reconnect: float = Field(
+        default=10.0, ge=0, le=600, description="how long a line may be lost before the run ends, s; 0 for not at all"
+    )
+    patience: float = Field(
+        default=10.0, gt=0, le=600, description="how long a protocol may compute between two of its messages, s"
+    )
+    order: tuple[str, ...] = Field(
+        default=(), description="devices that are brought into their safe state one after another, in this order"
+    )
+    unattended: bool = Field(
+        default=True,
+        description="whether no operator is present, so that a device that heats needs a watchdog and an interlock",
+    )
+
+
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
@@ -94,6 +125,7 @@ class _RigFileContent(_Table):
     protocols: dict[str, dict[str, Any]] = Field(default_factory=dict, description="parameters by protocol")
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
+    safety: SafetyTable = SafetyTable()
     telemetry: TelemetryTable = TelemetryTable()
     dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
@@ -178,6 +210,7 @@ class RigFile:
     protocols: Mapping[str, Mapping[str, Any]]
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
+    safety: SafetyTable
     telemetry: TelemetryTable
     dashboard: DashboardLayout | None
     laboratory: Any | None
@@ -331,6 +364,11 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         loaded = _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
         if loaded is not None:
             entries.append(DeviceEntry(device, *loaded))
+    for i, device in enumerate(order := tables.safety.order):
+        if device not in tables.devices or device in order[:i]:
+            found.append(
+                f"safety.order: {device!r}: expected devices, each once; there are: {', '.join(tables.devices)}"
+            )
     derived: dict[str, DerivedSignal] = {}
     for name, table in tables.derived.items():
         key = f"derived.{name}."
@@ -364,6 +402,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         protocols=tables.protocols,
         derived=derived,
         interlocks=tables.interlocks,
+        safety=tables.safety,
         telemetry=tables.telemetry,
         dashboard=tables.dashboard,
         laboratory=laboratory,

@@ -160,7 +160,7 @@ class TestUnknownKeys:
                 "[rig]",
                 "titel = 1\n[rig]",
                 "titel",
-                "rig, devices, roles, protocols, derived, interlocks, telemetry, dashboard, emulation",
+                "rig, devices, roles, protocols, derived, interlocks, safety, telemetry, dashboard, emulation",
             ),
             ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
             ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title, description"),
