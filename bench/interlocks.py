@@ -210,6 +210,7 @@ class InterlockWatch:
     def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
         self._latest = -math.inf
+        self._tripped: Finding | None = None
         follow = {f"{each.interlock.setpoint}{SETPOINT}" for each in self._courses if each.interlock.setpoint}
         if missing := sorted((self.signals | follow) - units.keys()):
             raise ConfigurationError(
@@ -268,6 +269,8 @@ class InterlockWatch:
         found: list[Finding] = []
         for course in self._courses:
             course.look(t, values, setpoints, found)
+        if found and self._tripped is None:
+            self._tripped = next((finding for finding in found if finding.level is Level.SAFE), None)
         return tuple(found)
 
     def check(
@@ -281,9 +284,8 @@ class InterlockWatch:
             If an interlock of the level `safe` acts, or has acted before, or one has held for too long.
         """
         found = self.look(t, values, setpoints)
-        for finding in self.active:
-            if finding.level is Level.SAFE:
-                raise InterlockError(finding.text)
+        if self._tripped is not None:
+            raise InterlockError(self._tripped.text)
         return found
 
 
@@ -314,11 +316,13 @@ class _Criterion(ABC):
 class _Range(_Criterion):
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
         interlock = self._interlock
-        low, high = (interlock.low, interlock.high) if self.since is None else interlock.resume
+        if self.since is None:
+            if not interlock.low <= value <= interlock.high:
+                self.since = t
+            return
+        low, high = interlock.resume
         if low <= value <= high:
             self.since = None
-        elif self.since is None:
-            self.since = t
 
     def seen(self, t: float, since: float, value: float) -> str:
         return (
@@ -482,6 +486,7 @@ class _Course:
         self.interlock = interlock
         self._units = units
         self._settling = _Settling(interlock) if interlock.settle else None
+        self._follows = f"{interlock.setpoint}{SETPOINT}" if interlock.stuck is not None else ""
         self._criteria = self._make_criteria()
         self.active: list[Finding | None] = [None] * len(self._criteria)
         self._acted = [math.nan] * len(self._criteria)
@@ -526,14 +531,12 @@ class _Course:
         found: list[Finding],
     ) -> None:
         interlock = self.interlock
-        setpoint: float | None = None
-        if self._settling is not None or interlock.stuck is not None:
-            if setpoints is None:
-                setpoints = {name.removesuffix(SETPOINT): values[name] for name in values if name.endswith(SETPOINT)}
-            if self._settling is not None:
-                self._settling.look(t, setpoints)
-            setpoint = setpoints.get(interlock.setpoint)
-        value = _reading(interlock.signal, values, setpoints)
+        if self._settling is not None:
+            self._settling.look(t, _setpoints(values) if setpoints is None else setpoints)
+        setpoint = _reading(self._follows, values, setpoints) if self._follows else None
+        value = values.get(interlock.signal)
+        if value is None:
+            value = _reading(interlock.signal, values, setpoints)
         if interlock.minus and value is not None:
             other = _reading(interlock.minus, values, setpoints)
             value = None if other is None else value - other
@@ -545,7 +548,8 @@ class _Course:
             for criterion in self._criteria:
                 criterion.look(t, value, setpoint)
         for i, criterion in enumerate(self._criteria):
-            self._act(t, value, criterion, i, found)
+            if criterion.since is not None or self.active[i] is not None:
+                self._act(t, value, criterion, i, found)
 
     def _is_off(self, values: Mapping[str, float], setpoints: Mapping[str, float] | None) -> bool:
         """Return whether a set-point that is compared is none, as the output is off."""
@@ -573,6 +577,11 @@ class _Course:
         else:
             return
         found.extend(each for each in (self.active[i],) if each is not None)
+
+
+def _setpoints(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the set-points among values of signals, by device."""
+    return {name.removesuffix(SETPOINT): value for name, value in values.items() if name.endswith(SETPOINT)}
 
 
 def _reading(name: str, values: Mapping[str, float], setpoints: Mapping[str, float] | None) -> float | None:
