@@ -211,17 +211,20 @@ class InterlockWatch:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
         self._latest = -math.inf
         self._tripped: Finding | None = None
-        follow = {f"{each.interlock.setpoint}{SETPOINT}" for each in self._courses if each.interlock.setpoint}
-        if missing := sorted((self.signals | follow) - units.keys()):
+        watched = [course.interlock for course in self._courses]
+        names = {name for each in watched for name in (each.signal, each.minus) if name}
+        names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
+        if missing := sorted(names - units.keys()):
             raise ConfigurationError(
                 f"interlocks: there is no signal {', '.join(missing)}; there are: {', '.join(units)}"
             )
 
     @property
     def signals(self) -> frozenset[str]:
-        """Names of the signals that have to be read for it; set-points may be among them."""
+        """Names of the signals that have to be read for it; set-points are not among them, as they are known."""
         watched = [course.interlock for course in self._courses]
-        return frozenset(name for each in watched for name in (each.signal, each.minus) if name)
+        names = {name for each in watched for name in (each.signal, each.minus) if name}
+        return frozenset(name for name in names if not name.endswith(SETPOINT))
 
     @property
     def active(self) -> tuple[Finding, ...]:

@@ -59,7 +59,7 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -125,8 +125,8 @@ class _RigFileContent(_Table):
     protocols: dict[str, dict[str, Any]] = Field(default_factory=dict, description="parameters by protocol")
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
-    safety: SafetyTable = SafetyTable()
     telemetry: TelemetryTable = TelemetryTable()
+    safety: SafetyTable = SafetyTable()
     dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
@@ -210,8 +210,8 @@ class RigFile:
     protocols: Mapping[str, Mapping[str, Any]]
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
-    safety: SafetyTable
     telemetry: TelemetryTable
+    safety: SafetyTable
     dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
@@ -226,6 +226,10 @@ class RigFile:
         """Whether every device is emulated in this process, so that time can stand while the process computes."""
         ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
         return self.emulated and all(port.startswith("emulated://") for port in ports)
+
+    def served_by(self, laboratory: Any) -> RigFile:  # noqa: ANN401 - without Settings
+        """Return the same rig with a `Laboratory` that is open already in place of its own."""
+        return replace(self, laboratory=lambda *_: laboratory)
 
 
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
@@ -402,8 +406,8 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         protocols=tables.protocols,
         derived=derived,
         interlocks=tables.interlocks,
-        safety=tables.safety,
         telemetry=tables.telemetry,
+        safety=tables.safety,
         dashboard=tables.dashboard,
         laboratory=laboratory,
         laboratory_settings=settings,

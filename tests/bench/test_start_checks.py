@@ -1,41 +1,67 @@
-import math
 from dataclasses import replace
 
 import pytest
 
 from bench.clock import VirtualClock
-from bench.devices import Limits
+from bench.description import RigDescription
+from bench.devices import DeviceDescription, Identity, Limits, Signal
 from bench.errors import ConfigurationError
 from bench.interlocks import Interlock
 from bench.rig import Rig
 from bench.rig_file import SafetyTable, load_rig, packaged_rigs
-from bench.start_checks import DeviceDescription, RigDescription, check_start
+from bench.roles import PositionSensor, TECAmplifier
+from bench.start_checks import check_start
 
-TEC = DeviceDescription("tec", ("tec_temperature", "tec_current"), Limits(15.0, 95.0, "°C"), watchdog=5.0, heats=True)
-PSD = DeviceDescription("psd", ("psd_position",), watchdog=2.0)
-UNITS = {
-    "tec_setpoint": "°C",
-    "tec_temperature": "°C",
-    "tec_current": "A",
-    "psd_position": "m",
-    "curvature": "1/m",
-    "overheating": "K",
-}
-SOURCES = {"curvature": ("psd_position",), "overheating": ("twice",), "twice": ("tec_temperature",)}
+
+class Heater(TECAmplifier):
+    heats = True
+
+
+class Cooler(TECAmplifier):
+    heats = False
+
+
+def signals(**units):
+    return tuple(Signal(name, unit, name) for name, unit in units.items())
+
+
+IDENTITY = Identity("Test", "1", "1", "1")
+TEC = DeviceDescription(
+    name="tec",
+    kind=Heater,
+    identity=IDENTITY,
+    signals=signals(tec_temperature="°C", tec_current="A"),
+    setpoint_signal=Signal("tec_setpoint", "°C", "temperature"),
+    limits=Limits(15.0, 95.0, "°C"),
+    watchdog=5.0,
+    safe_within=1.0,
+)
+COOLER = replace(TEC, kind=Cooler)
+PSD = DeviceDescription("psd", PositionSensor, IDENTITY, signals(psd_position="m"), None, None, 2.0, 1.0)
 HOT = Interlock(signal="tec_temperature", high=100.0)
+DERIVED = """
+[derived.twice]
+expression = "2 * tec_current"
+unit = "A"
+
+[derived.excess]
+expression = "twice - offset"
+constants = { offset = "1 A" }
+unit = "A"
+"""
 
 
 @pytest.fixture
-def check():
-    file = load_rig("vo2")
+def check(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('extends = "vo2"\n' + DERIVED)
+    file = replace(load_rig(str(path)), path="mine.toml")
+    found = (TEC.setpoint_signal, *TEC.signals, *PSD.signals, *signals(curvature="1/m", twice="A", excess="A"))
 
-    def check(*interlocks, devices=(TEC, PSD), interval=0.2, key="safety.rate", **safety):
-        return check_start(
-            replace(file, interlocks=interlocks, safety=SafetyTable(**safety)),
-            RigDescription(tuple(devices), UNITS, SOURCES),
-            interval=interval,
-            interval_key=key,
-        )
+    def check(*interlocks, devices=(TEC, PSD), interval=0.2, key="safety.rate", measurements=None, **safety):
+        guarded = replace(file, interlocks=interlocks, safety=SafetyTable(**safety))
+        description = RigDescription(guarded, {device.name: device for device in devices}, found)
+        return check_start(description, interval=interval, interval_key=key, measurements=measurements)
 
     return check
 
@@ -44,8 +70,8 @@ def refused(check, *interlocks, **keys):
     with pytest.raises(ConfigurationError) as caught:
         check(*interlocks, **keys)
     lines = str(caught.value).splitlines()
-    assert all(line.startswith("vo2.toml: ") for line in lines)
-    return [line.removeprefix("vo2.toml: ") for line in lines]
+    assert all(line.startswith("mine.toml: ") for line in lines)
+    return [line.removeprefix("mine.toml: ") for line in lines]
 
 
 def test_a_rig_that_is_guarded_starts_without_a_warning(check):
@@ -67,13 +93,13 @@ class TestIntervals:
             assert check(HOT, devices=[replace(TEC, watchdog=watchdog)], interval=2.0 * watchdog / 5.0) == ()
 
     def test_of_the_longest_measurement_of_any_device(self, check):
-        assert check(HOT, devices=[TEC, replace(PSD, longest_measurement=0.8)]) == ()
-        (line,) = refused(check, HOT, devices=[replace(TEC, longest_measurement=0.9), PSD])
+        assert check(HOT, measurements={"psd": 0.8}) == ()
+        (line,) = refused(check, HOT, measurements={"psd": 0.1, "tec": 0.9})
         assert line.startswith("devices.tec: a measurement takes 0.9 s, but psd goes to its safe state after 2 s")
 
     @pytest.mark.parametrize("watchdog", [None, 0.0])
     def test_without_a_watchdog_there_is_no_bound(self, check, watchdog):
-        devices = [replace(TEC, heats=False, watchdog=watchdog), replace(PSD, watchdog=watchdog)]
+        devices = [replace(COOLER, watchdog=watchdog), replace(PSD, watchdog=watchdog)]
         assert check(devices=devices, interval=60.0) == ()
 
 
@@ -85,14 +111,14 @@ class TestADeviceThatHeats:
         assert line.startswith("devices.tec: it heats and has no watchdog")
         assert line.endswith("or safety.unattended = false if an operator is present")
         (warning,) = check(HOT, devices=devices, unattended=False)
-        assert warning.startswith("vo2.toml: devices.tec: it heats and has no watchdog")
+        assert warning.startswith("mine.toml: devices.tec: it heats and has no watchdog")
         assert warning.endswith("accepted, as safety.unattended = false")
 
     def test_without_an_interlock(self, check):
         (line,) = refused(check)
         assert line.startswith(
             "devices.tec: it heats, and no interlock of level safe or hold limits it; expected one on "
-            "tec_temperature, tec_current or a signal derived from them, or with setpoint = 'tec'"
+            "tec_current, tec_temperature or a signal derived from them, or with setpoint = 'tec'"
         )
         assert len(check(unattended=False)) == 1
 
@@ -116,8 +142,8 @@ class TestADeviceThatHeats:
         [
             Interlock(signal="tec_current", low=-1.0),
             Interlock(signal="tec_temperature", fastest=5.0),
-            Interlock(signal="overheating", high=60.0),
-            Interlock(signal="overheating", high=60.0, level="hold"),
+            Interlock(signal="excess", high=60.0),
+            Interlock(signal="excess", high=60.0, level="hold"),
             Interlock(signal="curvature", high=1.0, setpoint="tec"),
         ],
         ids=lambda each: f"{each.signal}-{each.level}-{each.setpoint}",
@@ -126,7 +152,7 @@ class TestADeviceThatHeats:
         assert check(interlock) == ()
 
     def test_one_that_does_not_heat_needs_neither(self, check):
-        assert check(devices=[replace(TEC, heats=False, watchdog=None)]) == ()
+        assert check(devices=[replace(COOLER, watchdog=None)]) == ()
 
     def test_all_problems_are_said_at_once(self, check):
         lines = refused(check, devices=[replace(TEC, watchdog=None), PSD], interval=5.0)
@@ -181,31 +207,20 @@ class TestInterlocks:
         )
 
 
-def description(rig):
-    return RigDescription(
-        tuple(DeviceDescription.of(device) for device in rig.devices.values()),
-        {signal.name: signal.unit for signal in rig.signals},
-        {name: derived.sources for name, derived in rig.derived.items()},
-    )
-
-
 @pytest.mark.parametrize("name", sorted(name for name in packaged_rigs() if "hardware" not in name))
 def test_the_packaged_rigs_can_be_left_to_themselves(name):
     file = load_rig(name)
     rig = Rig(file, VirtualClock(), seed=0)
-    try:
-        found = description(rig)
-    finally:
-        rig.close()
+    rig.close()
     # As the drivers declare it, and as if each declared what the rig file says.
     watchdogs = {entry.name: getattr(entry.settings, "watchdog", None) for entry in file.devices}
-    heaters = {"tec", "supply"}
-    strict = tuple(
-        replace(each, watchdog=each.watchdog or watchdogs[each.name], heats=each.heats or each.name in heaters)
-        for each in found.devices
-    )
-    assert {each.name for each in strict if each.heats}
-    assert not any(math.isnan(each.watchdog) for each in strict if each.watchdog)
-    for devices in (found.devices, strict):
-        looks = replace(found, devices=devices)
-        assert check_start(file, looks, interval=1.0 / file.safety.rate, interval_key="safety.rate") == ()
+    kinds = {"tec": Heater, "supply": Heater}
+    declared = rig.description.devices
+    strict = {
+        name: replace(each, watchdog=each.watchdog or watchdogs[name], kind=kinds.get(name, each.kind))
+        for name, each in declared.items()
+    }
+    assert Heater in {each.kind for each in strict.values()}
+    for devices in (declared, strict):
+        description = replace(rig.description, devices=devices)
+        assert check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate") == ()
