@@ -135,6 +135,7 @@ class Engine:
             error = AbortError(f"ended by {type(caught).__name__}, which the protocol raised")
             error.__cause__ = caught
         finally:
+            self._interrupts.acknowledge()
             self._clock.interrupted = lambda: False
             safe_state = self._station.end()
         return self._finish(error, start, safe_state)

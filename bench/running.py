@@ -192,6 +192,7 @@ class RunAtHand:
     def raise_if_aborted(self) -> None:
         """Raise AbortError if the operator or the system has asked for the end."""
         if self._interrupts.abort_reason is not None:
+            self._interrupts.acknowledge()
             raise AbortError(f"ended by {self._interrupts.abort_reason}")
 
     @property

@@ -9,6 +9,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -22,13 +23,14 @@ from bench.attachment import AttachedClock, attach
 from bench.binding import Slots
 from bench.clock import Stopwatch, wall_time
 from bench.description import RigDescription
+from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
-from bench.errors import ConfigurationError
+from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
 from bench.guardian.remote import GuardedRig, RemoteStation
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal
+from bench.interrupts import Interrupts, say_at_once
+from bench.journal import FILE_NAME, Journal, abandon
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 RECORDING_NAME = "run.rrd"
 RIG_FILE_NAME = "rig.toml"
+_LAST_WORDS = 1.0
+"""Longest wait for a terminal at the end, s."""
 _PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
 
 
@@ -108,8 +112,17 @@ class RunResult:
         return self.outcome.laboratory_seconds / self.wall_seconds
 
 
-def carry_out(run: Run, console: Console) -> RunResult:
+def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) -> RunResult:
     """Carry a run out, keep its record, and leave the rig in the safe state.
+
+    Parameters
+    ----------
+    run : Run
+        What to run.
+    console : Console
+        Where progress is shown.
+    interrupts : Interrupts, optional
+        At work already, and for longer than the run; without them the run has its own.
 
     Raises
     ------
@@ -134,6 +147,11 @@ def carry_out(run: Run, console: Console) -> RunResult:
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     guardian: RemoteStation | None = None
     with ExitStack() as stack:
+        if interrupts is None:
+            interrupts = stack.enter_context(Interrupts(say_at_once))
+        clock.interrupted = interrupts.abort_requested
+        # A guardian makes the devices safe as soon as this process is gone.
+        interrupts.leave_by(_leave)
         if run.attach is None and rig_file.in_process:
             station: Station = LocalStation(Rig(rig_file, clock, run.seed))
         else:
@@ -150,6 +168,8 @@ def carry_out(run: Run, console: Console) -> RunResult:
                 f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
                 "run it in a terminal, where an operator can answer"
             )
+        if (reason := interrupts.abort_reason) is not None:
+            raise AbortError(f"ended by {reason} before anything moved")
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         if guardian is not None:
             guardian.keep_record(folder)
@@ -158,6 +178,7 @@ def carry_out(run: Run, console: Console) -> RunResult:
         signals = description.signals + trace_signals(run.protocol, description, slots)
         journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
+        interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
@@ -169,13 +190,26 @@ def carry_out(run: Run, console: Console) -> RunResult:
         layout = rig_file.dashboard
         shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
-        observers.append(stack.enter_context(progress))
-        interrupts = stack.enter_context(Interrupts(_say_at_once))
+        observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
         outcome = Engine(station, journal, observers, interrupts, ask).run(run.protocol, parameters)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
+    interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _leave(reason: str, station: Station | None = None, journal: Path | None = None) -> None:
+    """End the process from another thread than the one that hangs; a guardian makes the devices safe then."""
+    safe_state = station.end() if isinstance(station, LocalStation) else {}
+    text = f"ended by {reason}; the protocol did not come to an end, so the process was left"
+    if journal is not None:
+        abandon(journal, text, safe_state)
+    # The terminal may hang as well.
+    saying = threading.Thread(target=say_at_once, args=(text,), daemon=True)
+    saying.start()
+    saying.join(_LAST_WORDS)
+    os._exit(AbortError.exit_code)
 
 
 def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
@@ -245,11 +279,6 @@ def _metadata(
             "started": wall_time().isoformat(),
         },
     }
-
-
-def _say_at_once(text: str) -> None:
-    # In a signal handler: a console has locks, and the interrupted code may hold them.
-    os.write(2, f"\n{text}\n".encode())
 
 
 def _make_folder(parent: Path, name: str) -> Path:
