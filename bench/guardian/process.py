@@ -28,9 +28,9 @@ from bench.errors import BenchError, ConfigurationError, GuardianError
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
 from bench.safety import SAFE as IS_SAFE
-from bench.safety import InterlockWatch
 from bench.station.core import StationCore
 from bench.station.interface import News, masked
 
@@ -79,8 +79,9 @@ class Guardian:
         safety = rig.file.safety
         factor = float(getattr(rig.clock, "factor", 1.0))
         units = {signal_.name: signal_.unit for signal_ in rig.signals}
-        self._core = StationCore(InterlockWatch(rig.file.interlocks, units), 1.0 / (safety.rate * min(factor, 10.0)))
-        self._watched = {interlock.signal for interlock in rig.file.interlocks}
+        watch = InterlockWatch(rig.file.interlocks, units)
+        self._core = StationCore(watch, 1.0 / (safety.rate * min(factor, 10.0)))
+        self._watched = watch.signals
         self._looked_at = self._look_readers()
         self._statuses: list[Status] = []
         self._news: list[News] = []
@@ -336,7 +337,8 @@ class Guardian:
     def _judge(self, values: dict[str, float]) -> None:
         if self._watched <= values.keys():
             self._last_seen = self._wall.now()
-            self._core.judge(self._rig.clock.now(), values)
+            setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
+            self._core.judge(self._rig.clock.now(), values, setpoints)
 
     def _blind(self, error: BaseException) -> None:
         self._looking = False

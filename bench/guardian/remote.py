@@ -6,6 +6,7 @@ import faulthandler
 import math
 import signal
 import subprocess
+import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,8 @@ class RemoteStation(Station):
         self._setpoints: dict[str, float] = {}
         self._safe: Mapping[str, str] | None = None
         self._stacks: TextIO | None = None
-        self._process, self._channel = start_guardian()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._process, self._channel = start_guardian(self._log)
         try:
             found = self._ask(
                 "hello",
@@ -243,6 +245,7 @@ class RemoteStation(Station):
         except subprocess.TimeoutExpired:
             # It goes on until what is not safe yet is safe.
             self._process.returncode = 0
+        self._log.close()
 
     def _rescued(self, error: BenchError) -> Mapping[str, str]:
         """Make sure that the guardian is dead, and make the devices safe without it."""

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from enum import Enum
 
 from bench.errors import BenchError, DeviceError, GuardianError, InterlockError
-from bench.safety import InterlockWatch
+from bench.interlocks import InterlockWatch
 
 
 class State(Enum):
@@ -119,13 +119,18 @@ class StationCore:
                 )
             )
 
-    def judge(self, t: float, values: Mapping[str, float]) -> None:
-        """Judge readings by the interlocks; trip if one is not met."""
+    def judge(self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None = None) -> None:
+        """Judge readings by the interlocks; trip if one is not met.
+
+        Set-points are by device, nan for an output that is off; without them those among the values count.
+        """
+        # The samples of a block are judged after it, when a look may have come in between.
+        t = t if self._seen is None else max(t, self._seen)
         self._seen = t
         if self.over:
             return
         try:
-            self._watch.check(t, values)
+            self._watch.check(t, values, setpoints)
         except InterlockError as error:
             self.trip(error)
 

@@ -9,9 +9,10 @@ from typing import TypeVar
 
 from bench.devices import Actuator, Status
 from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
 from bench.roles import Floats
-from bench.safety import InterlockWatch, make_safe
+from bench.safety import make_safe
 from bench.station.core import StationCore
 from bench.station.interface import Arrivals, News, Station, arrivals_of, masked
 from bench.station.reconnection import reconnect
@@ -36,10 +37,9 @@ class LocalStation(Station):
         self.clock = rig.clock
         self.description = rig.description
         units = {signal.name: signal.unit for signal in rig.signals}
-        self._core = StationCore(
-            InterlockWatch(rig.file.interlocks, units), 1.0 / interlock_rate if interlock_rate else math.inf
-        )
-        self._watched = [interlock.signal for interlock in rig.file.interlocks]
+        watch = InterlockWatch(rig.file.interlocks, units)
+        self._core = StationCore(watch, 1.0 / interlock_rate if interlock_rate else math.inf)
+        self._watched = watch.signals
         self._core.begin(self.clock.now())
         self._statuses: list[Status] = []
         self._news: list[News] = []
@@ -125,7 +125,8 @@ class LocalStation(Station):
             now = self.clock.now()
             self._core.advance(now)
             if self._core.look_due(now):
-                self._core.judge(now, self.look(Look.PART, self._watched))
+                setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
+                self._core.judge(now, self.look(Look.PART, self._watched), setpoints)
             self._raise_if_tripped()
         self.clock.sleep_until(instant)
 

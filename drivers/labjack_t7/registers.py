@@ -15,6 +15,7 @@ import secrets
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.modbus import (
+    FEEDBACK,
     ModbusClient,
     RefusedError,
     exception_text,
@@ -30,6 +32,7 @@ from drivers.modbus import (
     read_request,
     swapped,
     write_frame,
+    write_request,
 )
 from drivers.modbus_tcp import Connection, share
 
@@ -74,7 +77,7 @@ class Span(NamedTuple):
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
-    """Form of the reply: its function, the number of bytes of the values, and the values."""
+    """Form of the reply: its function, the number of bytes of the values (both skipped), and the values."""
     frame: bytes
     """Asks for them in function 76, among others."""
     values: struct.Struct
@@ -94,20 +97,69 @@ class Span(NamedTuple):
             address=register.address,
             request=read_request(register.address, words),
             size=2 + values.size,
-            reply=struct.Struct(f">xB{count}{register.form}"),
+            reply=struct.Struct(f">xx{count}{register.form}"),
             frame=read_frame(register.address, words),
             values=values,
         )
 
-    def ask(self, client: ModbusClient) -> list[float]:
+    def ask(self, client: ModbusClient) -> tuple[float, ...]:
         """Return the values, as a client gets them by a request of their own.
 
         Raises what the request does, and `OSError` if the answer announces another number of bytes than it has.
         """
-        size, *values = self.reply.unpack(client.request(self.request, self.size))
-        if size != self.size - 2:
-            raise OSError(f"the answer announces {size} bytes where {self.size - 2} were asked for")
-        return values
+        reply = client.request(self.request, self.size)
+        if reply[1] != self.size - 2:
+            raise OSError(f"the answer announces {reply[1]} bytes where {self.size - 2} were asked for")
+        return self.reply.unpack(reply)
+
+
+class Packet(NamedTuple):
+    """Spans to be read in one packet of function 76 again and again, in their order, and the owner number."""
+
+    name: str
+    """Names their registers."""
+    request: bytes
+    """Asks for them."""
+    size: int
+    """Bytes of the reply."""
+    reply: struct.Struct
+    """Form of the reply: its function, the values of all spans, and the owner number."""
+
+    @classmethod
+    def of(cls, spans: Sequence[Span]) -> Packet:
+        """Return the packet of spans."""
+        read = (*spans, _OWNER_SPAN)
+        reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in read))
+        return cls(
+            name=", ".join(f"reading register {span.address}" for span in spans),
+            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in read),
+            size=reply.size,
+            reply=reply,
+        )
+
+
+class Target(NamedTuple):
+    """A register to be set again and again."""
+
+    address: int
+    head: bytes
+    """What stands before its value in the request."""
+    echo: bytes
+    """The reply."""
+    encode: Callable[[float], bytes]
+    """Returns a value as it is sent."""
+
+    @classmethod
+    def of(cls, register: Register) -> Target:
+        """Return the target of a register.
+
+        Raises `ValueError` if it can only be read.
+        """
+        if "W" not in register.access:
+            raise ValueError(f"{register.name} can only be read")
+        value = struct.Struct(f">{register.form}")
+        head = write_request(register.address, bytes(value.size))[: -value.size]
+        return cls(register.address, head, head[:-1], value.pack)
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -171,6 +223,11 @@ _DETAILS = {
     2375: "AIN resolution index not allowed",
     2376: "AIN rate not possible at this resolution index",
 }
+
+
+def _ask_echo(target: Target, request: bytes, client: ModbusClient) -> None:
+    if client.request(request, len(target.echo)) != target.echo:
+        raise OSError("the answer is none to the request")
 
 
 class LabJackT7:
@@ -353,20 +410,32 @@ class LabJackT7:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
         return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
 
-    def read_span(self, span: Span) -> list[float]:
+    def read_span(self, span: Span) -> tuple[float, ...]:
         """Get the values of neighbouring registers of one type."""
         if self._connection.ended or not self._connected:
             self.reopen()
         try:
             with self._lock:
                 reply = self._client.request(span.request, span.size)
-            size, *values = span.reply.unpack(reply)
-            if size != span.size - 2:
-                raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
+            if reply[1] != span.size - 2:
+                raise OSError(f"the answer announces {reply[1]} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
-            doing = f"reading register {span.address}"
-            return self._again(error, doing, span.ask)
-        return values
+            return self._again(error, f"reading register {span.address}", span.ask)
+        return span.reply.unpack(reply)
+
+    def read_packet(self, packet: Packet) -> tuple[float, ...]:
+        """Get the values of several spans in one request, one behind the other; raises what `read_spans` does."""
+        if self._connection.ended or not self._connected:
+            self.reopen()
+        try:
+            with self._lock:
+                reply = self._client.request(packet.request, packet.size)
+        except (RefusedError, OSError) as error:
+            reply = self._again(error, packet.name, lambda client: client.request(packet.request, packet.size))
+        *values, owner = packet.reply.unpack(reply)
+        if owner != self._owner and self._owner and not self._unchecked:
+            self._check_owner(owner)
+        return tuple(values)
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
         """Get the values of several spans in one request; what is to be written at addresses goes first in it.
@@ -444,7 +513,7 @@ class LabJackT7:
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""
-        return self.read_span(Span.of(register, count))
+        return list(self.read_span(Span.of(register, count)))
 
     def read_integer(self, register: Register) -> int:
         """Get the value of a UINT32 or UINT16 register."""
@@ -473,6 +542,19 @@ class LabJackT7:
                 self._client.write(address, data)
         except (RefusedError, OSError) as error:
             self._again(error, f"writing register {address}", lambda client: client.write(address, data))
+
+    def send(self, target: Target, value: float) -> None:
+        """Set a register."""
+        if self._connection.ended or not self._connected:
+            self.reopen()
+        request = target.head + target.encode(value)
+        try:
+            with self._lock:
+                reply = self._client.request(request, len(target.echo))
+            if reply != target.echo:
+                raise OSError(f"the answer {reply.hex(' ')} is none to the request {target.head.hex(' ')} …")
+        except (RefusedError, OSError) as error:
+            self._again(error, f"writing register {target.address}", partial(_ask_echo, target, request))
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type and read them back, in one request.

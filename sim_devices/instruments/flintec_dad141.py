@@ -33,7 +33,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +41,7 @@ from bench.devices import Identity
 from bench.errors import DeviceError
 from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice
-from sim_devices.instruments.registers import Register, RegisterInstrument, Service
+from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
 
@@ -193,7 +192,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._access_code = _FIRST_ACCESS_CODE
         self._span = _SATURATION * max(self._highest, -self._lowest) / self._scale
         self._peak = 0
-        self._service = Service(self._begin, self._end)
         self._set_map_up(self._register_map())
         self.power_cycle()
         world.add(self)
@@ -348,9 +346,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         return (1 if self._still else 0) | (2 if self._zero else 0) | (4 if self._tare_set else 0)
 
     # The registers.
-
-    def _request(self) -> AbstractContextManager[None]:
-        return self._service
 
     def _begin(self) -> None:
         self.world.lock.acquire()

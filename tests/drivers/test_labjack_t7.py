@@ -367,9 +367,9 @@ def test_byte_vectors_of_a_ratiometric_sensor():
     volts = "4020 0000 40a0 0000"  # 2.5 and 5 V
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", f"0001 0000 000b 01 03 08 {volts}"),  # AIN2, AIN3
-        (  # AIN2_EF_READ_A, B and C, of two inputs each
-            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
-            f"0002 0000 001a 01 4c {volts} 4024 0000 40a4 0000 401c 0000 409c 0000",
+        (  # AIN2_EF_READ_A, B and C, of two inputs each, and USER_RAM39_U32
+            "0002 0000 0012 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04 00 b462 02",
+            f"0002 0000 001e 01 4c {volts} 4024 0000 40a4 0000 401c 0000 409c 0000 0000 0000",
         ),
     )
     with Scripted(*exchanges) as server:
@@ -447,9 +447,9 @@ def test_byte_vectors_of_a_switch(monkeypatch):
 def test_byte_vectors_of_a_thermistor():
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", "0001 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2 1.25 V, AIN3 2.5 V
-        (  # AIN2_EF_READ_A, B and C, of two inputs each
-            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
-            "0002 0000 001a 01 4c 3fa0 0000 4020 0000 3fb0 0000 4024 0000 3f90 0000 401c 0000",
+        (  # AIN2_EF_READ_A, B and C, of two inputs each, and USER_RAM39_U32
+            "0002 0000 0012 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04 00 b462 02",
+            "0002 0000 001e 01 4c 3fa0 0000 4020 0000 3fb0 0000 4024 0000 3f90 0000 401c 0000 0000 0000",
         ),
     )
     with Scripted(*exchanges) as server:
@@ -474,7 +474,7 @@ def test_byte_vectors_of_a_high_voltage_supply():
         ("0003 0000 0006 01 03 0000 0006", f"0003 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
         ("0004 0000 000b 01 10 7530 0002 04 3f80 0000", "0004 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
         ("0005 0000 000b 01 10 7530 0002 04 bf80 0000", "0005 0000 0006 01 10 7530 0002"),  # TDAC0 -1 V
-        ("0006 0000 0006 01 4c 00 0000 06", f"0006 0000 000e 01 4c {on}"),  # glance
+        ("0006 0000 000a 01 4c 00 0000 06 00 b462 02", f"0006 0000 0012 01 4c {on} 0000 0000"),  # glance
         ("0007 0000 000b 01 10 7530 0002 04 0000 0000", "0007 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
         # DIO5 low
         (
@@ -1559,3 +1559,32 @@ def test_connecting_either_leaves_the_other_as_it_is(bench):
     assert sensor.measure()["psd_position"] == pytest.approx(0.0175, abs=1e-5)
     sensor.close()
     assert switch.measure() == {"fan_state": 1.0}
+
+
+@pytest.mark.parametrize("make", [Bench.supply, Bench.switch])
+def test_a_line_that_is_opened_again_is_switched_off_over_it(bench, make):
+    bench.volts[2] = 0.0
+    device = make(bench)
+    device._line._connection.end()
+    device.reconnect()
+    device.safe()
+    assert not bench.t7.dio_level(5, pulled_down=True)
+
+
+def test_devices_on_one_connection_are_read_in_one_request(bench):
+    sensor, thermistor = bench.sensor(channels=[0]), bench.thermistor(channels=[3, 4])
+    bench.volts |= {0: 1.0, 3: 1.2, 4: 2.5}
+    assert sensor.joins(thermistor)
+    assert not sensor.joins(bench.switch())
+    requests = []
+    client = sensor._line._client
+    send = client.request
+    client.request = lambda request, expected: requests.append(request) or send(request, expected)
+    values = sensor.joined([thermistor])()
+    assert len(requests) == 1
+    one_by_one = sensor.glance() | thermistor.glance()
+    assert len(requests) == 3
+    assert values == {name: pytest.approx(value, abs=1e-2, rel=1e-3) for name, value in one_by_one.items()}
+    bench.volts[3] = 2.5
+    with pytest.raises(DeviceError, match=r"^base: thermistor open"):
+        sensor.joined([thermistor])()
