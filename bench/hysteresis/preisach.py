@@ -303,6 +303,10 @@ class Preisach(Operator[MemoryCurve]):
         For a signed density the best memory curve over each input is found by dynamic programming over the
         columns. Either way each quadratic piece is tested at its ends and at its vertex.
         """
+        return self._extremes
+
+    @cached_property
+    def _extremes(self) -> tuple[float, float]:
         return -self._greatest(-1.0), self._greatest(1.0)
 
     def _greatest(self, sign: float) -> float:

@@ -341,8 +341,8 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     @property
     def _adc(self) -> int:
-        weight = self._second + self._noise_second
-        return min(max(round(weight / self._span * _FULL_SCALE), -_FULL_SCALE), _FULL_SCALE - 1)
+        code = round((self._second + self._noise_second) / self._span * _FULL_SCALE)
+        return int(min(max(code, -_FULL_SCALE), _FULL_SCALE - 1))
 
     @property
     def _net(self) -> int:
