@@ -243,6 +243,9 @@ class Preisach(Operator[MemoryCurve]):
         from bench.hysteresis import _kernels
 
         t = self.lattice
+        if not inputs.flags.writeable:
+            # For arrays that are read-only, as the columns of a record, numba would compile once more.
+            inputs = inputs.copy()
         return np.asarray(_kernels.evaluate(inputs, t.plane, t.below, t.offset, t.terms, self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
