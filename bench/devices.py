@@ -12,6 +12,9 @@ Promises of every device
 - `safe` brings the device into its safe state from any state; calling it again changes nothing.
   It tries everything that can make the device safer, and raises only after that.
 - `stop` ends a motion and holds, `close` releases the line; neither replaces `safe`.
+- An instrument that has restarted is found by the next reading, or by the next set-point before it is sent:
+  `DeviceRestartedError`. Its limits and modes are lost, so nothing is sent to it but what makes it safe.
+- An answer belongs to its question: a late, doubled or damaged one is discarded, and never taken for a reading.
 - Methods may be called from one thread at a time.
 
 Devices conform to `bluesky.protocols` by structure (`name`, `parent`, `read`, `describe`, `set`, `stop`),
@@ -26,7 +29,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any, ClassVar, TypedDict
 
 from pydantic import BaseModel, ConfigDict
 
@@ -315,6 +318,38 @@ class Device(ABC):
             for signal in self.signals
         }
 
+    @property
+    def watchdog(self) -> float | None:
+        """Silence of the host, s, after which the instrument itself goes to its safe state; None if it never does."""
+        return None
+
+    @property
+    def safe_within(self) -> float:
+        """Longest time that `safe` takes on a line that works, s."""
+        return 1.0
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected, as their answers were lost."""
+        return 0
+
+    def reconnect(self) -> None:
+        """Open the line again after it was lost, and check that the instrument is as it was left.
+
+        Nothing is configured and nothing moves. One attempt takes 1 s at most.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened or nothing answers; it may be tried again.
+        DeviceRestartedError
+            If the instrument has restarted.
+        DeviceError
+            If another instrument answers, it reports an error, or its set-point is not the one that was sent; also
+            of a device that has no line to open.
+        """
+        raise DeviceError(self.name, "its driver cannot open the line again")
+
     def stop(self, success: bool = True) -> None:  # noqa: B027 - bluesky's form; sensors do not move
         """End a motion where it is and hold; does nothing to a device that only measures."""
 
@@ -331,7 +366,15 @@ class Device(ABC):
 
 
 class Actuator(Device):
-    """A device that takes a set-point."""
+    """A device that takes a set-point.
+
+    Attributes
+    ----------
+    heats : bool
+        Whether its output heats, so that it may not be left on without a watchdog and an interlock.
+    """
+
+    heats: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -374,3 +417,52 @@ class Actuator(Device):
         """Raise `LimitError` if `set` would not take `value`."""
         if not (math.isfinite(value) and value in self.limits):
             raise LimitError(self.name, f"set-point {value:g} {self.limits.unit} is outside of {self.limits}")
+
+
+@dataclass(frozen=True)
+class DeviceDescription:
+    """What can be known of a connected device without asking it again, also where another process holds it.
+
+    Attributes
+    ----------
+    name : str
+        Name in the rig.
+    kind : type
+        Its class.
+    identity : Identity
+        Which instrument it is.
+    signals : tuple of Signal
+        What it delivers.
+    setpoint_signal : Signal or None
+        What its set-point is; None of a device that takes none.
+    limits : Limits or None
+        The set-points that it takes.
+    watchdog : float or None
+        Silence of the host after which the instrument goes to its safe state by itself, s.
+    safe_within : float
+        Longest time that its safe state takes, s.
+    """
+
+    name: str
+    kind: type[Device]
+    identity: Identity
+    signals: tuple[Signal, ...]
+    setpoint_signal: Signal | None
+    limits: Limits | None
+    watchdog: float | None
+    safe_within: float
+
+    @classmethod
+    def of(cls, device: Device) -> DeviceDescription:
+        """Describe a connected device."""
+        actuator = device if isinstance(device, Actuator) else None
+        return cls(
+            name=device.name,
+            kind=type(device),
+            identity=device.identity,
+            signals=device.signals,
+            setpoint_signal=actuator.setpoint_signal if actuator else None,
+            limits=actuator.limits if actuator else None,
+            watchdog=device.watchdog,
+            safe_within=device.safe_within,
+        )

@@ -53,6 +53,10 @@ class DeviceConnectionError(DeviceError):
     """An instrument cannot be reached, or stopped answering."""
 
 
+class DeviceRestartedError(DeviceError):
+    """An instrument has restarted since it was connected: its settings are lost, and it has to be connected again."""
+
+
 class LimitError(DeviceError):
     """A set-point lies outside of the limits of the device; it was not sent."""
 
@@ -67,6 +71,12 @@ class SettleTimeoutError(BenchError):
     """A signal did not become steady within the time that the step allows."""
 
     exit_code = 6
+
+
+class GuardianError(BenchError):
+    """The process that holds the lines of the instruments was lost, or ended the run as its bench did not answer."""
+
+    exit_code = 7
 
 
 class AbortError(BenchError):

@@ -109,6 +109,46 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         """Maker, model, serial number and firmware, as the instrument reported on connecting."""
         return self._identity
 
+    @classmethod
+    def rescue(cls, name: str, settings: SettingsT, clock: Clock) -> None:
+        """Open the line of an instrument in any state, bring it into its safe state, and release the line.
+
+        Which instrument answers is not checked, and nothing is configured.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened.
+        DeviceError
+            If the safe state could not be confirmed, after everything was tried.
+        """
+        line = cls._open_line(name, settings, clock)
+        device = cls(name, settings, clock, line)
+        try:
+            device.safe()
+        finally:
+            device.close()
+
+    def reconnect(self) -> None:
+        """Open the line again after it was lost, and check that the instrument is as it was left.
+
+        Errors are those of `Device.reconnect`.
+        """
+        self._renew_line()
+        found = self._identify()
+        if (found.model, found.serial_number) != (self._identity.model, self._identity.serial_number):
+            raise DeviceError(self.name, f"is another instrument now: {found}; it was {self._identity}")
+        self._check_unchanged()
+
+    def _renew_line(self) -> None:
+        """Close the line, and open another to the same address."""
+        self._line.close()
+        self._line = self._open_line(self.name, self._settings, self._clock)
+
+    def _check_unchanged(self) -> None:
+        """Raise `DeviceError` unless the instrument is as the driver left it: not restarted, without an error."""
+        self.glance()
+
     def _check_range(self, text: str, value: float, limits: tuple[float, float], unit: str, advice: str) -> None:
         """Raise `DeviceError` if a value is outside of its limits; `text` and `advice` begin and end the message."""
         low, high = limits
@@ -131,6 +171,24 @@ class LineActuator(LineDevice[SettingsT, LineT], Actuator):
     def setpoint(self) -> float:
         """The set-point that was last sent, in the unit of `limits`; nan before the first."""
         return self._setpoint
+
+    def safe(self) -> None:
+        """Bring the device into its safe state, over a line of its own if the one in use is gone.
+
+        Raises DeviceError if the safe state could not be confirmed, after everything was tried.
+        """
+        try:
+            self._make_safe()
+        except DeviceConnectionError as failure:
+            try:
+                self._renew_line()
+            except DeviceError:
+                raise failure from None
+            self._make_safe()
+
+    @abstractmethod
+    def _make_safe(self) -> None:
+        """Try everything that makes the device safe; raise `DeviceError` if that is not confirmed."""
 
     def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:
         """Return the error for a part that may still be on, after everything was tried."""

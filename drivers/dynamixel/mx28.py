@@ -268,7 +268,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         self._write_goal(position)
         self._setpoint = self._position(position)
 
-    def safe(self) -> None:
+    def _make_safe(self) -> None:
         """Switch the torque off and see that it is off; an expired watchdog is cleared.
 
         If the servo refuses or still reports its torque on, its output is set to zero and it is rebooted,

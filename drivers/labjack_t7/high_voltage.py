@@ -193,7 +193,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
             rows.append(self._line.play(spans, self._register, sent[first : first + most], wait))
         return sensor.converted(np.concatenate(rows))
 
-    def safe(self) -> None:
+    def _make_safe(self) -> None:
         """Send 0 V, switch the enable line off, and see that the amplifier is off and its output at 0 V."""
         self._setpoint = 0.0
         self._switch_off()

@@ -232,7 +232,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._write(_LIVE_TARGET, present)
         self._setpoint = present
 
-    def safe(self) -> None:
+    def _make_safe(self) -> None:
         """Switch the output stage off in every possible way, and see that it is off.
 
         Live enable and output stage enable are both switched off; if either fails, or the device still

@@ -215,7 +215,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             self._keep(power, battery)
             return {self._voltage_name: self._voltage(power, battery), self._current_name: current}
 
-    def safe(self) -> None:
+    def _make_safe(self) -> None:
         """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
         with self._lock:
             self._order += 1
