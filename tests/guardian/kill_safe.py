@@ -3,7 +3,8 @@
     python tests/guardian/kill_safe.py [--rig RIG]... [--trial NAME]... [--times N] [--busy N]
 
 prints a table: for each rig and trial, how often every output became safe within its declared time, and the median
-and longest time it took. The instruments are served by `bench emulate` in another process; the bench runs as on hardware.
+and longest time it took. The instruments are served by `bench emulate` in another process, and the bench runs as on
+hardware.
 """
 
 from __future__ import annotations
