@@ -106,11 +106,10 @@ class World:
                     due, first = instant, timed
             if first is None or due > target:
                 break
-            self._advance_plant(max(due, self._time))
+            if due > self._time:
+                self._plant.advance(due - self._time)
+                self._time = due
             first.expire()
-        self._advance_plant(target)
-
-    def _advance_plant(self, instant: float) -> None:
-        if instant > self._time:
-            self._plant.advance(instant - self._time)
-            self._time = instant
+        if target > self._time:
+            self._plant.advance(target - self._time)
+            self._time = target
