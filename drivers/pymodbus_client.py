@@ -131,7 +131,7 @@ class _BlockingClient(ModbusSerialClient):
         super().__init__(
             settings.port, baudrate=settings.baudrate, parity=parity, timeout=settings.timeout, retries=0
         )
-        self.socket: Any = open_port(device, settings, parity=parity, exclusive=True)
+        self.socket: Any = open_port(device, settings, parity=parity)
         self._received = 0
 
     def connect(self) -> bool:
