@@ -272,7 +272,9 @@ class _Line:
             self.lost = True
             raise lost_line(self._name, self._settings, error, ", then connect again") from error
         if isinstance(problem, UnexpectedReplyError):
-            raise DeviceError(self._name, f"{problem}; check that no other master is on the line") from problem
+            raise DeviceConnectionError(
+                self._name, f"{problem}; check that no other master is on the line"
+            ) from problem
         settings = self._settings
         raise no_answer(
             self._name,
