@@ -42,6 +42,7 @@ class TextLine:
         self._clock = clock
         self._free_at = clock.now()
         self._in_step = True
+        self._end, self._encoding, self._delay = settings.write_terminator, settings.encoding, settings.delay
         self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
 
     def close(self) -> None:
@@ -51,14 +52,14 @@ class TextLine:
     def tell(self, message: str) -> None:
         """Send a message that has no answer."""
         self._clock.sleep_until(self._free_at)
-        text = f"{message}{self._settings.write_terminator}"
         try:
-            self._transport.write(text.encode(self._settings.encoding))
+            self._transport.write(f"{message}{self._end}".encode(self._encoding))
         except UnicodeEncodeError as error:
             raise DeviceError(
                 self._device, f"{message!r} cannot be written in {self._settings.encoding}: {error}"
             ) from None
-        self._free_at = self._clock.now() + self._settings.delay
+        if self._delay:
+            self._free_at = self._clock.now() + self._delay
 
     def ask(self, question: str, form: Template) -> tuple[str, dict[str, float]]:
         """Return the answer to a question, and the numbers in it by name.
@@ -122,7 +123,7 @@ class TextLine:
 
     def _receive(self) -> str | None:
         answer = self._transport.read()
-        return None if answer is None else answer.decode(self._settings.encoding, "backslashreplace").strip()
+        return None if answer is None else answer.decode(self._encoding, "backslashreplace").strip()
 
     def _catch_up(self) -> bool:
         """Return whether the line is in step again, so that no late answer can come any more."""
