@@ -31,7 +31,6 @@ AttachOption = Annotated[
 
 
 @app.command()
-@show_compilation()
 def safe(
     rig: RigArgument,
     force: Annotated[

@@ -96,11 +96,17 @@ class TestSafe:
         after = rig.control.state()
         assert {output: after[output] for output in outputs} == dict.fromkeys(outputs, 0.0)
 
-    def test_of_an_instrument_in_error(self, bench, served):
-        rig = served("vo2")
-        rig.control.fault("tec-over-current")
+    @pytest.mark.slow
+    def test_beside_an_instrument_in_error(self, bench, served):
+        rig = served("hybrid")
+        with client(rig, "tec=0.1", "piezo=20"):
+            rig.control.fault("tec-over-current")
+        assert rig.control.state()["amplifier_enable"] == 1.0
         code, _, err = bench("safe", *attached(rig))
         assert (code, err) == (0, "")
+        state = rig.control.state()
+        assert (state["amplifier_enable"], state["tec_output"]) == (0.0, 0.0)
+        # It stays in its error until that is cleared.
         assert bench("recover", *attached(rig), "--yes")[0] == 0
 
     @pytest.mark.slow
