@@ -71,14 +71,14 @@ class Holder:
     since: str
 
     @classmethod
-    def of_this_process(cls, rig: str, doing: str) -> Holder:
-        """Return what is known of this process."""
+    def of_this_process(cls, rig: str, doing: str, process: int | None = None) -> Holder:
+        """Return what is known of this process; `process` is another one for which it holds the rig."""
         try:
             user = getpass.getuser()
         except (OSError, KeyError):
             user = "unknown"
         since = wall_time().astimezone().isoformat(sep=" ", timespec="seconds")
-        return cls(rig, doing, user, platform.node(), os.getpid(), since)
+        return cls(rig, doing, user, platform.node(), process or os.getpid(), since)
 
     def __str__(self) -> str:
         """Return who it is, on one line."""

@@ -10,7 +10,7 @@ from functools import partial
 
 from bench.binding import RoleTable, reading_of
 from bench.clock import Clock
-from bench.devices import Actuator, Device, Finding, Limits, Status
+from bench.devices import Actuator, Device, DeviceDescription, Finding, Limits, Status
 from bench.errors import BenchError, DeviceConnectionError, DeviceError
 from bench.rig_file import RigFile
 from bench.safety import SAFE, make_safe
@@ -196,10 +196,16 @@ def _typical_noise(signal: str, roles: Mapping[str, RoleTable], devices: Mapping
             continue
         watched = role.reset.signal or role.signal or role.reading
         if not watched and role.device in devices:
-            watched = reading_of(role, devices)
+            watched = _reading(role, devices)
         if watched == signal:
             return role.reset.noise
     return None
+
+
+def _reading(role: RoleTable, devices: Mapping[str, Device]) -> str:
+    """Return the signal of a role whose device, if it has one, is connected."""
+    known = {role.device: DeviceDescription.of(devices[role.device])} if role.device else {}
+    return reading_of(role, known)
 
 
 def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[Finding]:
@@ -287,7 +293,7 @@ def _exercise(
     """Set an actuator near its rest, see that its reading follows, and make it safe again."""
     device = devices[name]
     assert isinstance(device, Actuator)
-    signal = reading_of(role, devices)
+    signal = _reading(role, devices)
     source = next((each for each in devices.values() if signal in (s.name for s in each.signals)), None)
     if source is None:
         return [Finding("exercise", f"{signal} cannot be read, so {name} was not moved", "connect its device")]

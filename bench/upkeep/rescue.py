@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 import threading
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from bench.clock import Clock, Stopwatch
 from bench.devices import Actuator
@@ -14,6 +21,9 @@ from bench.upkeep.opening import Workplace
 
 LONGEST = 3.0
 """Wall-clock time (s) that all lines together are given."""
+
+_LONGEST_RESCUE = 30.0
+"""Wall-clock time (s) for a process of its own that does it, its start included."""
 
 MEASURES_ONLY = "measures only"
 """State of a device without an output that could not be reached."""
@@ -65,6 +75,50 @@ def rescue(place: Workplace) -> list[Rescued]:
     # What is still under way may add to it.
     found = dict(states)
     return [_judged(entry, found.get(entry.name, f"not confirmed within {LONGEST:g} s")) for entry in place.entries]
+
+
+def rescue_by_another_process(
+    rig: str, overrides: Mapping[str, str], endpoints: Path | None, devices: Iterable[str]
+) -> dict[str, str]:
+    """Make the devices of a rig safe by `bench safe --force`, for a process that opens no line itself.
+
+    Parameters
+    ----------
+    rig, overrides, endpoints
+        As for `bench.upkeep.opening.opened`.
+    devices : iterable of str
+        Names of the devices of the rig.
+
+    Returns
+    -------
+    dict of str to str
+        By device name: `safe`, or what went wrong; the same of all if the process itself failed.
+    """
+    with TemporaryDirectory(prefix="bench-safe-") as folder:
+        result = Path(folder) / "result.json"
+        command = [sys.executable, "-P", "-m", "bench", "safe", rig, "--force", "--json", str(result)]
+        command += [f"--override={key}={value}" for key, value in overrides.items()]
+        command += [] if endpoints is None else ["--attach", str(endpoints)]
+        # The modules of the rig have to be found as here.
+        path = os.pathsep.join(entry for entry in sys.path if entry)
+        try:
+            ended = subprocess.run(  # noqa: S603 - this interpreter
+                command,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                env={**os.environ, "PYTHONPATH": path},
+                start_new_session=True,
+                timeout=_LONGEST_RESCUE,
+                check=False,
+            )
+            if not result.exists():
+                reason = f"`bench safe` ended with exit code {ended.returncode}: {ended.stderr.strip()}"
+                return dict.fromkeys(devices, reason)
+            content = json.loads(result.read_text(encoding="utf-8"))
+        except (OSError, ValueError, subprocess.SubprocessError) as error:
+            return dict.fromkeys(devices, f"`bench safe` failed: {error}")
+    return {name: SAFE if each["is_safe"] else each["state"] for name, each in content.items()}
 
 
 def _rescue_line(entries: list[DeviceEntry], clock: Clock, states: dict[str, str]) -> None:

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from bench.clock import Stopwatch
+from bench.upkeep.rescue import rescue_by_another_process
 from sim_devices.serving.process import serve
 
 CLIENT = """
@@ -134,6 +135,19 @@ class TestSafe:
 
     def test_an_emulated_rig_in_process(self, bench):
         assert bench("safe", "hybrid")[0] == 0
+
+    @pytest.mark.slow
+    def test_by_a_process_of_its_own_for_one_that_opens_no_line(self, served):
+        rig = served("hybrid")
+        with client(rig, "tec=0.1", "piezo=20"):
+            names = ["tec", "displacement", "base", "tip", "piezo"]
+            states = rescue_by_another_process(rig.name, {}, rig.endpoints_file, names)
+            assert rig.control.state()["amplifier_enable"] == 0.0
+        assert states["piezo"] == "safe"
+        assert list(states) == names
+        failed = rescue_by_another_process("nowhere", {}, None, ["tec"])
+        assert list(failed) == ["tec"]
+        assert "there is no rig 'nowhere'" in failed["tec"]
 
 
 class TestOneBench:
