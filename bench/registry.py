@@ -156,15 +156,19 @@ def check_import(module: str) -> None:
     top = module.partition(".")[0]
     if not top or module in sys.modules or top in ("bench", *_OWN_FOLDERS):
         return
-    parts = (entry for group in GROUPS for entry in entries(group).values())
-    if top in {entry.reference.partition(":")[0].partition(".")[0] for entry in parts}:
-        return
-    spec = importlib.util.find_spec(top)
+    try:
+        spec = importlib.util.find_spec(top)
+    except ValueError:
+        # What runs as a script has none.
+        spec = None
     # Without one there is nothing to import, and the import says so.
     if spec is None:
         return
     places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))]
-    if places and any(Path(places[0]).resolve().parent == folder for folder in _beside):
+    if places and Path(places[0]).resolve().parent in _beside:
+        return
+    parts = (entry for group in GROUPS for entry in entries(group).values())
+    if top in {entry.reference.partition(":")[0].partition(".")[0] for entry in parts}:
         return
     where = places[0] if places else spec.origin
     raise ConfigurationError(
