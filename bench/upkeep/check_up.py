@@ -161,7 +161,7 @@ def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list
             if noise > _MUCH_NOISE * typical:
                 advice = "look for a loose cable, a ground loop, or a load that is not at rest"
         for lock in place.file.interlocks:
-            if lock.signal == signal.name and not lock.low <= value <= lock.high:
+            if lock.signal == signal.name and not lock.minus and not lock.low <= value <= lock.high:
                 text += f"; outside of its interlock, {lock.low:g} to {lock.high:g} {signal.unit}"
                 advice = "bring it into the range of its interlock before a run"
         findings.append(Finding(signal.name, text, advice))
