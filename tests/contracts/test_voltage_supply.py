@@ -58,7 +58,7 @@ class LosingServer(WireServer):
         self.lose_next = b""
 
     def receive(self, data):
-        if self.lose_next and data.startswith(self.lose_next):
+        if self.lose_next and self.lose_next in data:
             self.lose_next = b""
             return b"z\r"
         return self.server.receive(data)
@@ -621,17 +621,6 @@ def test_heartbeat_that_stays_away_is_told(bench):
     bench.device.safe()
     assert bench.plant.voltage == 0.0
     assert bench.instrument.read_object(0x2112) == 0
-
-
-@over_the_wire
-def test_restart_of_the_device_is_told_once(bench):
-    bench.device.set(6.0)
-    bench.instrument.power_cycle()
-    with pytest.raises(DeviceError, match="supply: the device has restarted"):
-        bench.device.measure()
-    assert bench.device.setpoint == 0.0
-    assert bench.device.measure()["supply_voltage"] == 0.0
-    bench.device.set(5.0).wait()
 
 
 @over_the_wire
