@@ -5,8 +5,8 @@ Source: Roboteq CANBus Networking Manual V2.0 (PDO mapping and transmission type
 slcan lines carry no check sum, so a damaged digit looks like a value. Each value comes twice therefore: applied
 power, battery voltage, current and fault flags in the TPDOs 1 and 3, channel flags in 2 and 4. TPDO 4 has the command
 that the controller obeys as well. TPDO 2 has the mark: user variable 16, into which the host writes another number
-after each reading. So process data of an earlier SYNC, late or doubled, are never taken for those of the present one, and a
-controller that has restarted is known by its mark of 0. Scripts of the controller must not use that variable.
+after each reading. So process data of an earlier SYNC, late or doubled, are never taken for those of the present one,
+and a controller that has restarted is known by its mark of 0. Scripts of the controller must not use that variable.
 
 The configuration lies in RAM. TPDOs that were set up for other listeners are taken over.
 """
@@ -152,7 +152,8 @@ class ProcessData:
                 if agreed is not None and obeyed is not None and (expected or odd):
                     report = _decoded(_REPORT, agreed)
                     if report is not None:
-                        return Report(*report, obeyed[0])
+                        power, battery, current, faults, flags = report
+                        return Report(power, battery, current, faults, flags, obeyed[0])
                 odd = odd or (obeyed is not None and not expected)
                 seen |= {first, second}
             elif may_write():

@@ -29,7 +29,9 @@ def line(identifier, data):
 class Script(WireServer):
     """An adapter and a node of a few lines: objects, what was received, and answers put into its mouth.
 
-    It refuses to configure process data. `objects` holds (value, size) by index and subindex; `instead`, request by request, lines to send in place
+    It refuses to configure process data.
+
+    `objects` holds (value, size) by index and subindex; `instead`, request by request, lines to send in place
     of the right one (None for the right one); `aborts` abort codes by index and subindex.
     """
 
