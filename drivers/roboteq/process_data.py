@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import struct
 from binascii import unhexlify
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from bench.errors import DeviceConnectionError, DeviceError
@@ -134,7 +135,7 @@ class ProcessData:
         DeviceError
             If no two of them agree.
         """
-        seen: set[bytes] = set()
+        seen: list[bytes] = []
         odd = False
         before = b""
         for number in range(_MOST_READINGS):
@@ -148,14 +149,14 @@ class ProcessData:
                 first, second = found[0] + found[1][:8], found[2] + found[3][:8]
                 obeyed = _decoded(_COMMAND, found[3][8:])
                 expected = obeyed is not None and abs(obeyed[0] - command) <= 1
-                agreed = first if first == second or first in seen else second if second in seen else None
+                agreed = first if first == second and not seen else _most_frequent([*seen, first, second])
                 if agreed is not None and obeyed is not None and (expected or odd):
                     report = _decoded(_REPORT, agreed)
                     if report is not None:
                         power, battery, current, faults, flags = report
                         return Report(power, battery, current, faults, flags, obeyed[0])
                 odd = odd or (obeyed is not None and not expected)
-                seen |= {first, second}
+                seen += [first, second]
             elif may_write():
                 before = self.next_mark()
         if seen:
@@ -176,6 +177,12 @@ class ProcessData:
         line.write(Entry(mapping, "number of mapped objects", 1), len(objects), 0)
         line.write(Entry(parameters, "transmission type of a PDO", 1), kind, 2)
         line.write(cob_id, identifier + self._node, 1)
+
+
+def _most_frequent(copies: Sequence[bytes]) -> bytes | None:
+    """Return what has come twice at least, and more often than anything else; None if there is no such thing."""
+    (copy, count), *others = Counter(copies).most_common(2)
+    return copy if count > 1 and not (others and others[0][1] == count) else None
 
 
 def _decoded(form: struct.Struct, digits: bytes) -> tuple[int, ...] | None:

@@ -411,13 +411,11 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         self._refuse_other(report)
         # The last digit flickers; following it would make the voltage flicker.
         battery = report.battery / 10
-        if abs(battery - self._battery) > 1.5 * _LAST_DIGIT:
-            command = self._command_for(self._setpoint, battery)
-            self._battery = battery
-        else:
-            command = self._command
-        if not self._send(command):
+        follow = abs(battery - self._battery) > 1.5 * _LAST_DIGIT
+        if not self._send(self._command_for(self._setpoint, battery) if follow else self._command):
             raise self._dropped()
+        if follow:
+            self._battery = battery
 
     def _refuse_other(self, report: Report) -> None:
         """Raise if the device obeyed the present command and obeys another one now."""
@@ -569,6 +567,10 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             self._write(_COMMAND, command, self._settings.channel, before=end, after=mark)
         except MissedError:
             return False
+        except DeviceConnectionError:
+            # It may have arrived.
+            self._obeyed = False
+            raise
         if self._clock.now() >= end:
             return False
         if command != self._command:
