@@ -24,9 +24,16 @@ A rig file is TOML::
     expression = "2 * spot_position / length ** 2"
     ...
 
-    [[interlocks]]                                 # the run ends in the safe state outside of these
-    signal = "plate_sink_temperature"
+    [[interlocks]]                                 # the run ends in the safe state outside of these; what else
+    signal = "plate_sink_temperature"              # an interlock can watch and do is in `bench.interlocks`
     high = 60.0
+
+    [safety]                                       # on hardware; these are the defaults
+    rate = 5.0                                     # Hz, at which interlocks are looked at
+    reconnect = 10.0                               # s for which a line may be lost
+    patience = 10.0                                # s for which a protocol may compute
+    order = []                                     # devices in the order of their safe state
+    unattended = true                              # false: an operator stays with the rig
 
     [telemetry]
     period = 1.0                                   # s between two quick readings during holds
@@ -52,7 +59,7 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -66,8 +73,8 @@ from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
+from bench.interlocks import Interlock
 from bench.layout import DashboardLayout
-from bench.safety import Interlock
 
 
 class _Table(BaseModel):
@@ -87,6 +94,30 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
+class SafetyTable(_Table):
+    """The table `[safety]`: how a rig is guarded while a run goes on."""
+
+    rate: float = Field(
+        default=5.0,
+        ge=0.1,
+        le=50,
+        description="looks at the interlocks of hardware, of their own, Hz",
+    )
+    reconnect: float = Field(
+        default=10.0, ge=0, le=600, description="how long a line may be lost before the run ends, s; 0 for not at all"
+    )
+    patience: float = Field(
+        default=10.0, gt=0, le=600, description="how long a protocol may compute between two of its messages, s"
+    )
+    order: tuple[str, ...] = Field(
+        default=(), description="devices that are brought into their safe state one after another, in this order"
+    )
+    unattended: bool = Field(
+        default=True,
+        description="whether no operator is present, so that a device that heats needs a watchdog and an interlock",
+    )
+
+
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
@@ -95,6 +126,7 @@ class _RigFileContent(_Table):
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
+    safety: SafetyTable = SafetyTable()
     dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
@@ -179,6 +211,7 @@ class RigFile:
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
+    safety: SafetyTable
     dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
@@ -193,6 +226,10 @@ class RigFile:
         """Whether every device is emulated in this process, so that time can stand while the process computes."""
         ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
         return self.emulated and all(port.startswith("emulated://") for port in ports)
+
+    def served_by(self, laboratory: Any) -> RigFile:  # noqa: ANN401 - without Settings
+        """Return the same rig with a `Laboratory` that is open already in place of its own."""
+        return replace(self, laboratory=lambda *_: laboratory)
 
 
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
@@ -311,6 +348,9 @@ def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # no
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     *parents, last = key.split(".")
+    if parents in (["telemetry"], ["safety"]):
+        # Tables with defaults for every key, which a file may leave out.
+        content.setdefault(parents[0], {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
@@ -331,6 +371,11 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         loaded = _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
         if loaded is not None:
             entries.append(DeviceEntry(device, *loaded))
+    for i, device in enumerate(order := tables.safety.order):
+        if device not in tables.devices or device in order[:i]:
+            found.append(
+                f"safety.order: {device!r}: expected devices, each once; there are: {', '.join(tables.devices)}"
+            )
     derived: dict[str, DerivedSignal] = {}
     for name, table in tables.derived.items():
         key = f"derived.{name}."
@@ -365,6 +410,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         derived=derived,
         interlocks=tables.interlocks,
         telemetry=tables.telemetry,
+        safety=tables.safety,
         dashboard=tables.dashboard,
         laboratory=laboratory,
         laboratory_settings=settings,

@@ -186,7 +186,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             try:
                 self._received += self._receive(sent)
             except (FramingError, ConnectionError) as error:
-                raise SerialException(f"{_SCHEME}{self._name} ended the connection: {error}") from None
+                raise self._ended(error) from None
             return len(sent)
         self._clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
         self._hear()
@@ -194,6 +194,19 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
+
+    def exchange(self, data: bytes) -> bytes:
+        """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
+        if self._line is None and self.is_open and self._socket.taken and not self._received:
+            try:
+                return self._receive(data)
+            except (FramingError, ConnectionError) as error:
+                raise self._ended(error) from None
+        self.write(data)
+        return self.read_all()
+
+    def _ended(self, error: Exception) -> SerialException:
+        return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")
 
     def flush(self) -> None:
         """Do nothing: what was written has arrived."""

@@ -133,14 +133,11 @@ class Frame:
     ----------
     drum : EmulatedDrum or None
         The stage's drum, once it is there.
-    t7 : EmulatedT7 or None
-        The instrument that switches the fan, once it is there.
     """
 
     def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
-        self.t7: EmulatedT7 | None = None
         self._fastened = False
 
     def apply(self, voltage: float) -> None:
@@ -163,8 +160,6 @@ class Frame:
 
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds, with the end following the stage."""
-        if self.t7 is not None:
-            self.muscle.blow(self.t7.dio_level(FAN_LINE))
         if self._fastened and self.drum is not None:
             # A servo on its way is due every 20 ms, so that the world advances in pieces as short as that.
             reach = self.muscle.parameters.reach
@@ -226,7 +221,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
         self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
-        self.frame.t7 = self.t7
+        self.t7.add_follower(lambda: self.muscle.blow(self.t7.dio_level(FAN_LINE)))
         self.instruments = {"t7": self.t7, "supply": self.supply, "load_cell": self.load_cell, "stage": self.servo}
         self.faults = self._faults()
         if settings.fault != "none":
