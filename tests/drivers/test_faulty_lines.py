@@ -170,7 +170,7 @@ def count_servo(faults, share, seed=0, calls=CALLS):
             clock.sleep(rng.uniform(0.0, 0.5))
             instrument.write_item(116, rng.randrange(-5000, 5000))
             # Each motion is over by then.
-            clock.sleep(2.5)
+            clock.sleep(4.0)
             servo._goal = instrument.read_item(116)
             goal = rng.uniform(-9.0, 9.0) if rng.random() < 0.2 else None
             try:
