@@ -129,7 +129,7 @@ def test_round_trips_beside_the_stock_client(terminal, capsys):
 
 @pytest.mark.benchmark
 def test_cpu_in_process_beside_the_stock_client(capsys):
-    """A glance is a SYNC, its process data and a command; the stock client reads its frames in a thread of its own."""
+    """A glance is a SYNC, process data and a command; the stock client reads its frames in a thread of its own."""
     canopen = pytest.importorskip("canopen")
     clock = VirtualClock()
     device = EmulatedRoboteq("supply", World(Nothing(), clock), Nothing(), watchdog=0.0)
