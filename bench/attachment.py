@@ -233,6 +233,11 @@ class AttachedClock(Clock):
             control.close()
 
     @property
+    def is_alone(self) -> bool:
+        """Whether the server is gone, and its instruments with it."""
+        return self._alone is not None
+
+    @property
     def _control(self) -> ControlClient:
         control: ControlClient | None = getattr(self._of_thread, "control", None)
         if control is None:

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from bench.attachment import AttachedClock, attach
 from bench.binding import Slots
-from bench.clock import Stopwatch, wall_time
+from bench.clock import Clock, Stopwatch, wall_time
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
@@ -33,7 +33,7 @@ from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, clock_for
-from bench.rig_file import load_rig
+from bench.rig_file import RigFile, load_rig
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -134,13 +134,6 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     """
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
-    if run.attach is None:
-        clock = clock_for(rig_file, run.clock)
-    elif not rig_file.emulated:
-        raise ConfigurationError(f"rig {rig_file.name} has no emulated laboratory that could be served elsewhere")
-    else:
-        attachment = attach(run.attach, rig_file.name)
-        clock = attachment.clock
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
@@ -149,6 +142,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     guardian: RemoteStation | None = None
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
+        clock = _clock(run, rig_file, stack)
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
         clock.interrupted = interrupts.abort_requested
@@ -204,6 +198,16 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _clock(run: Run, file: RigFile, stack: ExitStack) -> Clock:
+    if run.attach is None:
+        return clock_for(file, run.clock)
+    if not file.emulated:
+        raise ConfigurationError(f"rig {file.name} has no emulated laboratory that could be served elsewhere")
+    attachment = attach(run.attach, file.name)
+    stack.callback(attachment.close)
+    return attachment.clock
 
 
 def _leave(reason: str, station: Station | None = None, journal: Path | None = None) -> None:

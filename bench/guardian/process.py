@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.attachment import AttachedClock
 from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
 from bench.errors import BenchError, ConfigurationError, GuardianError
@@ -167,10 +168,16 @@ class Guardian:
     def _is_over(self) -> bool:
         if self._ending is None or self._safe is None or self._pending:
             return False
-        all_safe = not self._unsafe
-        return (all_safe and (self._reported or not self._bench_is_there)) or (
-            not self._bench_is_there and self._wall.now() - self._ending > _TRY_FOR
-        )
+        if self._bench_is_there:
+            return not self._unsafe and self._reported
+        return not self._unsafe or self._is_in_vain()
+
+    def _is_in_vain(self) -> bool:
+        """Return whether it is of no use to try again: after 10 min, or as the emulated laboratory is gone."""
+        assert self._ending is not None
+        clock = self._rig.clock
+        gone = isinstance(clock, AttachedClock) and clock.is_alone
+        return gone or self._wall.now() - self._ending > _TRY_FOR
 
     # The bench
 

@@ -53,6 +53,7 @@ from sim_devices.instruments.dynamixel_table import (
     FULL_PWM,
     GOALS,
     HIGHEST_GOAL,
+    INDIRECT_ADDRESSES,
     ITEMS,
     POSITION,
     PWM,
@@ -555,6 +556,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
                 self._command()
         elif address in GOALS:
             self._command()
+        elif address in INDIRECT_ADDRESSES:
+            self._table.forget()
         if address in (64, 98):
             self._feed()
 
@@ -572,6 +575,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._values |= {address: item.default for address, item in ITEMS.items() if not item.in_eeprom}
         self._values |= self._saved
         self._values[100] = self._values[36]
+        self._table.forget()
         self._hardware_error = HardwareError(0)
         self._registered = None
         self._switch_off()
