@@ -25,6 +25,7 @@ from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import ConfigurationError
 from bench.extras import MissingExtraError, needed_for
+from bench.faults import read_schedule, schedule_faults
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
@@ -66,6 +67,8 @@ class Run:
         Whether to write the .rrd beside the journal while the run goes on.
     attach : Path, optional
         Endpoints file of `bench emulate`: the emulated laboratory is served there, on its own clock and seed.
+    faults : Path, optional
+        Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
     """
 
     protocol: ProtocolDefinition
@@ -78,6 +81,7 @@ class Run:
     live: bool = False
     recording: bool = True
     attach: Path | None = None
+    faults: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -127,12 +131,15 @@ def carry_out(run: Run, console: Console) -> RunResult:
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
+    faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     with ExitStack() as stack:
         rig = Rig(rig_file, clock, run.seed)
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(rig.close)
+        if run.faults is not None:
+            schedule_faults(rig.laboratory, faults, run.faults)
         slots = rig.slots(run.protocol)
         expected = plan(run.protocol, parameters, slots)
         check_before_moving(rig, run.protocol, expected)

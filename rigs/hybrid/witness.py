@@ -7,6 +7,7 @@ the deflection in m, a 64-bit floating-point number, highest word first.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import ClassVar
 
 from pydantic import Field
@@ -18,7 +19,6 @@ from bench.roles import PositionSensor
 from drivers.device import LineDevice
 from drivers.modbus import RefusedError
 from drivers.modbus_tcp import Connection, share
-from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.wire.modbus import ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
 
@@ -29,16 +29,16 @@ _WORDS = struct.Struct(">4H")
 class WitnessRegisters:
     """The registers of the witness; a `sim_devices.wire.modbus.RegisterBank`."""
 
-    def __init__(self, world: World, plant: HybridCantilever) -> None:
+    def __init__(self, world: World, deflection: Callable[[], float]) -> None:
         self._world = world
-        self._plant = plant
+        self._deflection = deflection
 
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return the words of the deflection; raise `RegisterError` for any other registers."""
         if (address, count) != (0, 4):
             raise RegisterError(ILLEGAL_ADDRESS, "the witness has the registers 0 to 3, to be read at once")
         with self._world.at_present():
-            return list(_WORDS.unpack(_VALUE.pack(self._plant.deflection)))
+            return list(_WORDS.unpack(_VALUE.pack(self._deflection())))
 
     def write_registers(self, address: int, values: list[int]) -> None:  # noqa: ARG002
         """Raise `RegisterError`: nothing can be written."""

@@ -212,6 +212,16 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
             self._settle()
             self._peak = self._gross
 
+    def freeze(self) -> None:
+        """Let the converter stand still, and with it everything that is read."""
+        with self.world.at_present():
+            self.frozen = True
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        with self.world.at_present():
+            self.frozen = False
+
     # The conversion.
 
     def deadline(self) -> float:

@@ -33,7 +33,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -207,6 +207,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._sources = dict(inputs)
         self._normals = normals(rng)
         self._service = Service(self._begin, self._end)
+        self._converter = self._convert
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
@@ -243,6 +244,14 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for follow in self._restart_followers:
                 follow()
             self._lead()
+
+    def freeze(self) -> None:
+        """Let each input stand at its next reading."""
+        self._converter = cache(self._convert)
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._converter = self._convert
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -407,7 +416,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             return self._reading(channel)
 
     def _reading(self, channel: int) -> float:
-        return self._convert(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
+        return self._converter(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -426,7 +435,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for sample in range(1, settings.samples + 1):
                 self.world.clock.sleep_until(begin + sample / settings.scan_rate)
                 self.world.advance()
-                readings.append(self._convert(channel, self._stream_index or _DEFAULT_STREAM_INDEX))
+                readings.append(self._converter(channel, self._stream_index or _DEFAULT_STREAM_INDEX))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 

@@ -181,7 +181,9 @@ def test_help_names_everything(vo2):
     assert set(found["requests"]) == set(REQUESTS)
     assert all(each["does"] for each in found["requests"].values())
     assert found["rigs"]["vo2"]["instruments"] == ["psd", "tec"]
-    assert found["rigs"]["vo2"]["faults"]["displaced-spot"]["values"] == {"metres": 20e-6}
+    metres = found["rigs"]["vo2"]["faults"]["displaced-spot"]["values"]["metres"]
+    assert (metres["default"], metres["unit"]) == (20e-6, "m")
+    assert metres["low"] < 0.0 < metres["high"]
 
 
 def test_control_clients_do_not_disturb_each_other(vo2):
