@@ -40,9 +40,7 @@ def test_a_wrong_value_is_found_out(matrix, monkeypatch):
     cell = matrix.run_cell("hybrid", "base.drifting", 1)
     assert cell.status == "completed"
     assert cell.results["true"] == "ok"
-    monkeypatch.setattr(
-        matrix, "entry", lambda name, fault, seed: {"at": 5.0, "fault": name, "values": {"slope": 0.1}}
-    )
+    monkeypatch.setattr(matrix, "entry", lambda name, *_: {"at": 5.0, "fault": name, "values": {"slope": 0.1}})
     cell = matrix.run_cell("hybrid", "base.drifting", 1)
     assert cell.failures == ["true"]
     assert cell.results["true"].startswith("base_temperature = ")

@@ -1,5 +1,6 @@
 """Faults of lines, instruments, sensors and plants, in process on the virtual clock."""
 
+import json
 import math
 
 import pytest
@@ -482,6 +483,34 @@ def test_a_wrong_file_of_faults_is_one_message(tmp_path, name, text, words):
 def test_a_file_of_faults_that_is_not_there_is_one_message(tmp_path):
     with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
         read_schedule(tmp_path / "none.toml")
+
+
+def test_a_run_with_a_schedule_fails_at_its_instant_and_ends_safe(bench, tmp_path):
+    (tmp_path / "faults.toml").write_text("[[fault]]\nat = 12.5\nfault = 'tec-over-current'\n")
+    code, out, err = bench(
+        "run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=20", "--out", tmp_path / "runs",
+        "--faults", tmp_path / "faults.toml", "--json", tmp_path / "result.json",
+    )  # fmt: skip
+    assert code == 4
+    assert "failed: " in out
+    assert "error: tec: " in err
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["is_safe"]
+    assert 12.5 < result["laboratory_seconds"] < 16.0
+
+
+def test_a_wrong_schedule_is_one_message_before_anything_moves(bench, tmp_path):
+    (tmp_path / "faults.toml").write_text("[[fault]]\nat = 12.5\nfault = 'tec.melt'\n")
+    code, out, err = bench(
+        "run", "creep", "--rig", "vo2", "--clock", "virtual", "--out", tmp_path / "runs",
+        "--faults", tmp_path / "faults.toml",
+    )  # fmt: skip
+    assert (code, out) == (2, "")
+    assert (
+        "fault 1 of the schedule: the VO2 laboratory has no fault 'tec.melt'; it has: tec-over-current"
+        in " ".join(err.split())
+    )
+    assert not (tmp_path / "runs").exists()
 
 
 LABORATORIES = {rig: make(rig) for rig in RIGS}
