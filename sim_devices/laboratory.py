@@ -157,7 +157,7 @@ class EmulatedLaboratory:
             If there is no such fault, or it does not take these values or a duration.
         """
         chosen = self._fault(fault).chosen(fault, values or {}, duration)
-        self.catch_up()
+        self._present()
         self._begin(fault, chosen, duration)
 
     def end(self, fault: str) -> None:
@@ -165,18 +165,18 @@ class EmulatedLaboratory:
 
         Raises ConfigurationError if there is no such fault.
         """
-        known = self._fault(fault)
+        known, now = self._fault(fault), self._present()
         if fault not in self._ends:
             return
         self._ends.pop(fault)()
         values = {"disturbed": float(known.disturbed())} if isinstance(known, AnswerFault) else {}
         if known.undo is not None:
             known.undo()
-        self.events.append(FaultEvent(self._now(), fault, "ends", values))
+        self.events.append(FaultEvent(now, fault, "ends", values))
 
     def mend(self, instrument: str) -> None:
         """End all faults of the line of an instrument."""
-        self.catch_up()
+        self._present()
         for fault in [each for each in self._ends if each in self.lines[instrument].faults()]:
             self.end(fault)
 
@@ -191,10 +191,9 @@ class EmulatedLaboratory:
                 self._fault(each.fault).chosen(each.fault, each.values, each.duration)
             except ConfigurationError as error:
                 raise ConfigurationError(f"fault {number} of the schedule: {error}") from None
-        self.catch_up()
         for line in self.lines.values():
             line.is_watched = True
-        begun = self._now()
+        begun = self._present()
         for number, each in enumerate(faults):
             if each.at is not None:
                 self.at(begun + each.at, partial(self._happen, each))
@@ -230,9 +229,12 @@ class EmulatedLaboratory:
             raise ConfigurationError(f"the {self._title} has no fault {name!r}; it has: {known}")
         return self.faults[name]
 
-    def _now(self) -> float:
-        """Return where the world stands: within what is due, at that instant."""
-        return self._clock.now() if self.world is None else self.world.time
+    def _present(self) -> float:
+        """Bring the world to the present and return the time, s; within what is due, that is its instant."""
+        if self.world is None:
+            return self._clock.now()
+        self.world.advance()
+        return self.world.time
 
     def _happen(self, each: ScheduledFault) -> None:
         self._begin(each.fault, self.faults[each.fault].chosen(each.fault, each.values, each.duration), each.duration)
@@ -257,12 +259,12 @@ class EmulatedLaboratory:
         if fault.undo is not None:
             take_out = _nothing
             if duration is not None:
-                take_out = self.at(self._now() + duration, partial(self.end, name))
+                take_out = self.at(self._present() + duration, partial(self.end, name))
             self._ends[name] = take_out
         if duration is not None:
             for line in self.lines.values():
                 line.is_watched = True
-        self.events.append(FaultEvent(self._now(), name, "begins", chosen))
+        self.events.append(FaultEvent(self._present(), name, "begins", chosen))
         fault.begin(**chosen)
 
     def operate(self, task: str, value: float) -> None:  # noqa: ARG002

@@ -10,6 +10,7 @@ clock; a connection of an instrument on TCP (`sim_devices.wire.modbus_tcp`) take
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 import serial
@@ -142,9 +143,14 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     def _wait_for(self, size: int) -> None:
         """Let time pass until so many bytes are there, at most the timeout."""
         self._hear()
-        if self._timeout == 0:
-            return
-        end = math.inf if self._timeout is None else self._clock.now() + self._timeout
+        if self._timeout != 0:
+            self._wait_until(size, self._end_of_timeout())
+
+    def _end_of_timeout(self) -> float:
+        return math.inf if self._timeout is None else self._clock.now() + self._timeout
+
+    def _wait_until(self, size: int, end: float) -> None:
+        """Let time pass until so many bytes are there, at most until `end` (s)."""
         while len(self._received) < size:
             due = self._stream.next_unsolicited()
             # What is overdue and has not come does not come.
@@ -172,9 +178,17 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         """
         self._check()
         self._hear()
-        end = self._received.find(expected)
-        found = len(self._received) + 1 if end < 0 else end + len(expected)
-        return self.read(found if size is None else min(found, size))
+        received, until = self._received, self._end_of_timeout()
+        most = sys.maxsize if size is None else size
+        while (begin := received.find(expected)) < 0 and len(received) < most and self._timeout != 0:
+            before = len(received)
+            self._wait_until(before + 1, until)
+            if len(received) == before:
+                break
+        count = min(len(received) if begin < 0 else begin + len(expected), most)
+        data = bytes(received[:count])
+        del received[:count]
+        return data
 
     def write(self, data: bytes, /) -> int:
         """Send bytes; the answer is ready for `read` when this returns.
