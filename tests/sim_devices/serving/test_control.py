@@ -138,7 +138,7 @@ def test_an_answer_is_delayed_doubled_and_readdressed_on_a_served_line(vo2, tec,
     assert line.read(2 * len(right)) == 2 * right
     vo2.control.fault("tec.readdress")
     line.write(IDENTIFY)
-    assert line.read_until(b"\r")[1:3] == b"16"
+    assert line.read_until(b"\r")[1:3] == b"02"
     last = vo2.control.events()[-6:]
     assert [(each["fault"], each["what"]) for each in last] == [
         (f"tec.{kind}", what) for kind in ("delay", "double", "readdress") for what in ("begins", "ends")
