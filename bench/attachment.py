@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import math
 import socket
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -220,20 +222,37 @@ class AttachedClock(Clock):
     A sleep ends when the laboratory has come so far: a server that is slowed down by a busy machine slows its client
     down as well. If the server is gone, time passes on as fast as it did, so that a run can still be ended.
 
+    Any thread may use it.
+
     Parameters
     ----------
-    control : ControlClient
-        A connection of its own.
+    connect : callable
+        Opens a connection to the control socket; each thread has one of its own.
     """
 
-    def __init__(self, control: ControlClient, rig: str) -> None:
+    def __init__(self, connect: Callable[[], ControlClient], rig: str) -> None:
         super().__init__()
-        self._control = control
-        answer = control.request("time", rig=rig)
+        self._connect = connect
+        self._of_thread = threading.local()
+        self._opened: list[ControlClient] = []
+        answer = self._control.request("time", rig=rig)
         self.epoch = datetime.fromisoformat(answer["epoch"])
         self.factor = float(answer["factor"])
         self._last = float(answer["time"])
         self._alone: tuple[float, ScaledClock] | None = None
+
+    def close(self) -> None:
+        """Close the connections of all threads."""
+        for control in self._opened:
+            control.close()
+
+    @property
+    def _control(self) -> ControlClient:
+        control: ControlClient | None = getattr(self._of_thread, "control", None)
+        if control is None:
+            control = self._of_thread.control = self._connect()
+            self._opened.append(control)
+        return control
 
     def now(self) -> float:
         """Return the laboratory time of the server, s."""
@@ -332,11 +351,11 @@ def attach(path: Path, rig: str) -> Attachment:
         raise ConfigurationError(f"{path} serves {', '.join(endpoints.served) or 'no rig'}, not {rig}")
     with ExitStack() as opened:
         try:
-            controls = [ControlClient(endpoints.control, rig) for _ in range(2)]
-            for control in controls:
-                opened.callback(control.close)
-            server = controls[0].request("time", rig=rig)["server"]
-            clock = AttachedClock(controls[1], rig)
+            control = ControlClient(endpoints.control, rig)
+            opened.callback(control.close)
+            server = control.request("time", rig=rig)["server"]
+            clock = AttachedClock(partial(ControlClient, endpoints.control, rig), rig)
+            opened.callback(clock.close)
         except (DeviceConnectionError, KeyError):
             server = None
         if server != endpoints.server:
@@ -344,4 +363,4 @@ def attach(path: Path, rig: str) -> Attachment:
                 f"{path} is out of date: its server does not answer at {endpoints.control}; start bench emulate again"
             )
         ports = {name: endpoint.port for name, endpoint in endpoints.served[rig].instruments.items()}
-        return Attachment(clock, controls[0], ports, opened.pop_all())
+        return Attachment(clock, control, ports, opened.pop_all())

@@ -29,7 +29,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from bench.devices import Actuator, Device, Signal
+from bench.devices import Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError
 from bench.layout import Range
 from bench.settling import Dwell, Settle, UntilSteady
@@ -199,7 +199,7 @@ def bind(
     protocol: str,
     needs: Mapping[str, type[Device] | type[Signal]],
     roles: Mapping[str, RoleTable],
-    devices: Mapping[str, Device],
+    devices: Mapping[str, DeviceDescription],
     signals: Mapping[str, Signal],
     path: str,
 ) -> Slots:
@@ -224,33 +224,33 @@ def _bind(
     name: str,
     kind: type[Device] | type[Signal],
     table: RoleTable,
-    devices: Mapping[str, Device],
+    devices: Mapping[str, DeviceDescription],
     signals: Mapping[str, Signal],
     path: str,
 ) -> Slot:
     device = devices.get(table.device)
-    if kind is not Signal and (device is None or not isinstance(device, kind)):
-        fitting = ", ".join(key for key, each in devices.items() if isinstance(each, kind)) or "none"
+    if kind is not Signal and (device is None or not issubclass(device.kind, kind)):
+        fitting = ", ".join(key for key, each in devices.items() if issubclass(each.kind, kind)) or "none"
         bound = f"device {table.device!r}" if table.device else f"signal {table.signal!r}"
         raise ConfigurationError(
             f"{path}: roles.{name}: protocol {protocol} needs a {kind.__name__}, and {bound} is none; "
             f"fitting devices: {fitting}"
         )
     signal = signals[reading_of(table, devices)]
-    actuator = device if isinstance(device, Actuator) else None
+    setpoint = device.setpoint_signal if device is not None else None
     return Slot(
         name=name,
         device=table.device,
         signal=signal.name,
         unit=signal.unit,
         description=signal.description,
-        setpoint_unit=actuator.setpoint_signal.unit if actuator else "",
+        setpoint_unit=setpoint.unit if setpoint else "",
         precision=signal.precision,
         table=table,
     )
 
 
-def reading_of(table: RoleTable, devices: Mapping[str, Device]) -> str:
+def reading_of(table: RoleTable, devices: Mapping[str, DeviceDescription]) -> str:
     """Return the signal of a role: the one that is named, else the first of its device."""
     if table.signal or table.reading:
         return table.signal or table.reading
@@ -259,7 +259,7 @@ def reading_of(table: RoleTable, devices: Mapping[str, Device]) -> str:
 
 
 def check_roles(
-    roles: Mapping[str, RoleTable], devices: Mapping[str, Device], signals: Mapping[str, Signal], path: str
+    roles: Mapping[str, RoleTable], devices: Mapping[str, DeviceDescription], signals: Mapping[str, Signal], path: str
 ) -> None:
     """Check that each role is bound to devices and signals that the rig has, in the unit that it says.
 
@@ -267,7 +267,7 @@ def check_roles(
     """
     for name, table in roles.items():
         if table.device:
-            actuators = [key for key, device in devices.items() if isinstance(device, Actuator)]
+            actuators = [key for key, device in devices.items() if device.setpoint_signal is not None]
             if table.device not in actuators:
                 what = "takes no set-point" if table.device in devices else "is not a device of this rig"
                 raise ConfigurationError(

@@ -417,3 +417,52 @@ class Actuator(Device):
         """Raise `LimitError` if `set` would not take `value`."""
         if not (math.isfinite(value) and value in self.limits):
             raise LimitError(self.name, f"set-point {value:g} {self.limits.unit} is outside of {self.limits}")
+
+
+@dataclass(frozen=True)
+class DeviceDescription:
+    """What can be known of a connected device without asking it again, also where another process holds it.
+
+    Attributes
+    ----------
+    name : str
+        Name in the rig.
+    kind : type
+        Its class.
+    identity : Identity
+        Which instrument it is.
+    signals : tuple of Signal
+        What it delivers.
+    setpoint_signal : Signal or None
+        What its set-point is; None of a device that takes none.
+    limits : Limits or None
+        The set-points that it takes.
+    watchdog : float or None
+        Silence of the host after which the instrument goes to its safe state by itself, s.
+    safe_within : float
+        Longest time that its safe state takes, s.
+    """
+
+    name: str
+    kind: type[Device]
+    identity: Identity
+    signals: tuple[Signal, ...]
+    setpoint_signal: Signal | None
+    limits: Limits | None
+    watchdog: float | None
+    safe_within: float
+
+    @classmethod
+    def of(cls, device: Device) -> DeviceDescription:
+        """Describe a connected device."""
+        actuator = device if isinstance(device, Actuator) else None
+        return cls(
+            name=device.name,
+            kind=type(device),
+            identity=device.identity,
+            signals=device.signals,
+            setpoint_signal=actuator.setpoint_signal if actuator else None,
+            limits=actuator.limits if actuator else None,
+            watchdog=device.watchdog,
+            safe_within=device.safe_within,
+        )

@@ -2,58 +2,143 @@
 
 from __future__ import annotations
 
+import os
+import queue
 import signal
+import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Self
 
-_ABORTING = ("SIGTERM", "SIGHUP", "SIGBREAK")
+from bench.clock import Stopwatch
+
+_ABORTING = (
+    "SIGTERM",
+    "SIGHUP",
+    "SIGBREAK",
+    "SIGQUIT",
+    "SIGUSR1",
+    "SIGUSR2",
+    "SIGALRM",
+    "SIGVTALRM",
+    "SIGPROF",
+    "SIGXCPU",
+)
+"""Signals that would end the process, and can be caught."""
+
+_UNHEARD = 2.0
+"""Wall-clock time within which a run has to begin to end when it was asked to, s."""
+
+_UNFINISHED = 30.0
+"""Wall-clock time for its end from then on, s: safe state, rescue and record."""
+
+_LAST_WORDS = 1.0
+"""Longest wait for a terminal at the end, s."""
 
 
 class Interrupts:
     """Turns Ctrl-C and the signals of the system into requests that the engine looks at.
 
-    The first Ctrl-C asks for a pause at the next step, the second for the end at once; SIGTERM and SIGHUP ask
-    for the end at once. Nothing is raised inside of a device's transaction. Use it as a context manager; the
-    former handlers come back at the end. In a thread other than the main one it watches nothing, as Python
-    has it.
+    The first Ctrl-C asks for a pause, the second for the end at once, as does every signal that would end the
+    process. Nothing is raised inside of a device's transaction. A run that does not begin to end within 2 s,
+    as its protocol computes for ever or a write hangs, is left by a thread of its own.
+
+    Use it as a context manager, from before the first device is opened; the former handlers come back at the end. In
+    a thread other than the main one it watches nothing, as Python runs handlers in the main thread only.
 
     Parameters
     ----------
     notify : callable
-        Tells the operator what was understood. Called at any point of the program: it must not wait for
-        a lock, as the lines that were interrupted may hold it; printing through a console does.
-
-    Attributes
-    ----------
-    pause_requested : bool
-        Whether to pause at the next step; the engine clears it.
-    abort_reason : str or None
-        Why to end at once.
+        Says to the operator what was understood; called in a thread of its own, as a terminal may hang.
     """
 
     def __init__(self, notify: Callable[[str], None] = lambda _: None) -> None:
-        self.pause_requested = False
-        self.abort_reason: str | None = None
+        self._pause = False
+        self._reason: str | None = None
         self._notify = notify
+        self._leave: Callable[[str], None] | None = None
         self._former: dict[int, object] = {}
+        self._former_wakeup = -1
+        self._presses = 0
+        self._ending = threading.Event()
+        self._over = threading.Event()
+        self._words: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._threads: list[threading.Thread] = []
+        self._sockets: tuple[socket.socket, ...] = ()
+
+    @property
+    def pause_requested(self) -> bool:
+        """Whether to pause; the engine clears it."""
+        return self._pause
+
+    @pause_requested.setter
+    def pause_requested(self, wanted: bool) -> None:
+        self._pause = wanted
+        self._presses = int(wanted)
+
+    @property
+    def abort_reason(self) -> str | None:
+        """Why to end at once; None while there is no reason."""
+        return self._reason
+
+    @abort_reason.setter
+    def abort_reason(self, reason: str | None) -> None:
+        self._reason = reason
+
+    def abort_requested(self) -> bool:
+        """Return whether the run has to end at once."""
+        return self._reason is not None
+
+    def acknowledge(self) -> None:
+        """Note that the run has begun to end."""
+        self._ending.set()
+
+    def finish(self) -> None:
+        """Note that the run is over and every device safe: what is left to do may be left at any time."""
+        self._ending.clear()
+
+    def leave_by(self, leave: Callable[[str], None]) -> None:
+        """Set what ends the process, from another thread and with a reason, if the run does not come to its end."""
+        self._leave = leave
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._install(signal.SIGINT, self._interrupt)
-            for name in _ABORTING:
-                number = getattr(signal, name, None)
-                if number is not None:
-                    self._install(number, self._terminate)
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        ours, theirs = socket.socketpair()
+        for each in (ours, theirs):
+            each.setblocking(False)
+        self._sockets = ours, theirs
+        self._install(signal.SIGINT, self._interrupt)
+        for name in _ABORTING:
+            number = getattr(signal, name, None)
+            if number is not None:
+                self._install(number, self._terminate)
+        # Python's handlers wait for the main thread, these bytes do not.
+        self._former_wakeup = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+        for work in (self._listen, self._speak):
+            thread = threading.Thread(target=work, name="interrupts", daemon=True)
+            thread.start()
+            self._threads.append(thread)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._over.set()
+        if not self._sockets:
+            return
+        signal.set_wakeup_fd(self._former_wakeup, warn_on_full_buffer=False)
         for number, handler in self._former.items():
             signal.signal(number, handler)  # type: ignore[arg-type]  # as signal.signal returned it
+        ours, theirs = self._sockets
+        theirs.close()
+        listening, speaking = self._threads[:2]
+        listening.join(_LAST_WORDS)
+        self._words.put(None)
+        speaking.join(_LAST_WORDS)
+        ours.close()
 
     def _install(self, number: int, handler: Callable[[int, FrameType | None], None]) -> None:
         former = signal.getsignal(number)
@@ -62,22 +147,58 @@ class Interrupts:
             signal.signal(number, handler)
             self._former[number] = signal.SIG_DFL if former is None else former
 
-    def _tell(self, text: str) -> None:
-        # Nothing may be raised here, as a signal arrives at any point of the program.
-        with suppress(Exception):
-            self._notify(text)
-
-    def abort_requested(self) -> bool:
-        """Return whether the run has to end at once."""
-        return self.abort_reason is not None
-
     def _interrupt(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
-        if self.pause_requested:
-            self.abort_reason = "Ctrl-C, twice"
-            self._tell("ending at once, in the safe state")
+        if self._pause:
+            self._reason = "Ctrl-C, twice"
         else:
-            self.pause_requested = True
-            self._tell("pausing at the next step; Ctrl-C again ends at once")
+            self._pause = True
 
     def _terminate(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
-        self.abort_reason = signal.Signals(number).name
+        self._reason = signal.Signals(number).name
+
+    def _listen(self) -> None:
+        """Hear the signals beside the main thread, which may be unable to."""
+        ours = self._sockets[0]
+        ours.setblocking(True)
+        with suppress(OSError):
+            while numbers := ours.recv(64):
+                for number in numbers:
+                    self._hear(number)
+
+    def _hear(self, number: int) -> None:
+        if number not in self._former:
+            return
+        if number == signal.SIGINT:
+            self._presses += 1
+            if self._presses < 2:
+                self._words.put("pausing; Ctrl-C again ends at once")
+                return
+            reason = "Ctrl-C, twice"
+            self._words.put("ending at once, in the safe state")
+        else:
+            reason = signal.Signals(number).name
+        if len(self._threads) == 2:
+            watch = threading.Thread(target=self._watch_the_end, args=(reason,), name="end", daemon=True)
+            self._threads.append(watch)
+            watch.start()
+
+    def _watch_the_end(self, reason: str) -> None:
+        since = Stopwatch()
+        while not self._over.wait(0.1):
+            if since.seconds() > (_UNFINISHED if self._ending.is_set() else _UNHEARD):
+                break
+        else:
+            return
+        if self._leave is not None:
+            self._leave(reason)
+
+    def _speak(self) -> None:
+        while (words := self._words.get()) is not None:
+            # The terminal may be gone.
+            with suppress(Exception):
+                self._notify(words)
+
+
+def say_at_once(text: str) -> None:
+    """Write to the terminal without its console, whose locks the interrupted code may hold."""
+    os.write(2, f"\n{text}\n".encode())

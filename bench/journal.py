@@ -35,7 +35,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -255,6 +255,13 @@ class Journal:
     def _transaction(self) -> AbstractContextManager[None]:
         # Reuse an open transaction.
         return nullcontext() if self._db.in_transaction else _Transaction(self._db)
+
+
+def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
+    """Record the end of a run whose own thread hangs, if its file can be written within a second."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
+        for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
+            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
 
 
 class _Transaction:

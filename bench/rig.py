@@ -4,20 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from enum import StrEnum
 from functools import partial
 from types import TracebackType
 from typing import Self
 
-from bench.binding import Slots, bind, check_roles
+from bench.binding import check_roles
 from bench.clock import Clock, make_clock
 from bench.derived import Derived
-from bench.devices import Actuator, Device, DriverSettings, Signal
+from bench.description import RigDescription
+from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
-from bench.protocol.parameters import ProtocolDefinition
 from bench.rig_file import DeviceEntry, Laboratory, RigFile
 from bench.roles import BlockPlayer, Floats
 from bench.safety import SAFE, make_safe
+
+
+class Look(StrEnum):
+    """How the devices of a rig are read."""
+
+    MEASURE = "measure"
+    """The best reading of every signal."""
+    GLANCE = "glance"
+    """A quick reading of every signal."""
+    SAMPLE = "sample"
+    """The best reading of the signals that are wanted, a quick one of all others."""
+    PART = "part"
+    """A quick reading of the devices that the signals that are wanted come from, and of no other."""
 
 
 class Rig:
@@ -59,6 +73,9 @@ class Rig:
                 self.devices[entry.name] = device
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
+            self.description = RigDescription(
+                file, {name: DeviceDescription.of(device) for name, device in self.devices.items()}, self.signals
+            )
             self._check_references()
             self._stack = stack.pop_all()
 
@@ -90,20 +107,30 @@ class Rig:
 
     def measure(self) -> dict[str, float]:
         """Take the best reading of every signal; raises what the devices raise."""
-        return self._collect(lambda device: device.measure())
+        return self._collect(self.readers(Look.MEASURE))
 
     def glance(self) -> dict[str, float]:
         """Take a quick reading of every signal; raises what the devices raise."""
-        return self._collect(lambda device: device.glance())
+        return self._collect(self.readers(Look.GLANCE))
 
     def sample(self, wanted: Collection[str]) -> dict[str, float]:
         """Take the best reading of the signals that are wanted, and a quick one of all others."""
+        return self._collect(self.readers(Look.SAMPLE, wanted))
+
+    def readers(self, look: Look, wanted: Collection[str] = ()) -> dict[str, Callable[[], dict[str, float]]]:
+        """Return what a look asks of each device, by name; `assembled` takes what they return.
+
+        Devices on different lines may be asked at the same time.
+        """
         sources = self._sources(wanted)
-        return self._collect(
-            lambda device: (
-                device.measure() if any(signal.name in sources for signal in device.signals) else device.glance()
-            )
-        )
+        readers = {}
+        for name, device in self.devices.items():
+            is_wanted = any(signal.name in sources for signal in device.signals)
+            if look is Look.MEASURE or (look is Look.SAMPLE and is_wanted):
+                readers[name] = device.measure
+            elif look is not Look.PART or is_wanted:
+                readers[name] = device.glance
+        return readers
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
         """Return a function that takes a quick reading of the devices that some signals come from, and of no other.
@@ -111,11 +138,7 @@ class Rig:
         It returns what these devices deliver and the derived ones of the signals; set-points are not among them.
         """
         sources = self._sources(wanted)
-        readers = [
-            device.glance
-            for device in self.devices.values()
-            if any(signal.name in sources for signal in device.signals)
-        ]
+        readers = list(self.readers(Look.PART, wanted).values())
         derived = [(name, each.compute) for name, each in self.derived.items() if name in sources]
 
         def read() -> dict[str, float]:
@@ -154,40 +177,23 @@ class Rig:
                 sources.update(derived.sources)
         return sources
 
-    def slots(self, definition: ProtocolDefinition) -> Slots:
-        """Return the slots of a protocol, bound as the rig file says.
+    def _collect(self, readers: Mapping[str, Callable[[], dict[str, float]]]) -> dict[str, float]:
+        return self.assembled({name: read() for name, read in readers.items()})
 
-        Raises ConfigurationError if one is not bound, or bound to something of another kind.
+    def assembled(self, readings: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+        """Return the values of all signals from the readings of some devices, or of all.
+
+        Set-points and readings are those of these devices, derived signals those whose sources are among them.
         """
-        used = {name: kind for name, kind in definition.may_use.items() if name in self.file.roles}
-        wanted = {**definition.slots, **used}
-        return bind(definition.name, wanted, self.file.roles, self.devices, self._by_name, self.file.path)
-
-    @property
-    def _by_name(self) -> dict[str, Signal]:
-        return {signal.name: signal for signal in self.signals}
-
-    def check_needs(self, protocol: str, needs: Sequence[str]) -> None:
-        """Check that the devices and signals that a protocol names are there.
-
-        Raises ConfigurationError if a device or a signal is missing.
-        """
-        have = {*self.devices, *self._by_name}
-        missing = [need for need in needs if need not in have]
-        if missing:
-            raise ConfigurationError(
-                f"protocol {protocol} needs {', '.join(missing)}, which rig {self.file.name} does not have; "
-                f"it has: {', '.join(sorted(have))}"
-            )
-
-    def _collect(self, ask: Callable[[Device], dict[str, float]]) -> dict[str, float]:
         values: dict[str, float] = {}
-        for name, device in self.devices.items():
-            values.update(ask(device))
+        for name, reading in readings.items():
+            values.update(reading)
+            device = self.devices[name]
             if isinstance(device, Actuator):
                 values[f"{name}_setpoint"] = device.setpoint
         for name, derived in self.derived.items():
-            values[name] = derived.compute(values)
+            if len(readings) == len(self.devices) or all(source in values for source in derived.sources):
+                values[name] = derived.compute(values)
         return values
 
     def _bind_signals(self) -> tuple[Signal, ...]:
@@ -227,12 +233,11 @@ class Rig:
         if self.file.dashboard is not None:
             for prefix, plot in self.file.dashboard.plots.items():
                 used += [(f"dashboard.{prefix}input", plot.input), (f"dashboard.{prefix}output", plot.output)]
+        known = ", ".join(self.description.by_name)
         for key, signal in used:
-            if signal not in self._by_name:
-                raise ConfigurationError(
-                    f"{path}: {key} = {signal!r}: there is no such signal; there are: {', '.join(self._by_name)}"
-                )
-        check_roles(self.file.roles, self.devices, self._by_name, path)
+            if signal not in self.description.by_name:
+                raise ConfigurationError(f"{path}: {key} = {signal!r}: there is no such signal; there are: {known}")
+        check_roles(self.file.roles, self.description.devices, self.description.by_name, path)
 
 
 def clock_for(file: RigFile, name: str) -> Clock:

@@ -52,7 +52,7 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -87,6 +87,19 @@ class TelemetryTable(_Table):
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
+class SafetyTable(_Table):
+    """The table `[safety]`."""
+
+    rate: float = Field(default=5.0, ge=0.1, le=50, description="looks at the interlocks in a second on hardware, Hz")
+    reconnect: float = Field(default=10.0, ge=0, le=600, description="how long a lost line may be away, s")
+    patience: float = Field(
+        default=10.0, gt=0, le=600, description="how long a protocol may compute between two messages, s"
+    )
+    order: tuple[str, ...] = Field(
+        default=(), description="devices that are made safe before the others, one after the other"
+    )
+
+
 class _RigFileContent(_Table):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
@@ -95,6 +108,7 @@ class _RigFileContent(_Table):
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
+    safety: SafetyTable = SafetyTable()
     dashboard: DashboardLayout | None = None
     emulation: dict[str, Any] | None = None
 
@@ -179,6 +193,7 @@ class RigFile:
     derived: Mapping[str, DerivedSignal]
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
+    safety: SafetyTable
     dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
@@ -193,6 +208,10 @@ class RigFile:
         """Whether every device is emulated in this process, so that time can stand while the process computes."""
         ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
         return self.emulated and all(port.startswith("emulated://") for port in ports)
+
+    def served_by(self, laboratory: Any) -> RigFile:  # noqa: ANN401 - without Settings
+        """Return the same rig with a `Laboratory` that is open already in place of its own."""
+        return replace(self, laboratory=lambda *_: laboratory)
 
 
 def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
@@ -365,6 +384,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         derived=derived,
         interlocks=tables.interlocks,
         telemetry=tables.telemetry,
+        safety=tables.safety,
         dashboard=tables.dashboard,
         laboratory=laboratory,
         laboratory_settings=settings,

@@ -9,6 +9,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -21,16 +22,21 @@ from rich.console import Console
 from bench.attachment import AttachedClock, attach
 from bench.binding import Slots
 from bench.clock import Stopwatch, wall_time
+from bench.description import RigDescription
+from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
-from bench.errors import ConfigurationError
+from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
 from bench.faults import read_schedule, schedule_faults
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal
+from bench.guardian.remote import GuardedRig, RemoteStation
+from bench.interrupts import Interrupts, say_at_once
+from bench.journal import FILE_NAME, Journal, abandon
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
+from bench.station.interface import Station
+from bench.station.local import LocalStation
 from bench.terminal import ProgressDisplay, ask_operator
 
 if TYPE_CHECKING:
@@ -38,6 +44,8 @@ if TYPE_CHECKING:
 
 RECORDING_NAME = "run.rrd"
 RIG_FILE_NAME = "rig.toml"
+_LAST_WORDS = 1.0
+"""Longest wait for a terminal at the end, s."""
 _PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
 
 
@@ -108,8 +116,17 @@ class RunResult:
         return self.outcome.laboratory_seconds / self.wall_seconds
 
 
-def carry_out(run: Run, console: Console) -> RunResult:
+def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) -> RunResult:
     """Carry a run out, keep its record, and leave the rig in the safe state.
+
+    Parameters
+    ----------
+    run : Run
+        What to run.
+    console : Console
+        Where progress is shown.
+    interrupts : Interrupts, optional
+        At work already, and for longer than the run; without them the run has its own.
 
     Raises
     ------
@@ -120,40 +137,58 @@ def carry_out(run: Run, console: Console) -> RunResult:
     """
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
+    laboratory: object = None
     if run.attach is None:
         clock = clock_for(rig_file, run.clock)
     elif not rig_file.emulated:
         raise ConfigurationError(f"rig {rig_file.name} has no emulated laboratory that could be served elsewhere")
     else:
-        attachment = attach(run.attach, rig_file.name)
+        laboratory = attachment = attach(run.attach, rig_file.name)
         clock = attachment.clock
-        rig_file = replace(rig_file, laboratory=lambda *_: attachment)
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
+    guardian: RemoteStation | None = None
     with ExitStack() as stack:
-        rig = Rig(rig_file, clock, run.seed)
+        if interrupts is None:
+            interrupts = stack.enter_context(Interrupts(say_at_once))
+        clock.interrupted = interrupts.abort_requested
+        # A guardian makes the devices safe as soon as this process is gone.
+        interrupts.leave_by(_leave)
+        if run.attach is None and rig_file.in_process:
+            rig = Rig(rig_file, clock, run.seed)
+            laboratory = rig.laboratory
+            station: Station = LocalStation(rig)
+        else:
+            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed)
+            station = guardian = RemoteStation(guarded, clock, dict)
         # The lines only: the engine brings the devices into their safe state, and says how that went.
-        stack.callback(rig.close)
+        stack.callback(station.close)
         if run.faults is not None:
-            schedule_faults(rig.laboratory, faults, run.faults)
-        slots = rig.slots(run.protocol)
+            schedule_faults(laboratory, faults, run.faults)
+        description = station.description
+        slots = description.slots(run.protocol)
         expected = plan(run.protocol, parameters, slots)
-        check_before_moving(rig, run.protocol, expected)
+        check_before_moving(description, run.protocol, expected)
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
                 f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
                 "run it in a terminal, where an operator can answer"
             )
+        if (reason := interrupts.abort_reason) is not None:
+            raise AbortError(f"ended by {reason} before anything moved")
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        if guardian is not None:
+            guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = _metadata(run, rig, parameters, slots, expected, folder.name)
-        signals = rig.signals + trace_signals(run.protocol, rig, slots)
+        meta = _metadata(run, station, parameters, slots, expected, folder.name)
+        signals = description.signals + trace_signals(run.protocol, description, slots)
         journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
+        interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
@@ -163,15 +198,28 @@ def carry_out(run: Run, console: Console) -> RunResult:
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
-        shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in rig.signals[:2])
+        shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
-        observers.append(stack.enter_context(progress))
-        interrupts = stack.enter_context(Interrupts(_say_at_once))
+        observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
-        outcome = Engine(rig, journal, observers, interrupts, ask).run(run.protocol, parameters)
+        outcome = Engine(station, journal, observers, interrupts, ask).run(run.protocol, parameters)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
+    interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _leave(reason: str, station: Station | None = None, journal: Path | None = None) -> None:
+    """End the process from another thread than the one that hangs; a guardian makes the devices safe then."""
+    safe_state = station.end() if isinstance(station, LocalStation) else {}
+    text = f"ended by {reason}; the protocol did not come to an end, so the process was left"
+    if journal is not None:
+        abandon(journal, text, safe_state)
+    # The terminal may hang as well.
+    saying = threading.Thread(target=say_at_once, args=(text,), daemon=True)
+    saying.start()
+    saying.join(_LAST_WORDS)
+    os._exit(AbortError.exit_code)
 
 
 def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
@@ -193,26 +241,27 @@ def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
     return Dashboard
 
 
-def trace_signals(protocol: ProtocolDefinition, rig: Rig, slots: Slots) -> tuple[Signal, ...]:
+def trace_signals(protocol: ProtocolDefinition, description: RigDescription, slots: Slots) -> tuple[Signal, ...]:
     """Return the signals that a protocol's controllers add to the rig's."""
     controlled = protocol.controlled(slots)
     if not controlled:
         return ()
-    rig.check_needs(protocol.name, [controlled])
-    signal = next(signal for signal in rig.signals if signal.name == controlled)
+    description.check_needs(protocol.name, [controlled])
+    signal = description.by_name[controlled]
     traces = (replace(trace, unit=signal.unit, precision=signal.precision) for trace in TRACES)
     return (*traces, LATENESS)
 
 
 def _metadata(
-    run: Run, rig: Rig, parameters: ProtocolParameters, slots: Slots, expected: Plan, name: str
+    run: Run, station: Station, parameters: ProtocolParameters, slots: Slots, expected: Plan, name: str
 ) -> dict[str, Any]:
+    file, clock = station.description.file, station.clock
     return {
         "run": name,
-        "rig": rig.file.name,
-        "rig_title": rig.file.rig.title,
-        "rig_file": rig.file.text,
-        "rig_content": rig.file.content,
+        "rig": file.name,
+        "rig_title": file.rig.title,
+        "rig_file": file.text,
+        "rig_content": file.content,
         "overrides": dict(run.overrides),
         "protocol": run.protocol.name,
         "protocol_summary": run.protocol.summary,
@@ -221,14 +270,14 @@ def _metadata(
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
-        "clock": f"attached x{rig.clock.factor:g}" if isinstance(rig.clock, AttachedClock) else run.clock,
-        "epoch": rig.clock.epoch.isoformat(),
-        "devices": {name: str(device.identity) for name, device in rig.devices.items()},
+        "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
+        "epoch": clock.epoch.isoformat(),
+        "devices": {name: str(device.identity) for name, device in station.description.devices.items()},
         "calibration": {
-            **{entry.name: entry.settings.model_dump(mode="json") for entry in rig.file.devices},
-            **{name: derived.model_dump(mode="json") for name, derived in rig.file.derived.items()},
+            **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
+            **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
         },
-        "dashboard": rig.file.dashboard.model_dump(mode="json") if rig.file.dashboard else None,
+        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
         "operator": _operator(),
         "command": sys.argv,
         "packages": {package: _version(package) for package in _PACKAGES},
@@ -240,11 +289,6 @@ def _metadata(
             "started": wall_time().isoformat(),
         },
     }
-
-
-def _say_at_once(text: str) -> None:
-    # In a signal handler: a console has locks, and the interrupted code may hold them.
-    os.write(2, f"\n{text}\n".encode())
 
 
 def _make_folder(parent: Path, name: str) -> Path:

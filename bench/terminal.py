@@ -22,8 +22,8 @@ from rich.progress import (
 
 from bench.clock import Stopwatch
 from bench.devices import Signal
-from bench.engine import ABORT, RESUME
 from bench.journal import Event, StepRecord
+from bench.running import ABORT, RESUME
 
 _REFRESH = 0.1
 """Wall-clock seconds between two redraws of the readings."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markdown import Markdown
@@ -23,6 +23,9 @@ from bench.cli.console import (
     write_json,
 )
 from bench.errors import BenchError, ConfigurationError
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
 
 app = typer.Typer()
 
@@ -166,8 +169,8 @@ def run(
     definition = find_protocol(protocol)
     given = parse_assignments("--set", settings or [])
 
+    from bench.interrupts import Interrupts, say_at_once
     from bench.runs import Run, carry_out
-    from bench.safety import SAFE
 
     asked = Run(
         protocol=definition,
@@ -181,8 +184,16 @@ def run(
         attach=attach,
         faults=faults,
     )
-    with show_compilation():
-        result = carry_out(asked, console)
+    # Until the result is printed: a terminal that hangs must not keep the process from being ended.
+    with Interrupts(say_at_once) as interrupts:
+        with show_compilation():
+            result = carry_out(asked, console, interrupts)
+        _print_result(result, json_file)
+
+
+def _print_result(result: RunResult, json_file: Path | None) -> None:
+    from bench.safety import SAFE
+
     outcome, ratio = result.outcome, result.time_ratio
     console.print(
         f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time in "

@@ -12,6 +12,7 @@ from bench.protocol import Arrived, Dwell, ProtocolParameters, Step, UntilSteady
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.settling import Settled
+from bench.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):
@@ -31,7 +32,7 @@ def run(folder, rig, *steps, overrides=None):
     definition = protocol(needs=())(go)
     with Rig(load_rig(rig, overrides), VirtualClock(), 1) as connected:
         journal = Journal(folder / FILE_NAME, connected.signals, {})
-        outcome = Engine(connected, journal, (), Interrupts()).run(definition, Nothing())
+        outcome = Engine(LocalStation(connected), journal, (), Interrupts()).run(definition, Nothing())
         journal.close()
     assert outcome.is_safe
     assert plan(definition, Nothing()).steps == len(steps)

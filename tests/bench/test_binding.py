@@ -66,7 +66,7 @@ def refused(path, definition=PLAIN, settings=None):
         definition.parse(settings or {}, file.roles, file.protocols.get(definition.name), path=path)
         rig = Rig(file, VirtualClock(), 1)
         try:
-            rig.slots(definition)
+            rig.description.slots(definition)
         finally:
             assert rig.devices["tec"].calls == []
             rig.close()
@@ -198,7 +198,7 @@ class TestDefaults:
 
     def test_a_slot_has_what_the_rig_says(self, rig_file):
         with Rig(load_rig(rig_file(append=ROLES)), VirtualClock(), 1) as rig:
-            drive, response = rig.slots(PLAIN).values()
+            drive, response = rig.description.slots(PLAIN).values()
         assert (drive.device, drive.signal, drive.unit, drive.setpoint_unit) == ("tec", "tec_temperature", "°C", "°C")
         assert (drive.setpoint_signal, drive.rate_unit) == ("tec_setpoint", "K/s")
         assert (response.device, response.signal, response.setpoint_unit) == ("", "probe_temperature", "")
@@ -208,12 +208,12 @@ class TestDefaults:
     def test_the_first_signal_of_a_device_is_its_reading(self, rig_file):
         text = ROLES.replace('reading = "tec_temperature"\n', "")
         with Rig(load_rig(rig_file(append=text)), VirtualClock(), 1) as rig:
-            assert rig.slots(PLAIN)["drive"].signal == "tec_temperature"
+            assert rig.description.slots(PLAIN)["drive"].signal == "tec_temperature"
 
     def test_a_reset_of_a_fixed_time(self, rig_file):
         text = ROLES.replace("drift = 0.02\nnoise = 0.01\n", "seconds = 20\nsetpoint = 25\n")
         with Rig(load_rig(rig_file(append=text)), VirtualClock(), 1) as rig:
-            drive = rig.slots(PLAIN)["drive"]
+            drive = rig.description.slots(PLAIN)["drive"]
         assert [drive.settle(least) for least in (5.0, 30.0)] == [Dwell(20.0), Dwell(30.0)]
         assert drive.table.saturating == 25.0
 

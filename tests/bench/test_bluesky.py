@@ -95,4 +95,4 @@ class TestFailures:
 
 def test_the_rig_of_a_scan_runs_protocols_too(rig):
     with pytest.raises(Exception, match="probe_temperature"):
-        check_before_moving(rig, stairs, plan(stairs, stairs.parameters()))
+        check_before_moving(rig.description, stairs, plan(stairs, stairs.parameters()))

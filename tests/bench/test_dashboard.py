@@ -145,7 +145,7 @@ def make_run(steps: int, ticks: int) -> Iterator[Tick | StepRecord | Event]:
         if step == steps // 10:
             yield Event(t, "INFO", "phase", "identification")
         if step == steps // 2:
-            yield Event(t, "WARN", "pause", "paused before the next step")
+            yield Event(t, "WARN", "pause", "paused by the operator")
             t += 60.0
             yield Event(t, "INFO", "resume", "resumed")
         target = 52.5 - 31.5 * float(np.cos(2 * np.pi * 9 * step / steps) * np.exp(-2.2 * step / steps))

@@ -9,7 +9,7 @@ from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
 from bench.clock import PacedClock, VirtualClock, WallClock
 from bench.control.tracking import Command, Trace
-from bench.engine import ABORT, RESUME, Engine, check_before_moving
+from bench.engine import Engine, check_before_moving
 from bench.errors import (
     AbortError,
     ConfigurationError,
@@ -35,6 +35,8 @@ from bench.protocol import (
 )
 from bench.rig import Rig
 from bench.rig_file import load_rig
+from bench.running import ABORT, RESUME
+from bench.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):
@@ -58,7 +60,7 @@ class Bench:
         self.journal = Journal(folder / FILE_NAME, self.rig.signals + TRACES * traces, {})
         self.interrupts = Interrupts()
         self.watcher = Watcher()
-        self.engine = Engine(self.rig, self.journal, (*observers, self.watcher), self.interrupts, ask)
+        self.engine = Engine(LocalStation(self.rig), self.journal, (*observers, self.watcher), self.interrupts, ask)
 
     def run(self, definition, parameters=None):
         try:
@@ -254,11 +256,11 @@ class TestBeforeMoving:
             assert rig.devices["tec"].calls == []
 
     def test_right(self, rig):
-        check_before_moving(rig, stairs, plan(stairs, Stairs()))
+        check_before_moving(rig.description, stairs, plan(stairs, Stairs()))
 
     def test_setpoints_outside_of_the_limits(self, rig):
         with pytest.raises(ConfigurationError) as caught:
-            check_before_moving(rig, stairs, plan(stairs, Stairs(count=30)))
+            check_before_moving(rig.description, stairs, plan(stairs, Stairs(count=30)))
         assert "stairs would set tec to between 30 and 175 °C; rig heater allows 10 to 95 °C" in str(caught.value)
 
     def test_a_device_that_cannot_be_set(self, rig):
@@ -266,7 +268,7 @@ class TestBeforeMoving:
             yield Step({"probe": 30.0}, Dwell(1.0))
 
         with pytest.raises(ConfigurationError, match="wrong sets probe, which rig heater cannot set"):
-            check_before_moving(rig, define(wrong), plan(define(wrong), Nothing()))
+            check_before_moving(rig.description, define(wrong), plan(define(wrong), Nothing()))
 
     def test_needs(self, rig):
         @protocol(needs=("tec", "curvature", "servo"))
@@ -275,11 +277,11 @@ class TestBeforeMoving:
             yield Note("x")
 
         with pytest.raises(ConfigurationError, match="needs curvature, servo, which rig heater does not have"):
-            check_before_moving(rig, wanting, plan(wanting, Nothing()))
+            check_before_moving(rig.description, wanting, plan(wanting, Nothing()))
 
     def test_a_signal_that_is_not_there(self, rig):
         with pytest.raises(ConfigurationError, match="prob_temperature"):
-            check_before_moving(rig, settle, plan(settle, Settle(signal="prob_temperature")))
+            check_before_moving(rig.description, settle, plan(settle, Settle(signal="prob_temperature")))
 
 
 class TestFaults:
@@ -359,15 +361,19 @@ class TestFaults:
             assert event.kind == "safe-state"
             assert event.text.startswith("tec: ")
 
-    def test_not_even_a_keyboard_interrupt_leaves_the_output_on(self, bench):
+    @pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, GeneratorExit])
+    def test_what_is_no_exception_ends_the_run_and_its_record(self, bench, kind):
         def go(parameters):
             yield Step({"tec": 30.0}, Dwell(1.0))
-            raise KeyboardInterrupt
+            raise kind
 
         b = bench()
-        with pytest.raises(KeyboardInterrupt):
-            b.run(define(go))
+        outcome = b.run(define(go))
+        assert (outcome.status, outcome.steps) == ("aborted", 1)
+        assert kind.__name__ in outcome.reason
         b.assert_safe()
+        with b.record() as run:
+            assert (run.status, run.meta["safe_state"]) == ("aborted", {"tec": "safe", "probe": "safe"})
 
     def test_a_protocol_that_raises(self, bench):
         def go(parameters):
@@ -627,16 +633,18 @@ class TestControl:
 
     def test_limits_are_checked_before_anything_moves(self, rig_file):
         with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            check_before_moving(rig, control(Integrator(50.0)), plan(control(Integrator(50.0)), Nothing()))
+            check_before_moving(
+                rig.description, control(Integrator(50.0)), plan(control(Integrator(50.0)), Nothing())
+            )
             with pytest.raises(ConfigurationError, match="rig heater allows 10 to 95 °C"):
                 check_before_moving(
-                    rig,
+                    rig.description,
                     control(Integrator(50.0), limits=(15.0, 100.0)),
                     plan(control(Integrator(50.0), limits=(15.0, 100.0)), Nothing()),
                 )
             with pytest.raises(ConfigurationError, match="absent"):
                 check_before_moving(
-                    rig,
+                    rig.description,
                     control(Integrator(50.0), response="absent"),
                     plan(control(Integrator(50.0), response="absent"), Nothing()),
                 )
@@ -755,7 +763,7 @@ class TestPrompt:
             Rig(load_rig(rig_file()), VirtualClock(), 1) as rig,
             pytest.raises(ConfigurationError, match="no_such"),
         ):
-            check_before_moving(rig, definition, plan(definition, Nothing()))
+            check_before_moving(rig.description, definition, plan(definition, Nothing()))
 
     def test_an_empty_range(self):
         with pytest.raises(ValueError, match="low < high"):

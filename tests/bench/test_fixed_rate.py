@@ -30,6 +30,7 @@ from bench.protocol import (
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import trace_signals
+from bench.station.local import LocalStation
 
 PERIOD = 0.5
 """Of the telemetry of the heater's rig, s."""
@@ -105,10 +106,12 @@ class Bench:
         parameters = definition.parameters()
         signals = (*self.rig.signals, *TRACES, LATENESS)
         if definition.controls in [signal.name for signal in self.rig.signals]:
-            signals = (*self.rig.signals, *trace_signals(definition, self.rig, {}))
+            signals = (*self.rig.signals, *trace_signals(definition, self.rig.description, {}))
         journal = Journal(self.folder / FILE_NAME, signals, {})
         try:
-            return Engine(self.rig, journal, (self.watcher,), self.interrupts).run(definition, parameters)
+            return Engine(LocalStation(self.rig), journal, (self.watcher,), self.interrupts).run(
+                definition, parameters
+            )
         finally:
             journal.close()
             self.rig.close()
@@ -601,8 +604,8 @@ class TestTrouble:
                 return super().update(t, measured)
 
         b = bench()
-        with pytest.raises(KeyboardInterrupt):
-            b.run(loop(Interrupted()))
+        outcome = b.run(loop(Interrupted()))
+        assert outcome.status == "aborted"
         assert b.devices["tec"].calls[-1] == "safe"
         assert not b.devices["tec"].output_enabled
 
@@ -638,9 +641,9 @@ class TestTrouble:
     def test_and_even_before_the_run(self, rig_file, keys, word):
         wrong, right = define(loop(Controller(), **keys)), define(loop(Controller()))
         with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            check_before_moving(rig, right, plan(right, Nothing()))
+            check_before_moving(rig.description, right, plan(right, Nothing()))
             with pytest.raises(ConfigurationError, match=f"needs {word}, which rig heater does not have; it has: "):
-                check_before_moving(rig, wrong, plan(wrong, Nothing()))
+                check_before_moving(rig.description, wrong, plan(wrong, Nothing()))
 
 
 class TestWallClockTime:

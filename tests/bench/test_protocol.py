@@ -394,7 +394,7 @@ class BoundProtocols:
         return definition.parse(settings or {}, file.roles, file.protocols.get(definition.name), path=file.path)
 
     def slots(self, definition):
-        return self.rig.slots(definition)
+        return self.rig.description.slots(definition)
 
     def plan(self, definition, settings=None):
         return plan(definition, self.parse(definition, settings), self.slots(definition))

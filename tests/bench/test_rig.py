@@ -160,7 +160,7 @@ class TestUnknownKeys:
                 "[rig]",
                 "titel = 1\n[rig]",
                 "titel",
-                "rig, devices, roles, protocols, derived, interlocks, telemetry, dashboard, emulation",
+                "rig, devices, roles, protocols, derived, interlocks, telemetry, safety, dashboard, emulation",
             ),
             ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
             ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title, description"),
@@ -482,11 +482,11 @@ class TestConnecting:
 
     def test_needs(self, rig_file):
         with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            rig.check_needs("x", ["tec", "probe_temperature"])
+            rig.description.check_needs("x", ["tec", "probe_temperature"])
             with pytest.raises(
                 ConfigurationError, match="protocol x needs curvature, which rig heater does not have"
             ):
-                rig.check_needs("x", ["tec", "curvature"])
+                rig.description.check_needs("x", ["tec", "curvature"])
 
 
 def _paths(node, prefix=()):

@@ -20,6 +20,7 @@ from bench.protocol import FixedRate, ProtocolParameters, protocol
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import trace_signals
+from bench.station.local import LocalStation
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
@@ -94,9 +95,9 @@ def through_the_engine(folder, record_every, block=0):
 
     folder.mkdir()
     with Rig(load_rig("hybrid"), VirtualClock(), 1) as rig:
-        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig, {})), {})
+        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(fine, rig.description, {})), {})
         start = time.process_time()
-        outcome = Engine(rig, journal, (), Interrupts()).run(fine, Nothing())
+        outcome = Engine(LocalStation(rig), journal, (), Interrupts()).run(fine, Nothing())
         seconds = time.process_time() - start
         journal.close()
         assert outcome.status == "completed", outcome.reason

@@ -15,6 +15,7 @@ from bench.protocol import FixedRate, ProtocolParameters, find_protocol, protoco
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import trace_signals
+from bench.station.local import LocalStation
 
 RATE = 20e3
 DEFLECTION = "displacement_position"
@@ -50,8 +51,8 @@ def run(folder, message, hinder=None):
     with Rig(load_rig("hybrid"), VirtualClock(), 1) as rig:
         if hinder is not None:
             hinder(rig)
-        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(go, rig, {})), {})
-        outcome = Engine(rig, journal, (), Interrupts()).run(go, Nothing())
+        journal = Journal(folder / FILE_NAME, (*rig.signals, *trace_signals(go, rig.description, {})), {})
+        outcome = Engine(LocalStation(rig), journal, (), Interrupts()).run(go, Nothing())
         journal.close()
     with Record(folder) as record:
         ticks = record.telemetry()
@@ -167,9 +168,11 @@ def test_the_step_of_the_piezo_in_blocks(tmp_path):
         with Rig(load_rig("hybrid"), VirtualClock(), 1) as rig:
             parameters = definition.parameters(voltage=5.0, duration=0.02, block=block)
             journal = Journal(
-                folder / FILE_NAME, (*rig.signals, *trace_signals(definition, rig, rig.slots(definition))), {}
+                folder / FILE_NAME,
+                (*rig.signals, *trace_signals(definition, rig.description, rig.description.slots(definition))),
+                {},
             )
-            outcome = Engine(rig, journal, (), Interrupts()).run(definition, parameters)
+            outcome = Engine(LocalStation(rig), journal, (), Interrupts()).run(definition, parameters)
             journal.close()
         assert outcome.status == "completed", outcome.reason
         with Record(folder) as record:

@@ -73,7 +73,7 @@ def parsed(protocol, settings):
 @cache
 def slots_of(protocol, rig=PLAIN):
     with Rig(load_rig(rig), VirtualClock(), 1) as connected:
-        return connected.slots(find_protocol(protocol))
+        return connected.description.slots(find_protocol(protocol))
 
 
 def planned(protocol, rig=PLAIN, **settings):
@@ -135,8 +135,8 @@ class TestPlan:
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         definition, parameters = parsed(protocol, settings)
         with Rig(load_rig(rig), VirtualClock(), 1) as connected:
-            slots = connected.slots(definition)
-            check_before_moving(connected, definition, plan(definition, parameters, slots))
+            slots = connected.description.slots(definition)
+            check_before_moving(connected.description, definition, plan(definition, parameters, slots))
             assert definition.controlled(slots) in ("", DEFLECTION)
 
     @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
@@ -145,7 +145,7 @@ class TestPlan:
         expected = planned(protocol, WITNESSED, **settings)
         assert WITNESS in expected.watched
         with Rig(load_rig(WITNESSED), VirtualClock(), 1) as rig:
-            check_before_moving(rig, find_protocol(protocol), expected)
+            check_before_moving(rig.description, find_protocol(protocol), expected)
         with pytest.raises(ConfigurationError, match=r"witness: the rig binds no \[roles\.witness\]"):
             planned(protocol, PLAIN, **settings)
 

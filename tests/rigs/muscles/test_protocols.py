@@ -38,7 +38,7 @@ def bound(protocol, settings):
     texts = {key: str(value) for key, value in settings.items()}
     parameters = definition.parse(texts, file.roles, file.protocols.get(protocol))
     with Rig(file, VirtualClock(), 0) as rig:
-        return definition, parameters, rig.slots(definition)
+        return definition, parameters, rig.description.slots(definition)
 
 
 def dry(protocol, **settings):

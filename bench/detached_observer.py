@@ -1,0 +1,98 @@
+"""An observer that is notified in a thread of its own, as a terminal that is stuck must not hold up a run."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import Protocol, Self
+
+from bench.journal import Event, StepRecord
+from bench.running import Observer
+
+_INTERVAL = 0.1
+"""Wall-clock time between two notifications, s."""
+
+_MOST_EVENTS = 1000
+"""Events that wait for an observer that hangs; the journal has them all."""
+
+_END = 2.0
+"""Longest wait for an observer at the end, s of wall-clock time."""
+
+
+class _ObserverInContext(Observer, AbstractContextManager["_ObserverInContext"], Protocol):
+    pass
+
+
+class DetachedObserver:
+    """Passes on to another observer, ten times a second, the newest tick and step and all events.
+
+    Use it as a context manager; the thread enters and leaves the context of the observer. At the end what waits is
+    passed on for 2 s at most. What the observer raises is raised at the next notification.
+
+    Parameters
+    ----------
+    observer : Observer
+        It is called from one thread only.
+    """
+
+    def __init__(self, observer: _ObserverInContext) -> None:
+        self._observer = observer
+        self._tick: tuple[float, int, Sequence[float]] | None = None
+        self._step: StepRecord | None = None
+        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self._failure: Exception | None = None
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work, name=type(observer).__name__, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join(_END)
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """Note a tick."""
+        self._tick = t, step, values
+        self._raise_failure()
+
+    def step(self, record: StepRecord) -> None:
+        """Note a finished step."""
+        self._step = record
+        self._raise_failure()
+
+    def event(self, event: Event) -> None:
+        """Note that something happened."""
+        self._events.append(event)
+        self._raise_failure()
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _work(self) -> None:
+        try:
+            with self._observer:
+                over = False
+                while not over:
+                    over = self._over.wait(_INTERVAL)
+                    self._pass_on()
+        # Raised in the run's own thread.
+        except Exception as error:
+            self._failure = error
+
+    def _pass_on(self) -> None:
+        while self._events:
+            self._observer.event(self._events.popleft())
+        tick, self._tick = self._tick, None
+        if tick is not None:
+            self._observer.telemetry(*tick)
+        step, self._step = self._step, None
+        if step is not None:
+            self._observer.step(step)

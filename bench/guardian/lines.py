@@ -1,0 +1,106 @@
+"""One thread a line: several instruments are asked at the same time, and one that hangs delays no other."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from bench.clock import Clock
+from bench.devices import Device
+from bench.errors import DeviceConnectionError
+from bench.station.reconnection import reconnect
+
+SAFE, BENCH, LOOK = range(3)
+"""Priorities of calls that wait for their line: the safe state, requests of the bench, looks at the interlocks."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of a call of a device."""
+
+    device: str
+    value: Any
+    error: BaseException | None
+
+
+@dataclass(order=True)
+class _Call:
+    priority: int
+    number: int
+    device: str = field(compare=False)
+    call: Callable[[], Any] = field(compare=False)
+    done: Callable[[Result], None] = field(compare=False)
+
+
+class LineThreads:
+    """The lines of a rig, each with a thread of its own.
+
+    Parameters
+    ----------
+    devices : mapping of str to Device
+        By name.
+    lines : mapping of str to str
+        Line of each device, by name.
+    clock : Clock
+        The clock of the run.
+    longest : callable
+        Returns for how long the line of a device may be away, s.
+    notify : callable
+        Called in the thread of a line with the name of a device whose line was away, for how long (s), and why.
+    """
+
+    def __init__(
+        self,
+        devices: Mapping[str, Device],
+        lines: Mapping[str, str],
+        clock: Clock,
+        longest: Callable[[str], float],
+        notify: Callable[[str, float, str], None],
+    ) -> None:
+        self._devices = devices
+        self._clock = clock
+        self._longest = longest
+        self._notify = notify
+        self._ending = threading.Event()
+        self._numbers = itertools.count()
+        queues: dict[str, queue.PriorityQueue[_Call]] = {line: queue.PriorityQueue() for line in lines.values()}
+        self._queues = {name: queues[line] for name, line in lines.items()}
+        for line, calls in queues.items():
+            threading.Thread(target=self._work, args=(calls,), name=f"line {line}", daemon=True).start()
+
+    def submit(self, priority: int, device: str, call: Callable[[], Any], done: Callable[[Result], None]) -> None:
+        """Have something done on the line of a device; `done` is called in its thread."""
+        self._queues[device].put(_Call(priority, next(self._numbers), device, call, done))
+
+    def end(self) -> None:
+        """Wait for no line any more: what still waits is dropped but for the safe state."""
+        self._ending.set()
+
+    def _work(self, calls: queue.PriorityQueue[_Call]) -> None:
+        while True:
+            call = calls.get()
+            value, problem = None, None
+            try:
+                value = self._carry(call)
+            # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
+            except BaseException as error:
+                problem = error
+            call.done(Result(call.device, value, problem))
+
+    def _carry(self, call: _Call) -> Any:  # noqa: ANN401 - what a device returns
+        if call.priority != SAFE and self._ending.is_set():
+            raise DeviceConnectionError(call.device, "was not asked, as the run has ended")
+        try:
+            return call.call()
+        except DeviceConnectionError as lost:
+            # The safe state opens a line of its own.
+            if call.priority == SAFE or self._ending.is_set():
+                raise
+            device = self._devices[call.device]
+            seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
+            self._notify(call.device, seconds, str(lost))
+            return call.call()

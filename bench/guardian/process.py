@@ -1,0 +1,509 @@
+"""The guardian's main loop: requests of the bench, looks at the interlocks, and the safe state.
+
+One thread decides; the devices are asked in the threads of their lines. The bench promises with each request by when
+the next one comes. The run ends in the safe state when a promise is broken, the bench is gone, an interlock trips, or
+a device cannot be read.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import selectors
+import signal
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.clock import Clock, WallClock
+from bench.devices import Actuator, Status
+from bench.errors import BenchError, ConfigurationError, GuardianError
+from bench.guardian.black_box import BlackBox
+from bench.guardian.channel import Channel, ChannelError, Message, to_message
+from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.rig import Look, Rig
+from bench.safety import SAFE as IS_SAFE
+from bench.safety import InterlockWatch
+from bench.station.core import StationCore
+from bench.station.interface import News, masked
+
+_SAFE_WITHIN = 3.0
+"""Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""
+
+_TRY_AGAIN = 1.0
+"""Time after which a device that is not safe is tried again, s."""
+
+_TRY_FOR = 600.0
+"""Time for which it is tried, s."""
+
+_BLIND = 2.0
+"""Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
+
+_LONGEST_WAIT = 0.5
+"""Longest time between two turns of the loop, s."""
+
+
+@dataclass
+class _Job:
+    """Calls of several devices whose results belong together."""
+
+    waiting: set[str]
+    done: Callable[[dict[str, Any]], None]
+    failed: Callable[[BaseException], None]
+    values: dict[str, Any] = field(default_factory=dict)
+    error: BaseException | None = None
+
+
+class Guardian:
+    """Holds a rig for a bench in another process.
+
+    Parameters
+    ----------
+    channel : Channel
+        To the bench.
+    rig : Rig
+        Connected devices.
+    """
+
+    def __init__(self, channel: Channel, rig: Rig) -> None:
+        self._channel = channel
+        self._rig = rig
+        self._wall: Clock = WallClock()
+        safety = rig.file.safety
+        factor = float(getattr(rig.clock, "factor", 1.0))
+        units = {signal_.name: signal_.unit for signal_ in rig.signals}
+        self._core = StationCore(InterlockWatch(rig.file.interlocks, units), 1.0 / (safety.rate * min(factor, 10.0)))
+        self._watched = {interlock.signal for interlock in rig.file.interlocks}
+        self._looked_at = self._look_readers()
+        self._statuses: list[Status] = []
+        self._news: list[News] = []
+        self._box = BlackBox()
+        self._results: queue.SimpleQueue[tuple[Callable[[Result], None], Result]] = queue.SimpleQueue()
+        self._wake, self._woken = socket.socketpair()
+        for each in (self._wake, self._woken):
+            each.setblocking(False)
+        self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
+        self._looking = False
+        self._request: Message | None = None
+        self._last_seen = self._wall.now()
+        self._bench_is_there = True
+        self._writes_stacks = False
+        self._ending: float | None = None
+        self._unsafe: dict[str, str] = {}
+        self._safe: dict[str, str] | None = None
+        self._next_try = 0.0
+        self._stages: list[list[str]] = []
+        self._pending: set[str] = set()
+        self._reported = False
+        self._terminated = False
+
+    def begin(self, number: int, description: dict[str, Any]) -> None:
+        """Tell the bench what was connected, as the reply to its first request."""
+        self._request = {"n": number}
+        self._reply(description)
+
+    def serve(self) -> None:
+        """Serve until the run has ended and every device is safe, or 10 min were not enough for that."""
+        for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGPIPE", "SIGUSR1", "SIGUSR2"):
+            if (number := getattr(signal, name, None)) is not None:
+                signal.signal(number, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, self._terminate)
+        self._core.begin(self._wall.now())
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._channel, selectors.EVENT_READ, self._receive)
+            selector.register(self._woken, selectors.EVENT_READ, self._wake_up)
+            parent = _parent()
+            if parent is not None:
+                selector.register(parent, selectors.EVENT_READ, partial(self._lose_bench, "the bench has died"))
+            while not self._is_over():
+                wait = min(_LONGEST_WAIT, max(0.0, self._due() - self._wall.now()))
+                for key, _ in selector.select(wait):
+                    # Whatever fails here must not keep the devices from being made safe.
+                    try:
+                        key.data()
+                    except Exception as error:
+                        self._core.trip(_as_bench_error(error))
+                try:
+                    self._turn()
+                except Exception as error:
+                    self._core.trip(_as_bench_error(error))
+                if not self._bench_is_there:
+                    for lost in (self._channel, parent):
+                        with suppress(KeyError, ValueError, TypeError):
+                            selector.unregister(lost)  # type: ignore[arg-type]
+        self._box.note("end", safe=self._safe)
+        self._box.close()
+
+    # What has to be done now
+
+    def _due(self) -> float:
+        if self._ending is None:
+            return self._core.due()
+        return self._next_try
+
+    def _turn(self) -> None:
+        now = self._wall.now()
+        if self._terminated:
+            self._core.trip(GuardianError("the guardian was asked to end by SIGTERM"))
+        self._core.advance(now)
+        if self._request is not None:
+            self._last_seen = now
+        elif self._watched and now - self._last_seen > _BLIND + self._blind_allowance():
+            self._core.trip(GuardianError(f"the interlocks could not be looked at for {now - self._last_seen:.1f} s"))
+        if self._core.over:
+            self._keep_safe(now)
+        elif self._core.look_due(now) and not self._looking and self._looked_at:
+            self._looking = True
+            self._start(LOOK, self._looked_at, self._seen, self._blind)
+
+    def _is_over(self) -> bool:
+        if self._ending is None or self._safe is None or self._pending:
+            return False
+        all_safe = not self._unsafe
+        return (all_safe and (self._reported or not self._bench_is_there)) or (
+            not self._bench_is_there and self._wall.now() - self._ending > _TRY_FOR
+        )
+
+    # The bench
+
+    def _receive(self) -> None:
+        try:
+            messages = self._channel.receive()
+        except ChannelError as error:
+            self._lose_bench(str(error))
+            return
+        for message in messages:
+            self._take(message)
+
+    def _lose_bench(self, why: str) -> None:
+        if self._bench_is_there:
+            self._bench_is_there = False
+            self._request = None
+            self._core.trip(GuardianError(f"the bench is gone ({why})"))
+
+    def _take(self, message: Message) -> None:
+        do = message.get("do")
+        if self._request is not None and do != "end":
+            self._lose_bench("it asks before it was answered")
+            return
+        self._request = message
+        if do == "end":
+            self._core.end()
+            return
+        try:
+            self._core.request(self._wall.now())
+            _REQUESTS[str(do)](self, message)
+        except Exception as error:
+            self._refuse(error)
+
+    def _reply(self, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
+        self._answer(result=result)
+
+    def _refuse(self, error: BaseException) -> None:
+        if not isinstance(error, BenchError):
+            self._box.note("defect", error=f"{type(error).__name__}: {error}")
+        self._answer(error=to_message(error))
+
+    def _answer(self, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+        if self._request is None:
+            return
+        request, self._request = self._request, None
+        self._core.reply(self._wall.now())
+        news, self._news = self._news, []
+        cause = self._core.cause
+        try:
+            self._channel.send(
+                {
+                    "n": request.get("n"),
+                    "news": [asdict(each) for each in news],
+                    "tripped": None if cause is None else to_message(cause),
+                    **content,
+                }
+            )
+        except ChannelError as error:
+            self._lose_bench(str(error))
+
+    # Requests
+
+    def _promise(self, message: Message) -> None:
+        self._core.promise(float(message["seconds"]), str(message["why"]))
+        self._reply()
+
+    def _keep_record(self, message: Message) -> None:
+        self._box.keep_in(Path(message["folder"]))
+        self._writes_stacks = bool(message["stacks"])
+        self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
+        self._reply()
+
+    def _look(self, message: Message) -> None:
+        readers = self._rig.readers(Look(message["look"]), message["wanted"])
+
+        def done(readings: dict[str, Any]) -> None:
+            values = self._rig.assembled({name: readings[name] for name in readers})
+            self._judge(values)
+            self._reply(values)
+
+        self._start(BENCH, readers, done, self._refuse)
+
+    def _apply(self, message: Message) -> None:
+        setpoints = message["setpoints"]
+        actuators = {name: self._actuator(name) for name in setpoints}
+        for name, value in setpoints.items():
+            actuators[name].check(value)
+        self._core.arm()
+        calls = {name: partial(actuators[name].set, value) for name, value in setpoints.items()}
+
+        def done(statuses: dict[str, Status]) -> None:
+            self._statuses = [statuses[name] for name in setpoints]
+            self._reply({name: actuator.setpoint for name, actuator in actuators.items()})
+
+        self._start(BENCH, calls, done, self._refuse)
+
+    def _check(self, message: Message) -> None:
+        for name, values in message["setpoints"].items():
+            for value in values:
+                self._actuator(name).check(value)
+        self._reply()
+
+    def _arrivals(self, _message: Message) -> None:
+        statuses = {status.device: status for status in self._statuses}
+
+        def done(arrived: dict[str, bool]) -> None:
+            errors = [each for status in self._statuses if (each := status.exception()) is not None]
+            self._reply(
+                {
+                    "waiting": [name for name in statuses if not arrived[name]],
+                    "error": to_message(errors[0]) if errors else None,
+                }
+            )
+
+        self._start(BENCH, {name: status.update for name, status in statuses.items()}, done, self._refuse)
+
+    def _can_play(self, message: Message) -> None:
+        player = self._rig.block_player(message["inputs"], message["actuators"], message["period"])
+        self._reply(player is not None)
+
+    def _play(self, message: Message) -> None:
+        name = message["actuators"][0]
+        player = self._rig.block_player(message["inputs"], message["actuators"], message["period"])
+        if player is None:
+            raise ConfigurationError(f"{name} cannot carry out blocks by itself")
+        self._core.arm()
+        setpoints = np.array(message["setpoints"], dtype=np.float64)
+        self._start(
+            BENCH,
+            {name: lambda: player(setpoints)},
+            lambda readings: self._reply(readings[name].tolist()),
+            self._refuse,
+        )
+
+    def _operate(self, message: Message) -> None:
+        if self._rig.laboratory is None:
+            raise ConfigurationError("there is no emulated laboratory that could do it")
+        self._rig.laboratory.operate(message["task"], message["value"])
+        self._reply()
+
+    def _actuator(self, name: str) -> Actuator:
+        device = self._rig.devices.get(name)
+        if not isinstance(device, Actuator):
+            known = ", ".join(self._rig.description.limits) or "none"
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
+        return device
+
+    # Interlocks
+
+    def _look_readers(self) -> dict[str, Callable[[], dict[str, float]]]:
+        """Return what is asked at each look: what interlocks need, and what feeds the watchdogs of instruments."""
+        readers = self._rig.readers(Look.PART, self._watched)
+        for name, device in self._rig.devices.items():
+            if device.watchdog:
+                readers.setdefault(name, device.glance)
+        return {name: readers[name] for name in self._rig.devices if name in readers}
+
+    def _seen(self, readings: dict[str, Any]) -> None:
+        self._looking = False
+        values = self._rig.assembled({name: readings[name] for name in self._looked_at})
+        self._box.saw(values)
+        self._judge(values)
+
+    def _judge(self, values: dict[str, float]) -> None:
+        if self._watched <= values.keys():
+            self._last_seen = self._wall.now()
+            self._core.judge(self._rig.clock.now(), values)
+
+    def _blind(self, error: BaseException) -> None:
+        self._looking = False
+        self._core.trip(_as_bench_error(error))
+
+    def _blind_allowance(self) -> float:
+        return max((self._longest_away(name) for name in self._looked_at), default=0.0)
+
+    def _longest_away(self, name: str) -> float:
+        longest = self._rig.file.safety.reconnect
+        device = self._rig.devices[name]
+        if any(signal_.name in self._watched for signal_ in device.signals):
+            return min(longest, _BLIND)
+        return longest
+
+    def _line_was_away(self, name: str, seconds: float, why: str) -> None:
+        text = f"{name}: line lost for {seconds:.1f} s: {why}"
+        self._news.append(News("WARN", "line", text))
+        self._box.note("line", text=text)
+
+    # The safe state
+
+    def _keep_safe(self, now: float) -> None:
+        """Bring the devices into the safe state, and try again those that are not."""
+        if self._ending is None:
+            self._ending = now
+            self._next_try = now + _SAFE_WITHIN
+            self._lines.end()
+            cause = self._core.cause
+            self._box.note("safe", cause=None if cause is None else str(cause))
+            if self._core.late and self._writes_stacks:
+                _show_where_the_bench_stands()
+            order = [name for name in self._rig.file.safety.order if name in self._rig.devices]
+            others = [name for name in self._rig.devices if name not in order]
+            self._stages = [[name] for name in order] + ([others] if others else [])
+            self._unsafe = dict.fromkeys(self._rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
+            self._make_safe(self._stages.pop(0))
+        if not self._pending and self._stages:
+            self._make_safe(self._stages.pop(0))
+        complete = not self._pending and not self._stages
+        if self._safe is None and (complete or now - self._ending >= _SAFE_WITHIN):
+            while self._stages:
+                self._make_safe(self._stages.pop(0))
+            self._report_safe()
+            self._next_try = now + _TRY_AGAIN
+        if self._safe is not None:
+            if self._unsafe and now >= self._next_try:
+                self._next_try = now + _TRY_AGAIN
+                self._make_safe([name for name in self._unsafe if name not in self._pending])
+            self._report()
+
+    def _make_safe(self, names: list[str]) -> None:
+        for name in names:
+            self._pending.add(name)
+            self._submit(SAFE, name, self._rig.devices[name].safe, self._is_safe)
+
+    def _is_safe(self, result: Result) -> None:
+        self._pending.discard(result.device)
+        if result.error is None:
+            self._unsafe.pop(result.device, None)
+        else:
+            self._unsafe[result.device] = f"{type(result.error).__name__}: {result.error}"
+        self._box.note("device", device=result.device, state=self._unsafe.get(result.device, IS_SAFE))
+
+    def _report_safe(self) -> None:
+        self._safe = {name: self._unsafe.get(name, IS_SAFE) for name in self._rig.devices}
+        self._news += masked(self._rig.devices.values())
+
+    def _report(self) -> None:
+        """Answer a request that is open: with the end that it asked for, or with what has tripped the station."""
+        if self._request is None:
+            return
+        assert self._safe is not None
+        if self._request.get("do") == "end":
+            self._answer(result=self._safe)
+            self._reported = True
+        else:
+            self._refuse(self._core.cause or GuardianError("the run has ended already"))
+
+    # Devices
+
+    def _start(
+        self,
+        priority: int,
+        calls: Mapping[str, Callable[[], Any]],
+        done: Callable[[dict[str, Any]], None],
+        failed: Callable[[BaseException], None],
+    ) -> None:
+        job = _Job(set(calls), done, failed)
+        if not calls:
+            done({})
+        for name, call in calls.items():
+            self._submit(priority, name, call, partial(self._take_part, job))
+
+    def _submit(self, priority: int, device: str, call: Callable[[], Any], take: Callable[[Result], None]) -> None:
+        """Have something done on the line of a device; `take` is called by the main loop with what came of it."""
+        self._lines.submit(priority, device, call, partial(self._hand_over, take))
+
+    def _hand_over(self, take: Callable[[Result], None], result: Result) -> None:
+        # In the thread of a line.
+        self._results.put((take, result))
+        with suppress(OSError):
+            self._wake.send(b"\0")
+
+    def _wake_up(self) -> None:
+        with suppress(OSError):
+            self._woken.recv(4096)
+        while not self._results.empty():
+            take, result = self._results.get()
+            take(result)
+
+    def _take_part(self, job: _Job, result: Result) -> None:
+        job.waiting.discard(result.device)
+        job.values[result.device] = result.value
+        job.error = job.error or result.error
+        if job.waiting:
+            return
+        if job.error is not None:
+            job.failed(job.error)
+            return
+        try:
+            job.done(job.values)
+        # A derived signal, say, that cannot be computed.
+        except Exception as error:
+            job.failed(error)
+
+    def _terminate(self, _number: int, _frame: object) -> None:
+        self._terminated = True
+
+
+_REQUESTS: Mapping[str, Callable[[Guardian, Message], None]] = {
+    "promise": Guardian._promise,
+    "record": Guardian._keep_record,
+    "look": Guardian._look,
+    "apply": Guardian._apply,
+    "check": Guardian._check,
+    "arrivals": Guardian._arrivals,
+    "can-play": Guardian._can_play,
+    "play": Guardian._play,
+    "operate": Guardian._operate,
+}
+
+
+def lines_of(rig: Rig) -> dict[str, str]:
+    """Return the line of each device of a rig: its port where it has one, else a line of its own."""
+    return {entry.name: str(getattr(entry.settings, "port", entry.name)) for entry in rig.file.devices}
+
+
+def _as_bench_error(error: BaseException) -> BenchError:
+    if isinstance(error, BenchError):
+        return error
+    return GuardianError(f"the guardian failed: {type(error).__name__}: {error}")
+
+
+def _parent() -> int | None:
+    """Return a descriptor that becomes readable when the bench dies, where the system has one.
+
+    The channel alone does not do: a forked child of the bench keeps its end open.
+    """
+    if hasattr(os, "pidfd_open"):
+        with suppress(OSError):
+            return os.pidfd_open(os.getppid())
+    return None
+
+
+def _show_where_the_bench_stands() -> None:
+    """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
+    if hasattr(signal, "SIGUSR1") and sys.platform != "win32":
+        with suppress(OSError):
+            os.kill(os.getppid(), signal.SIGUSR1)

@@ -1,0 +1,309 @@
+"""A station whose devices a guardian holds, in another process."""
+
+from __future__ import annotations
+
+import faulthandler
+import math
+import signal
+import subprocess
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from bench.clock import Clock, Stopwatch
+from bench.description import RigDescription
+from bench.devices import DeviceDescription, Identity, Limits, Signal
+from bench.errors import AbortError, BenchError, GuardianError
+from bench.guardian.channel import ChannelError, Message, to_error
+from bench.guardian.start import start_guardian
+from bench.rig import Look
+from bench.rig_file import RigFile
+from bench.roles import Floats
+from bench.station.interface import Arrivals, News, Station
+
+_OPENING = 120.0
+"""Longest wait until all devices are connected, s."""
+
+_ANSWER = 15.0
+"""Longest wait for a reply beyond the time for which a line may be away, s."""
+
+_END = 5.0
+"""Longest wait for the safe state of all devices, s."""
+
+_ABORT = 2.0
+"""Time that an answer may take once the run has to end, s."""
+
+_SLICE = 0.2
+"""Longest single wait, s, so that a signal to the process is noticed soon."""
+
+STACKS_NAME = "stacks.txt"
+
+_STACKS: int | None = getattr(signal, "SIGUSR1", None)
+"""Signal at which the stacks of all threads are written, where the system has it."""
+
+
+@dataclass(frozen=True)
+class GuardedRig:
+    """What a guardian is to open.
+
+    Attributes
+    ----------
+    file : RigFile
+        The rig, as this process has read it.
+    rig : str
+        Name of a packaged rig, or path of a rig file.
+    overrides : mapping of str to str
+        Values of the rig file to replace, by dotted key.
+    attach : Path or None
+        Endpoints file of `bench emulate`, where the instruments are served.
+    seed : int
+        Seed of everything random in an emulated laboratory.
+    """
+
+    file: RigFile
+    rig: str
+    overrides: Mapping[str, str]
+    attach: Path | None
+    seed: int
+
+
+class RemoteStation(Station):
+    """A station in another process.
+
+    One request is outstanding at a time, and each has a number. A guardian that is lost is replaced by `rescue`,
+    which makes the devices safe; this process never opens a line.
+
+    Parameters
+    ----------
+    guarded : GuardedRig
+        What to open.
+    clock : Clock
+        The clock of the run.
+    rescue : callable
+        Makes the devices of the rig safe without a guardian; returns by device `safe`, or what went wrong.
+
+    Raises
+    ------
+    ConfigurationError
+        If the rig file is wrong, or the rig is in use.
+    DeviceError
+        If a device cannot be connected; nothing has moved.
+    GuardianError
+        If the guardian does not start.
+    """
+
+    def __init__(self, guarded: GuardedRig, clock: Clock, rescue: Callable[[], Mapping[str, str]]) -> None:
+        self.clock = clock
+        self._rescue = rescue
+        self._answer_within = _ANSWER + guarded.file.safety.reconnect
+        self._number = 0
+        self._news: list[News] = []
+        self._tripped: BenchError | None = None
+        self._promised: tuple[float, str] | None = None
+        self._setpoints: dict[str, float] = {}
+        self._safe: Mapping[str, str] | None = None
+        self._stacks: TextIO | None = None
+        self._process, self._channel = start_guardian()
+        try:
+            found = self._ask(
+                "hello",
+                _OPENING,
+                rig=guarded.rig,
+                overrides=dict(guarded.overrides),
+                attach=None if guarded.attach is None else str(guarded.attach),
+                seed=guarded.seed,
+            )
+        except BaseException:
+            self._channel.close()
+            raise
+        self.description = _description(guarded.file, found)
+        self._setpoints = dict.fromkeys(self.description.limits, math.nan)
+
+    @property
+    def has_operator(self) -> bool:
+        """Whether an emulated laboratory does what a prompt asks for."""
+        return self.description.file.emulated
+
+    def keep_record(self, folder: Path) -> None:
+        """Have the guardian keep its own record in the folder of the run.
+
+        If this process breaks a promise, the guardian has it write there where each of its threads stands.
+        """
+        if _STACKS is not None:
+            self._stacks = (folder / STACKS_NAME).open("w", encoding="utf-8")
+            faulthandler.register(_STACKS, self._stacks)
+        self._ask("record", folder=str(folder.resolve()), stacks=_STACKS is not None)
+
+    def promise(self, seconds: float, why: str) -> None:
+        """Promise that each request from now on is followed by the next one within so many seconds."""
+        if (seconds, why) != self._promised:
+            self._ask("promise", seconds=seconds, why=why)
+            self._promised = seconds, why
+
+    def look(self, look: Look, wanted: Collection[str] = ()) -> dict[str, float]:
+        """Read the devices; values by signal name."""
+        values: dict[str, float] = self._ask("look", look=look.value, wanted=list(wanted))
+        return values
+
+    def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
+        """Return a function that takes a quick reading of the devices that some signals come from."""
+        names = list(wanted)
+        return lambda: self._ask("look", look=Look.PART.value, wanted=names)
+
+    def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
+        """Return a function that sends those of some set-points that have changed."""
+
+        def move(setpoints: Sequence[float]) -> None:
+            changed = {
+                name: value
+                for name, value in zip(actuators, setpoints, strict=True)
+                if value != self._setpoints.get(name)
+            }
+            if changed:
+                self.apply(changed)
+
+        return move
+
+    def block_player(
+        self, inputs: Sequence[str], actuators: Sequence[str], period: float
+    ) -> Callable[[Floats], Floats] | None:
+        """Return what has an instrument carry out blocks of samples by itself; None if none can."""
+        asked: dict[str, Any] = {"inputs": list(inputs), "actuators": list(actuators), "period": period}
+        if not self._ask("can-play", **asked):
+            return None
+
+        def play(setpoints: Floats) -> Floats:
+            rows = self._ask("play", setpoints=setpoints.tolist(), **asked)
+            self._setpoints[actuators[0]] = float(setpoints[-1, 0])
+            return np.array(rows, dtype=np.float64)
+
+        return play
+
+    def check(self, setpoints: Mapping[str, Sequence[float]]) -> None:
+        """Raise LimitError if a device does not take one of its set-points; nothing is sent."""
+        self._ask("check", setpoints={name: list(values) for name, values in setpoints.items()})
+
+    def apply(self, setpoints: Mapping[str, float]) -> None:
+        """Send set-points; all are checked before any is sent."""
+        sent = self._ask("apply", setpoints={name: float(value) for name, value in setpoints.items()})
+        self._setpoints.update(sent)
+
+    def setpoint(self, device: str) -> float:
+        """Return the set-point that was last sent to a device; nan before the first."""
+        return self._setpoints[device]
+
+    def arrivals(self) -> Arrivals:
+        """Ask the devices that were sent set-points last how far they have come."""
+        found = self._ask("arrivals")
+        error = found["error"]
+        return Arrivals(tuple(found["waiting"]), None if error is None else to_error(error))
+
+    def judge(self, t: float, values: Mapping[str, float]) -> None:  # noqa: ARG002 - the guardian has judged them
+        """Raise what has tripped the station, now that the readings are recorded."""
+        if self._tripped is not None:
+            raise self._tripped
+
+    def sleep_until(self, instant: float) -> None:
+        """Let laboratory time pass up to an instant, s."""
+        self.clock.sleep_until(instant)
+
+    def operate(self, task: str, value: float) -> None:
+        """Have done by hand, in an emulated laboratory, what a prompt asks for."""
+        self._ask("operate", task=task, value=value)
+
+    def news(self) -> list[News]:
+        """Return what happened since the last call, oldest first."""
+        news, self._news = self._news, []
+        return news
+
+    def end(self) -> Mapping[str, str]:
+        """Bring every device into its safe state; return by device `safe`, or what went wrong."""
+        if self._safe is None:
+            try:
+                self._safe = self._ask("end", _END)
+            except BenchError as error:
+                self._safe = self._rescued(error)
+        return self._safe
+
+    def close(self) -> None:
+        """Leave the guardian, which ends once every device is safe."""
+        if self._stacks is not None and _STACKS is not None:
+            faulthandler.unregister(_STACKS)
+            self._stacks.close()
+            path = Path(self._stacks.name)
+            if not path.stat().st_size:
+                path.unlink()
+            self._stacks = None
+        self._channel.close()
+        try:
+            self._process.wait(_END)
+        except subprocess.TimeoutExpired:
+            # It goes on until what is not safe yet is safe.
+            self._process.returncode = 0
+
+    def _rescued(self, error: BenchError) -> Mapping[str, str]:
+        """Make sure that the guardian is dead, and make the devices safe without it."""
+        self._process.kill()
+        self._process.wait()
+        self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
+        return self._rescue()
+
+    def _ask(self, do: str, within: float | None = None, **content: Any) -> Any:  # noqa: ANN401 - what JSON holds
+        """Send a request and return what is replied.
+
+        Raises
+        ------
+        BenchError
+            What the guardian answered, or what has tripped the station.
+        GuardianError
+            If it is gone, or does not answer.
+        """
+        if self._tripped is not None and do != "end":
+            raise self._tripped
+        self._number += 1
+        waited = Stopwatch()
+        within = within or self._answer_within
+        try:
+            self._channel.send({"n": self._number, "do": do, **content})
+            while True:
+                if self._channel.wait(_SLICE):
+                    for reply in self._channel.receive():
+                        if reply.get("n") == self._number:
+                            return self._taken(reply)
+                elif waited.seconds() > within:
+                    raise ChannelError(f"it has not answered for {within:g} s")
+                elif do != "end" and self.clock.interrupted() and waited.seconds() > _ABORT:
+                    raise AbortError(f"ended while the guardian had not answered for {waited.seconds():.0f} s")
+        except ChannelError as error:
+            raise GuardianError(
+                f"the guardian, which holds the lines of the instruments, was lost: {error}"
+            ) from None
+
+    def _taken(self, reply: Message) -> Any:  # noqa: ANN401 - what JSON holds
+        self._news += [News(**each) for each in reply.get("news", ())]
+        if reply.get("tripped") is not None:
+            self._tripped = to_error(reply["tripped"])
+        if "error" in reply:
+            raise to_error(reply["error"])
+        return reply["result"]
+
+
+def _description(file: RigFile, found: Message) -> RigDescription:
+    kinds = {entry.name: entry.driver for entry in file.devices}
+    devices = {}
+    for name, content in found["devices"].items():
+        setpoint, limits = content["setpoint_signal"], content["limits"]
+        devices[name] = DeviceDescription(
+            name=name,
+            kind=kinds[name],
+            identity=Identity(**content["identity"]),
+            signals=tuple(Signal(**signal) for signal in content["signals"]),
+            setpoint_signal=None if setpoint is None else Signal(**setpoint),
+            limits=None if limits is None else Limits(**limits),
+            watchdog=content["watchdog"],
+            safe_within=content["safe_within"],
+        )
+    return RigDescription(file, devices, tuple(Signal(**signal) for signal in found["signals"]))

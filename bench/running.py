@@ -1,0 +1,252 @@
+"""The run at hand: lets laboratory time pass, takes readings, and writes them down before anybody is notified."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Protocol
+
+from bench.control.tracking import Trace
+from bench.errors import AbortError, ConfigurationError
+from bench.interrupts import Interrupts
+from bench.journal import Event, Journal, StepRecord
+from bench.protocol.vocabulary import LATENESS, TRACES, Reading
+from bench.rig import Look
+from bench.settling import Settled
+from bench.station.interface import Station
+
+RESUME = "resume"
+ABORT = "abort"
+
+TRACE_NAMES = tuple(signal.name for signal in TRACES)
+NOT_AT_WORK = dict.fromkeys((*TRACE_NAMES, LATENESS.name), math.nan)
+
+_GRACE = 2.0
+"""Wall-clock time beyond the next tick by which the station expects to hear from a hold, s."""
+
+
+class Observer(Protocol):
+    """Watches a run: the dashboard, the progress display. No method may block; an observer that raises is dropped."""
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """See one tick of a hold; `values` in the order of the rig's signals."""
+
+    def step(self, record: StepRecord) -> None:
+        """See a finished step."""
+
+    def event(self, event: Event) -> None:
+        """See something that happened."""
+
+
+class RunAtHand:
+    """What all parts of a run share: its station and clock, its record, its observers, and the operator.
+
+    Parameters
+    ----------
+    station : Station
+        Connected devices.
+    journal : Journal
+        Written before any observer is notified.
+    observers : iterable of Observer
+        Notified after the journal.
+    interrupts : Interrupts
+        What the operator and the system ask for.
+    ask : callable, optional
+        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
+
+    Attributes
+    ----------
+    period : float
+        Laboratory time between two ticks of a hold, s.
+    phase : str
+        Part of the protocol that is carried out.
+    steps : int
+        Number of finished steps.
+    trace : dict of str to float
+        What a controller thinks, for the record.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        journal: Journal,
+        observers: Iterable[Observer],
+        interrupts: Interrupts,
+        ask: Callable[[str], str] | None,
+    ) -> None:
+        self.station = station
+        self.clock = station.clock
+        self.period = station.description.file.telemetry.period
+        self.names = tuple(signal.name for signal in journal.signals)
+        self.phase = ""
+        self.steps = 0
+        self.trace = NOT_AT_WORK
+        self.ask = ask
+        self._journal = journal
+        self._observers = tuple(observers)
+        self._interrupts = interrupts
+
+    def expect_ticks(self, what: str) -> None:
+        """Promise the station a request with each tick."""
+        self.station.promise(self.period + _GRACE, what)
+
+    def look(self, look: Look = Look.GLANCE, wanted: Collection[str] = ()) -> dict[str, float]:
+        """Read the signals; return the values together with what a controller thinks."""
+        return self.station.look(look, wanted) | self.trace
+
+    def tick(self) -> dict[str, float]:
+        """Take a quick reading of all signals, record it, and have it judged by the interlocks."""
+        values = self.look()
+        self.record_tick(self.clock.now(), values)
+        return values
+
+    def record_tick(self, t: float, values: Mapping[str, float]) -> None:
+        """Record quick readings, and have them judged by the interlocks."""
+        row = tuple(values[name] for name in self.names)
+        self._journal.telemetry(t, self.steps, row)
+        self._tell(lambda observer: observer.telemetry(t, self.steps, row))
+        self.judge(t, values)
+
+    def judge(self, t: float, values: Mapping[str, float]) -> None:
+        """Have readings judged by the interlocks; record what happened at the station meanwhile."""
+        try:
+            self.station.judge(t, values)
+        finally:
+            self.take_news()
+
+    def take_news(self) -> None:
+        """Record what happened at the station since the last call."""
+        for news in self.station.news():
+            self.event(news.level, news.kind, news.text)
+
+    def tick_after(self, tick: float) -> float:
+        """Return when the tick after one is due; missed ticks are skipped, not caught up."""
+        return tick + self.period * (1 + max(0, math.floor((self.clock.now() - tick) / self.period)))
+
+    def hold_until(self, end: float, started: float) -> None:
+        """Let time pass up to an instant, with ticks counted from `started` on."""
+        tick = 1
+        # No tick closer to the end than rounding could bring it: the reading follows there.
+        while (instant := started + tick * self.period) < end - 1e-6 * self.period:
+            self.sleep_until(instant)
+            self.tick()
+            self.pause_if_asked()
+            tick = max(tick + 1, math.floor((self.clock.now() - started) / self.period))
+        self.sleep_until(end)
+
+    def sleep_until(self, instant: float) -> None:
+        """Let time pass up to an instant.
+
+        Raises AbortError if the run has to end, and what has tripped the station meanwhile.
+        """
+        self.raise_if_aborted()
+        self.station.sleep_until(instant)
+        self.raise_if_aborted()
+        if (seconds := self.clock.suspension()) > 0:
+            # The next reading finds what the watchdogs have done meanwhile.
+            self.event(
+                "WARN",
+                "suspended",
+                f"the machine was suspended for {seconds:.0f} s: the set-points stood, nothing was recorded, and "
+                "watchdogs may have switched outputs off",
+            )
+
+    def finish_step(
+        self,
+        started: float,
+        label: str,
+        setpoints: Mapping[str, float],
+        values: Mapping[str, float],
+        settled: Settled,
+    ) -> Reading:
+        """Write a step down, then notify the observers."""
+        finished = self.clock.now()
+        record = StepRecord(
+            step=self.steps,
+            started=started,
+            finished=finished,
+            phase=self.phase,
+            label=label,
+            settled=settled,
+            setpoints=setpoints,
+            values=tuple(values[name] for name in self.names),
+        )
+        self._journal.step(record)
+        self.steps += 1
+        self._tell(lambda observer: observer.step(record))
+        return Reading(record.step, finished, record.settled, values)
+
+    def event(self, level: str, kind: str, text: str) -> None:
+        """Write down that something happened, then notify the observers."""
+        event = Event(self.clock.now(), level, kind, text)
+        self._journal.event(event)
+        self._tell(lambda observer: observer.event(event))
+
+    def check_signals(self, *names: str) -> None:
+        """Raise ConfigurationError if the rig lacks a signal."""
+        for name in names:
+            if name not in self.names:
+                raise ConfigurationError(f"{name} is not a signal of this rig; there are: {', '.join(self.names)}")
+
+    def raise_if_aborted(self) -> None:
+        """Raise AbortError if the operator or the system has asked for the end."""
+        if self._interrupts.abort_reason is not None:
+            self._interrupts.acknowledge()
+            raise AbortError(f"ended by {self._interrupts.abort_reason}")
+
+    @property
+    def pause_requested(self) -> bool:
+        """Whether the operator has asked for a pause."""
+        return self._interrupts.pause_requested
+
+    def pause_if_asked(self) -> float:
+        """Pause if the operator has asked for it; return for how long, s.
+
+        The set-points stand meanwhile; telemetry and interlocks go on. Raises AbortError if the run is to end.
+        """
+        self.raise_if_aborted()
+        if not self._interrupts.pause_requested:
+            return 0.0
+        if self.ask is None:
+            raise AbortError("ended by Ctrl-C; no operator is present to resume")
+        since = self.clock.now()
+        self.event("WARN", "pause", "paused by the operator; the set-points stand")
+        answer = self.await_answer(self.ask, "paused:")
+        self._interrupts.pause_requested = False
+        if answer != RESUME:
+            raise AbortError("ended by the operator at a pause")
+        self.event("INFO", "resume", "resumed")
+        return self.clock.now() - since
+
+    def await_answer(self, ask: Callable[[str], str], question: str) -> str:
+        """Have the operator asked, with telemetry and interlocks going on; return the answer."""
+        self.expect_ticks("the operator is asked")
+        answer: list[str] = []
+        asking = threading.Thread(target=lambda: answer.append(ask(question)), name="ask-operator", daemon=True)
+        asking.start()
+        while asking.is_alive():
+            if self.clock.sleep_waits:
+                # Interlocks and watchdogs do not pause.
+                self.sleep_until(self.clock.now() + self.period)
+                self.tick()
+            else:
+                asking.join(0.1)
+                self.raise_if_aborted()
+        return answer[0] if answer else ABORT
+
+    def _tell(self, what: Callable[[Observer], None]) -> None:
+        for observer in self._observers:
+            try:
+                what(observer)
+            # A terminal or a viewer that is gone must not end a run of hours.
+            except Exception as error:
+                self._observers = tuple(other for other in self._observers if other is not observer)
+                name = type(observer).__name__
+                self.event("WARN", "observer", f"{name} was dropped: {type(error).__name__}: {error}")
+
+
+def traced(trace: Trace) -> dict[str, float]:
+    """Return what a controller thinks, for the record."""
+    thoughts = (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty)
+    return dict(zip(TRACE_NAMES, thoughts, strict=True)) | {LATENESS.name: math.nan}

@@ -1,0 +1,1 @@
+"""What the engine talks to: a rig with its interlocks and its safe state, in this process or held by a guardian."""

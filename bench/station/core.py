@@ -1,0 +1,150 @@
+"""What a station decides: when it looks at the interlocks, whether the bench is late, and what ends the run.
+
+One class without thread, socket, device or clock of its own: the caller says what time it is. So the same decisions
+are taken on a virtual clock and in the process that guards hardware.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import Enum
+
+from bench.errors import BenchError, DeviceError, GuardianError, InterlockError
+from bench.safety import InterlockWatch
+
+
+class State(Enum):
+    """How far a station is."""
+
+    IDLE = "idle"
+    """Nothing has been sent to a device yet."""
+    ARMED = "armed"
+    """An output may be on: the bench has to keep its promises."""
+    TRIPPED = "tripped"
+    """In the safe state, for good: what the bench still asks for is refused."""
+    ENDED = "ended"
+    """In the safe state, as the bench asked for it."""
+
+
+class StationCore:
+    """The state of a station.
+
+    Parameters
+    ----------
+    watch : InterlockWatch
+        The interlocks.
+    interval : float
+        Time between two looks at the interlocks, s; infinity if they are looked at with the readings only.
+
+    Attributes
+    ----------
+    state : State
+        How far it is.
+    cause : BenchError or None
+        What tripped it.
+    late : bool
+        Whether that was a promise of the bench.
+    """
+
+    def __init__(self, watch: InterlockWatch, interval: float) -> None:
+        self._watch = watch
+        self._interval = interval
+        self._next_look = math.inf
+        self._lease_end = math.inf
+        self._promised = math.inf
+        self._why = ""
+        self._asked = False
+        self._seen: float | None = None
+        self.state = State.IDLE
+        self.cause: BenchError | None = None
+        self.late = False
+
+    @property
+    def over(self) -> bool:
+        """Whether the station is in its safe state for good."""
+        return self.state in (State.TRIPPED, State.ENDED)
+
+    def begin(self, now: float) -> None:
+        """Begin to look at the interlocks, every interval from `now` on."""
+        self._next_look = now + self._interval
+
+    def promise(self, seconds: float, why: str) -> None:
+        """Take the promise that each request is followed by the next one within so many seconds."""
+        self._promised, self._why = seconds, why
+
+    def arm(self) -> None:
+        """Note that an output may be on from now on."""
+        if self.state is State.IDLE:
+            self.state = State.ARMED
+
+    def request(self, now: float) -> None:
+        """Begin with a request of the bench.
+
+        Raises what tripped the station, or a promise that was broken before the request came.
+        """
+        self.advance(now)
+        if self.over:
+            raise self.cause or GuardianError("the run has ended already")
+        self._asked = True
+
+    def reply(self, now: float) -> None:
+        """End a request of the bench: its promise counts from here."""
+        self._asked = False
+        self._lease_end = now + self._promised
+
+    def due(self) -> float:
+        """Return when there is something to do next: a look, or the end of the promise."""
+        if self.over:
+            return math.inf
+        return min(self._next_look, self._lease())
+
+    def look_due(self, now: float) -> bool:
+        """Return whether the interlocks have to be looked at; the next look is an interval later then."""
+        if self.over or now < self._next_look:
+            return False
+        # Looks that were missed are not made up for.
+        missed = math.floor((now - self._next_look) / self._interval)
+        self._next_look += self._interval * (1 + missed)
+        return True
+
+    def advance(self, now: float) -> None:
+        """Trip if the bench has broken its promise."""
+        if self._lease() <= now:
+            self.late = True
+            self.trip(
+                GuardianError(
+                    f"the bench has not come back within the {self._promised:g} s that it promised ({self._why}); "
+                    "every device was made safe"
+                )
+            )
+
+    def judge(self, t: float, values: Mapping[str, float]) -> None:
+        """Judge readings by the interlocks; trip if one is not met."""
+        self._seen = t
+        if self.over:
+            return
+        try:
+            self._watch.check(t, values)
+        except InterlockError as error:
+            self.trip(error)
+
+    def blind(self, error: DeviceError) -> None:
+        """Trip as what the interlocks need cannot be read."""
+        self.trip(error)
+
+    def trip(self, cause: BenchError) -> None:
+        """End the run in the safe state; the first cause counts."""
+        if not self.over:
+            self.state, self.cause = State.TRIPPED, cause
+
+    def end(self) -> None:
+        """End the run in the safe state, as the bench asks for it."""
+        if not self.over:
+            self.state = State.ENDED
+
+    def _lease(self) -> float:
+        # While a request is carried out the bench waits, and cannot be late.
+        if self.state is not State.ARMED or self._asked:
+            return math.inf
+        return self._lease_end

@@ -1,0 +1,175 @@
+"""A station whose devices are in this process: emulated ones as a rule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
+
+from bench.devices import Actuator, Status
+from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.rig import Look, Rig
+from bench.roles import Floats
+from bench.safety import InterlockWatch, make_safe
+from bench.station.core import StationCore
+from bench.station.interface import Arrivals, News, Station, arrivals_of, masked
+from bench.station.reconnection import reconnect
+
+_T = TypeVar("_T")
+
+
+class LocalStation(Station):
+    """A station on a rig of this process, driven by the clock of the run in the caller's thread.
+
+    Parameters
+    ----------
+    rig : Rig
+        Connected devices.
+    interlock_rate : float, optional
+        Looks at the interlocks in a laboratory second, Hz, beside those with each reading and each tick of the
+        telemetry. None for no others: on a virtual clock each look costs as much as a tick.
+    """
+
+    def __init__(self, rig: Rig, interlock_rate: float | None = None) -> None:
+        self._rig = rig
+        self.clock = rig.clock
+        self.description = rig.description
+        units = {signal.name: signal.unit for signal in rig.signals}
+        self._core = StationCore(
+            InterlockWatch(rig.file.interlocks, units), 1.0 / interlock_rate if interlock_rate else math.inf
+        )
+        self._watched = [interlock.signal for interlock in rig.file.interlocks]
+        self._core.begin(self.clock.now())
+        self._statuses: list[Status] = []
+        self._news: list[News] = []
+        self._safe: Mapping[str, str] | None = None
+
+    @property
+    def has_operator(self) -> bool:
+        """Whether an emulated laboratory does what a prompt asks for."""
+        return self._rig.laboratory is not None
+
+    def promise(self, seconds: float, why: str) -> None:
+        """Promise that each request from now on is followed by the next one within so many seconds."""
+        self._core.promise(seconds, why)
+
+    def look(self, look: Look, wanted: Collection[str] = ()) -> dict[str, float]:
+        """Read the devices; values by signal name."""
+        readers = self._rig.readers(look, wanted)
+        return self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+
+    def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
+        """Return a function that takes a quick reading of the devices that some signals come from."""
+        return self._rig.quick_reader(wanted)
+
+    def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
+        """Return a function that sends those of some set-points that have changed."""
+        devices = [self._actuator(name) for name in actuators]
+        self._core.arm()
+
+        def move(setpoints: Sequence[float]) -> None:
+            changed = [
+                (actuator, value)
+                for actuator, value in zip(devices, setpoints, strict=True)
+                if value != actuator.setpoint
+            ]
+            # None is sent when another is wrong.
+            if len(changed) > 1:
+                for actuator, value in changed:
+                    actuator.check(value)
+            for actuator, value in changed:
+                actuator.set(value)
+
+        return move
+
+    def block_player(
+        self, inputs: Sequence[str], actuators: Sequence[str], period: float
+    ) -> Callable[[Floats], Floats] | None:
+        """Return what has an instrument carry out blocks of samples by itself; None if none can."""
+        self._core.arm()
+        return self._rig.block_player(inputs, actuators, period)
+
+    def check(self, setpoints: Mapping[str, Sequence[float]]) -> None:
+        """Raise LimitError if a device does not take one of its set-points; nothing is sent."""
+        for name, values in setpoints.items():
+            actuator = self._actuator(name)
+            for value in values:
+                actuator.check(value)
+
+    def apply(self, setpoints: Mapping[str, float]) -> None:
+        """Send set-points; all are checked before any is sent."""
+        self.check({name: (value,) for name, value in setpoints.items()})
+        self._core.arm()
+        self._statuses = []
+        for name, value in setpoints.items():
+            self._statuses.append(self._ask(name, partial(self._actuator(name).set, value)))
+
+    def setpoint(self, device: str) -> float:
+        """Return the set-point that was last sent to a device; nan before the first."""
+        return self._actuator(device).setpoint
+
+    def arrivals(self) -> Arrivals:
+        """Ask the devices that were sent set-points last how far they have come."""
+        return arrivals_of(self._statuses)
+
+    def judge(self, t: float, values: Mapping[str, float]) -> None:
+        """Judge readings that were recorded by the interlocks."""
+        self._core.judge(t, values)
+        self._raise_if_tripped()
+
+    def sleep_until(self, instant: float) -> None:
+        """Let laboratory time pass up to an instant, s; looks at the interlocks that are due on the way are taken."""
+        while (due := self._core.due()) < instant and not self.clock.interrupted():
+            self.clock.sleep_until(due)
+            now = self.clock.now()
+            self._core.advance(now)
+            if self._core.look_due(now):
+                self._core.judge(now, self.look(Look.PART, self._watched))
+            self._raise_if_tripped()
+        self.clock.sleep_until(instant)
+
+    def operate(self, task: str, value: float) -> None:
+        """Have done by hand, in an emulated laboratory, what a prompt asks for."""
+        if self._rig.laboratory is None:
+            raise ConfigurationError("there is no emulated laboratory that could do it")
+        self._rig.laboratory.operate(task, value)
+
+    def news(self) -> list[News]:
+        """Return what happened since the last call, oldest first."""
+        if not self._news:
+            return []
+        news, self._news = self._news, []
+        return news
+
+    def end(self) -> Mapping[str, str]:
+        """Bring every device into its safe state; return by device `safe`, or what went wrong."""
+        self._core.end()
+        if self._safe is None:
+            self._safe = make_safe(self._rig.devices.values())
+            self._news += masked(self._rig.devices.values())
+        return self._safe
+
+    def close(self) -> None:
+        """Release the lines; each device keeps the state that it is in."""
+        self._rig.close()
+
+    def _actuator(self, name: str) -> Actuator:
+        device = self._rig.devices.get(name)
+        if not isinstance(device, Actuator):
+            known = ", ".join(self.description.limits) or "none"
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
+        return device
+
+    def _ask(self, name: str, call: Callable[[], _T]) -> _T:
+        try:
+            return call()
+        except DeviceConnectionError as error:
+            device = self._rig.devices[name]
+            seconds = reconnect(device, error, self.clock, self._rig.file.safety.reconnect, lambda: self._core.over)
+            self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
+            return call()
+
+    def _raise_if_tripped(self) -> None:
+        if self._core.cause is not None:
+            raise self._core.cause

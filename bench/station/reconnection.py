@@ -1,0 +1,61 @@
+"""A line that is lost is opened again, for as long as the rig file allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bench.clock import Clock
+from bench.devices import Device
+from bench.errors import DeviceConnectionError
+
+_INTERVAL = 0.2
+"""Time between two attempts, s."""
+
+_SHARE_OF_WATCHDOG = 0.6
+"""Share of its own watchdog's time for which an instrument may be out of reach."""
+
+
+def reconnect(
+    device: Device, lost: DeviceConnectionError, clock: Clock, longest: float, given_up: Callable[[], bool]
+) -> float:
+    """Open the line of a device again, by one attempt after another.
+
+    Parameters
+    ----------
+    device : Device
+        The device, of which a request has just failed.
+    lost : DeviceConnectionError
+        What it failed with.
+    clock : Clock
+        The clock of the run.
+    longest : float
+        How long the line may be away, s; an instrument with a watchdog only for 0.6 of its time.
+    given_up : callable
+        Whether the run has ended meanwhile.
+
+    Returns
+    -------
+    float
+        How long the line was away, s.
+
+    Raises
+    ------
+    DeviceConnectionError
+        What it failed with, if the line is not back in time.
+    DeviceError
+        If the instrument is not as it was left, or its driver cannot open the line again.
+    """
+    if type(device).reconnect is Device.reconnect:
+        raise lost
+    if device.watchdog:
+        longest = min(longest, _SHARE_OF_WATCHDOG * device.watchdog)
+    start = clock.now()
+    while True:
+        try:
+            device.reconnect()
+        except DeviceConnectionError:
+            if clock.now() - start >= longest or given_up() or clock.interrupted():
+                raise lost from None
+            clock.sleep(_INTERVAL)
+        else:
+            return clock.now() - start
