@@ -23,7 +23,7 @@ def matrix():
         ("vo2", "tec.unplug"),
         ("vo2", "tec-over-current"),
         ("sma", "supply.double"),
-        ("sma", "t7.cut"),
+        ("sma", "load_cell.corrupt"),
         ("sma", "broken-muscle"),
         ("hybrid", "tec.corrupt"),
         ("hybrid", "amplifier-trips"),
