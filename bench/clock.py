@@ -205,7 +205,8 @@ class VirtualClock(Clock):
         """Jump to `instant` exactly, free of the rounding that adding up differences would bring."""
         _check_finite(instant)
         with self._lock:
-            self._now = max(self._now, instant)
+            if instant > self._now:
+                self._now = instant
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,11 @@ class Engine:
             Prompt: self._prompt,
         }
 
+    def warn(self, warnings: Iterable[str]) -> None:
+        """Record what was accepted at the start only as an operator is present."""
+        for text in warnings:
+            self._run.event("WARN", "start", text)
+
     def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
         """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
         start = self._clock.now()

@@ -17,7 +17,7 @@ from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, S
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
 from bench.rig_file import DeviceEntry, Laboratory, RigFile
-from bench.roles import BlockPlayer, Floats
+from bench.roles import BlockPlayer, Floats, JointReader
 from bench.safety import SAFE, make_safe
 
 
@@ -125,7 +125,7 @@ class Rig:
         sources = self._sources(wanted)
         readers = {}
         for name, device in self.devices.items():
-            is_wanted = any(signal.name in sources for signal in device.signals)
+            is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
             if look is Look.MEASURE or (look is Look.SAMPLE and is_wanted):
                 readers[name] = device.measure
             elif look is not Look.PART or is_wanted:
@@ -138,7 +138,8 @@ class Rig:
         It returns what these devices deliver and the derived ones of the signals; set-points are not among them.
         """
         sources = self._sources(wanted)
-        readers = list(self.readers(Look.PART, wanted).values())
+        names = self.readers(Look.PART, wanted)
+        readers = _quick_readers([self.devices[name] for name in names])
         derived = [(name, each.compute) for name, each in self.derived.items() if name in sources]
 
         def read() -> dict[str, float]:
@@ -249,6 +250,23 @@ def clock_for(file: RigFile, name: str) -> Clock:
     if name != "wall" and not file.in_process:
         raise ConfigurationError(f"rig {file.name} has real devices, which know only the wall clock")
     return clock
+
+
+def _quick_readers(devices: Sequence[Device]) -> list[Callable[[], dict[str, float]]]:
+    """Return what takes quick readings of devices in their order; neighbours that can be read in one request are."""
+    readers: list[Callable[[], dict[str, float]]] = []
+    first = 0
+    while first < len(devices):
+        device, end = devices[first], first + 1
+        reader = device.glance
+        if isinstance(device, JointReader):
+            while end < len(devices) and device.joins(devices[end]):
+                end += 1
+            if end > first + 1:
+                reader = device.joined(devices[first + 1 : end])
+        readers.append(reader)
+        first = end
+    return readers
 
 
 def _play(player: BlockPlayer, sensor: Device, period: float, setpoints: Floats) -> Floats:

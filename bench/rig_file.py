@@ -24,9 +24,16 @@ A rig file is TOML::
     expression = "2 * spot_position / length ** 2"
     ...
 
-    [[interlocks]]                                 # the run ends in the safe state outside of these
-    signal = "plate_sink_temperature"
+    [[interlocks]]                                 # the run ends in the safe state outside of these; what else
+    signal = "plate_sink_temperature"              # an interlock can watch and do is in `bench.interlocks`
     high = 60.0
+
+    [safety]                                       # on hardware; these are the defaults
+    rate = 5.0                                     # Hz, at which interlocks are looked at
+    reconnect = 10.0                               # s for which a line may be lost
+    patience = 10.0                                # s for which a protocol may compute
+    order = []                                     # devices in the order of their safe state
+    unattended = true                              # false: an operator stays with the rig
 
     [telemetry]
     period = 1.0                                   # s between two quick readings during holds
@@ -66,8 +73,8 @@ from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
 from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
+from bench.interlocks import Interlock
 from bench.layout import DashboardLayout
-from bench.safety import Interlock
 
 
 class _Table(BaseModel):
@@ -88,15 +95,26 @@ class TelemetryTable(_Table):
 
 
 class SafetyTable(_Table):
-    """The table `[safety]`."""
+    """The table `[safety]`: how a rig is guarded while a run goes on."""
 
-    rate: float = Field(default=5.0, ge=0.1, le=50, description="looks at the interlocks in a second on hardware, Hz")
-    reconnect: float = Field(default=10.0, ge=0, le=600, description="how long a lost line may be away, s")
+    rate: float = Field(
+        default=5.0,
+        ge=0.1,
+        le=50,
+        description="looks at the interlocks of hardware, of their own, Hz",
+    )
+    reconnect: float = Field(
+        default=10.0, ge=0, le=600, description="how long a line may be lost before the run ends, s; 0 for not at all"
+    )
     patience: float = Field(
-        default=10.0, gt=0, le=600, description="how long a protocol may compute between two messages, s"
+        default=10.0, gt=0, le=600, description="how long a protocol may compute between two of its messages, s"
     )
     order: tuple[str, ...] = Field(
-        default=(), description="devices that are made safe before the others, one after the other"
+        default=(), description="devices that are brought into their safe state one after another, in this order"
+    )
+    unattended: bool = Field(
+        default=True,
+        description="whether no operator is present, so that a device that heats needs a watchdog and an interlock",
     )
 
 
@@ -330,6 +348,9 @@ def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # no
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     *parents, last = key.split(".")
+    if parents in (["telemetry"], ["safety"]):
+        # Tables with defaults for every key, which a file may leave out.
+        content.setdefault(parents[0], {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
@@ -350,6 +371,11 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         loaded = _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
         if loaded is not None:
             entries.append(DeviceEntry(device, *loaded))
+    for i, device in enumerate(order := tables.safety.order):
+        if device not in tables.devices or device in order[:i]:
+            found.append(
+                f"safety.order: {device!r}: expected devices, each once; there are: {', '.join(tables.devices)}"
+            )
     derived: dict[str, DerivedSignal] = {}
     for name, table in tables.derived.items():
         key = f"derived.{name}."

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -99,6 +99,20 @@ class VoltageSupply(Actuator):
     def setpoint_signal(self) -> Signal:
         """The voltage asked for."""
         return Signal(f"{self.name}_setpoint", "V", f"{self.output} voltage set-point", 3)
+
+
+@runtime_checkable
+class JointReader(Protocol):
+    """A device that can be read together with others on the same line, in one request."""
+
+    def joins(self, other: Device) -> bool:
+        """Return whether `joined` takes another device."""
+
+    def joined(self, others: Sequence[Device]) -> Callable[[], dict[str, float]]:
+        """Return what takes a quick reading of this device and the others, in this order.
+
+        It returns what the `glance` of each would have returned, and raises what the first that fails raises.
+        """
 
 
 @runtime_checkable

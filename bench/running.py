@@ -86,6 +86,7 @@ class RunAtHand:
         self._journal = journal
         self._observers = tuple(observers)
         self._interrupts = interrupts
+        self._pause_reason = ""
 
     def expect_ticks(self, what: str) -> None:
         """Promise the station a request with each tick."""
@@ -197,27 +198,41 @@ class RunAtHand:
 
     @property
     def pause_requested(self) -> bool:
-        """Whether the operator has asked for a pause."""
-        return self._interrupts.pause_requested
+        """Whether the operator or an interlock has asked for a pause, or an interlock holds the set-points."""
+        return self._interrupts.pause_requested or self._held()
+
+    def _held(self) -> bool:
+        if why := self.station.take_pause():
+            self._pause_reason = why
+        return bool(self._pause_reason) or self.station.is_holding
 
     def pause_if_asked(self) -> float:
-        """Pause if the operator has asked for it; return for how long, s.
+        """Pause if the operator or an interlock has asked for it; return for how long, s.
 
         The set-points stand meanwhile; telemetry and interlocks go on. Raises AbortError if the run is to end.
         """
         self.raise_if_aborted()
-        if not self._interrupts.pause_requested:
+        if not self.pause_requested:
             return 0.0
-        if self.ask is None:
-            raise AbortError("ended by Ctrl-C; no operator is present to resume")
         since = self.clock.now()
-        self.event("WARN", "pause", "paused by the operator; the set-points stand")
+        self.expect_ticks("the set-points are held")
+        while self.station.is_holding:
+            self.sleep_until(self.clock.now() + self.period)
+            self.tick()
+        if self._interrupts.pause_requested or self._pause_reason:
+            self._pause()
+        return self.clock.now() - since
+
+    def _pause(self) -> None:
+        why, self._pause_reason = self._pause_reason, ""
+        if self.ask is None:
+            raise AbortError(f"ended by {why or 'Ctrl-C'}; no operator is present to resume")
+        self.event("WARN", "pause", f"paused by {why or 'the operator'}; the set-points stand")
         answer = self.await_answer(self.ask, "paused:")
         self._interrupts.pause_requested = False
         if answer != RESUME:
             raise AbortError("ended by the operator at a pause")
         self.event("INFO", "resume", "resumed")
-        return self.clock.now() - since
 
     def await_answer(self, ask: Callable[[str], str], question: str) -> str:
         """Have the operator asked, with telemetry and interlocks going on; return the answer."""

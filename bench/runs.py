@@ -35,6 +35,7 @@ from bench.journal import FILE_NAME, Journal, abandon
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
+from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
 from bench.terminal import ProgressDisplay, ask_operator
@@ -152,6 +153,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     guardian: RemoteStation | None = None
+    warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
@@ -178,6 +180,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
                 f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
                 "run it in a terminal, where an operator can answer"
             )
+        if guardian is not None:
+            warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
         folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
@@ -202,7 +206,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
-        outcome = Engine(station, journal, observers, interrupts, ask).run(run.protocol, parameters)
+        engine = Engine(station, journal, observers, interrupts, ask)
+        engine.warn(warnings)
+        outcome = engine.run(run.protocol, parameters)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()

@@ -67,6 +67,11 @@ def read_request(address: int, count: int) -> bytes:
     return _READ.pack(READ, address, count)
 
 
+def write_request(address: int, data: bytes) -> bytes:
+    """Return the request that sets registers from `address` on, two bytes each; its reply is its first 5 bytes."""
+    return _WRITE.pack(WRITE, address, len(data) // 2, len(data)) + data
+
+
 def read_frame(address: int, count: int) -> bytes:
     """Return the frame of function 76 that reads `count` registers, 1 to 255, from `address` on."""
     return _FRAME.pack(_FRAME_READ, address, count)
@@ -93,7 +98,7 @@ class ModbusClient(ABC):
 
     def write(self, address: int, data: bytes) -> None:
         """Set registers from `address` on, two bytes each."""
-        request = _WRITE.pack(WRITE, address, len(data) // 2, len(data)) + data
+        request = write_request(address, data)
         self._check_echo(self.request(request, _READ.size), request)
 
     def write_one(self, address: int, value: int) -> None:
@@ -165,22 +170,22 @@ class TcpClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port.
+        The open port, with an `exchange` of its own.
     unit : int
         Unit identifier, 0 to 255.
     """
 
     def __init__(self, port: Any, unit: int = 1) -> None:  # noqa: ANN401 - pyserial is untyped
         super().__init__(port)
+        # Sends bytes, and returns what has come already, as it has in process.
+        self._exchange = port.exchange
         self._unit = unit
         self._transaction = 0
 
     def request(self, request: bytes, expected: int) -> bytes:
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
         transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
-        self._port.write(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
-        # What has come already, as it has in process.
-        reply: bytes = self._port.read_all()
+        reply: bytes = self._exchange(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
         size = _MBAP.size + expected
         if len(reply) == size and reply.startswith(
             _MBAP.pack(transaction, 0, expected + 1, self._unit) + request[:1]

@@ -168,9 +168,6 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         except (FramingError, ConnectionError) as error:
             raise self._ended(error) from None
 
-    def _ended(self, error: Exception) -> SerialException:
-        return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")
-
     def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
         """Return what was received up to `expected`, or `size` bytes; what there is after the timeout on the clock.
 
@@ -210,6 +207,19 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
+
+    def exchange(self, data: bytes) -> bytes:
+        """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
+        if self._connection is not None and self.is_open and self._socket.taken and not self._received:
+            try:
+                return self._connection.receive(data)
+            except (FramingError, ConnectionError) as error:
+                raise self._ended(error) from None
+        self.write(data)
+        return self.read_all()
+
+    def _ended(self, error: Exception) -> SerialException:
+        return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")
 
     def flush(self) -> None:
         """Do nothing: what was written has arrived."""

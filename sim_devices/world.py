@@ -74,18 +74,31 @@ class World:
     def advance(self) -> None:
         """Bring the plant and everything due to the clock's present time."""
         with self.lock:
-            # A request from within `expire` sees that instant, not the end.
-            if self._advancing:
-                return
-            self._advancing = True
-            try:
-                self._advance_to(self.clock.now())
-            finally:
-                self._advancing = False
+            self.advance_locked()
+
+    def advance_locked(self) -> None:
+        """Bring the plant and everything due to the clock's present time; the caller holds the lock."""
+        # A request from within `expire` sees that instant, not the end.
+        if self._advancing:
+            return
+        target = self.clock.now()
+        # Mostly nothing is due, and a fast loop asks several times for each sample.
+        for deadline, _ in self._timed:
+            if deadline() <= target:
+                break
+        else:
+            if target > self._time:
+                self._plant.advance(target - self._time)
+                self._time = target
+            return
+        self._advancing = True
+        try:
+            self._advance_to(target)
+        finally:
+            self._advancing = False
 
     def _advance_to(self, target: float) -> None:
         while True:
-            # A plain loop: this is asked some ten times for each sample of a fast loop.
             due, first = math.inf, None
             for deadline, timed in self._timed:
                 instant = deadline()
@@ -93,13 +106,10 @@ class World:
                     due, first = instant, timed
             if first is None or due > target:
                 break
-            self._advance_plant(max(due, self._time))
+            if due > self._time:
+                self._plant.advance(due - self._time)
+                self._time = due
             first.expire()
         if target > self._time:
             self._plant.advance(target - self._time)
             self._time = target
-
-    def _advance_plant(self, instant: float) -> None:
-        if instant > self._time:
-            self._plant.advance(instant - self._time)
-            self._time = instant

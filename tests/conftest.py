@@ -17,12 +17,16 @@ from bench.compilation_display import MESSAGE
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
-    """Spread the whole studies over the tests: one that came last would leave all workers but its own idle."""
+    """Spread the whole studies over the first half of the tests.
+
+    One that came last would leave all workers but its own idle. Of two workers the second begins in the middle, with
+    tests that compile little, and finds in the cache what the first has compiled for its studies.
+    """
     studies = [item for item in items if getattr(item, "originalname", "") == "test_campaign"]
     modules = [list(group) for _, group in groupby((i for i in items if i not in studies), lambda i: i.path)]
     # Between two modules, so that the fixtures of a module are made once.
     for place, study in reversed(list(enumerate(studies))):
-        modules.insert(place * len(modules) // len(studies), [study])
+        modules.insert(place * len(modules) // (2 * len(studies)), [study])
     items[:] = chain.from_iterable(modules)
 
 

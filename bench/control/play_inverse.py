@@ -52,7 +52,7 @@ class PlayInverse:
 
     def input(self, output: float) -> float:
         """Move to the input for an output (output units from rest) clipped to the stroke, and return it."""
-        x = min(max(output, self.low), self.high)
+        x = self.low if output < self.low else self.high if output > self.high else output
         self.output = x
         states, weights = self._states, self._weights
         total = self._total

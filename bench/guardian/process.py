@@ -28,11 +28,11 @@ from bench.errors import BenchError, ConfigurationError, GuardianError
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
 from bench.safety import SAFE as IS_SAFE
-from bench.safety import InterlockWatch
 from bench.station.core import StationCore
-from bench.station.interface import News, masked
+from bench.station.interface import News, masked, news_of
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""
@@ -77,10 +77,11 @@ class Guardian:
         self._rig = rig
         self._wall: Clock = WallClock()
         safety = rig.file.safety
-        factor = float(getattr(rig.clock, "factor", 1.0))
+        self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
         units = {signal_.name: signal_.unit for signal_ in rig.signals}
-        self._core = StationCore(InterlockWatch(rig.file.interlocks, units), 1.0 / (safety.rate * min(factor, 10.0)))
-        self._watched = {interlock.signal for interlock in rig.file.interlocks}
+        watch = InterlockWatch(rig.file.interlocks, units)
+        self._core = StationCore(watch, 1.0 / (safety.rate * min(factor, 10.0)))
+        self._watched = watch.signals
         self._looked_at = self._look_readers()
         self._statuses: list[Status] = []
         self._news: list[News] = []
@@ -218,11 +219,14 @@ class Guardian:
         self._core.reply(self._wall.now())
         news, self._news = self._news, []
         cause = self._core.cause
+        pause, self._core.pause = self._core.pause, ""
         try:
             self._channel.send(
                 {
                     "n": request.get("n"),
                     "news": [asdict(each) for each in news],
+                    "holding": self._core.holding,
+                    "pause": pause,
                     "tripped": None if cause is None else to_message(cause),
                     **content,
                 }
@@ -334,9 +338,12 @@ class Guardian:
         self._judge(values)
 
     def _judge(self, values: dict[str, float]) -> None:
+        now = self._wall.now()
         if self._watched <= values.keys():
-            self._last_seen = self._wall.now()
-            self._core.judge(self._rig.clock.now(), values)
+            self._last_seen = now
+        setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
+        findings = self._core.judge(self._rig.clock.now(), values, setpoints, now=now, factor=self._factor)
+        self._news += news_of(findings)
 
     def _blind(self, error: BaseException) -> None:
         self._looking = False

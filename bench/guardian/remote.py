@@ -6,6 +6,7 @@ import faulthandler
 import math
 import signal
 import subprocess
+import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,8 +106,11 @@ class RemoteStation(Station):
         self._promised: tuple[float, str] | None = None
         self._setpoints: dict[str, float] = {}
         self._safe: Mapping[str, str] | None = None
+        self._is_holding = False
+        self._pause = ""
         self._stacks: TextIO | None = None
-        self._process, self._channel = start_guardian()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._process, self._channel = start_guardian(self._log)
         try:
             found = self._ask(
                 "hello",
@@ -126,6 +130,16 @@ class RemoteStation(Station):
     def has_operator(self) -> bool:
         """Whether an emulated laboratory does what a prompt asks for."""
         return self.description.file.emulated
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether an interlock has the set-points stand until its signal is back."""
+        return self._is_holding
+
+    def take_pause(self) -> str:
+        """Return why an interlock asks for a pause, once; empty if none does."""
+        pause, self._pause = self._pause, ""
+        return pause
 
     def keep_record(self, folder: Path) -> None:
         """Have the guardian keep its own record in the folder of the run.
@@ -243,6 +257,7 @@ class RemoteStation(Station):
         except subprocess.TimeoutExpired:
             # It goes on until what is not safe yet is safe.
             self._process.returncode = 0
+        self._log.close()
 
     def _rescued(self, error: BenchError) -> Mapping[str, str]:
         """Make sure that the guardian is dead, and make the devices safe without it."""
@@ -284,6 +299,8 @@ class RemoteStation(Station):
 
     def _taken(self, reply: Message) -> Any:  # noqa: ANN401 - what JSON holds
         self._news += [News(**each) for each in reply.get("news", ())]
+        self._is_holding = bool(reply.get("holding"))
+        self._pause = reply.get("pause") or self._pause
         if reply.get("tripped") is not None:
             self._tripped = to_error(reply["tripped"])
         if "error" in reply:

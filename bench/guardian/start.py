@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
+from typing import BinaryIO
 
 from bench.errors import GuardianError
 from bench.guardian.channel import Channel
@@ -18,16 +19,18 @@ _START = 30.0
 _WINDOWS = sys.platform == "win32"
 
 
-def start_guardian() -> tuple[subprocess.Popen[bytes], Channel]:
+def start_guardian(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start a guardian in a session of its own; return the process and the bench's end of the channel.
+
+    What fails before it can answer is written to `log`.
 
     Raises GuardianError if it does not start.
     """
     if _WINDOWS:
-        return _start_by_port()
+        return _start_by_port(log)
     ours, theirs = socket.socketpair()
     with theirs:
-        process = _spawn([str(theirs.fileno())], pass_fds=(theirs.fileno(),))
+        process = _spawn([str(theirs.fileno())], log, pass_fds=(theirs.fileno(),))
     return process, Channel(ours)
 
 
@@ -40,12 +43,12 @@ def inherited(arguments: Sequence[str]) -> socket.socket:
     return connection
 
 
-def _start_by_port() -> tuple[subprocess.Popen[bytes], Channel]:
+def _start_by_port(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start a guardian that connects to a port of this process, as Windows hands sockets on to no child by itself."""
     token = secrets.token_hex(16)
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(_START)
-        process = _spawn([str(server.getsockname()[1]), token])
+        process = _spawn([str(server.getsockname()[1]), token], log)
         try:
             while True:
                 connection, _ = server.accept()
@@ -59,7 +62,7 @@ def _start_by_port() -> tuple[subprocess.Popen[bytes], Channel]:
             raise GuardianError(f"the guardian does not start: {error}") from None
 
 
-def _spawn(arguments: Sequence[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
+def _spawn(arguments: Sequence[str], log: BinaryIO, pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
     # The modules of the rig have to be found as here; -P keeps the working folder out of the way of ours.
     path = os.pathsep.join(entry for entry in sys.path if entry)
     flags = 0
@@ -70,6 +73,8 @@ def _spawn(arguments: Sequence[str], pass_fds: Sequence[int] = ()) -> subprocess
             [sys.executable, "-P", "-m", "bench.guardian", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
+            # Not that of the bench: who reads there would wait for the end of the guardian as well.
+            stderr=log,
             env={**os.environ, "PYTHONPATH": path},
             pass_fds=pass_fds,
             start_new_session=True,

@@ -243,6 +243,9 @@ class Preisach(Operator[MemoryCurve]):
         from bench.hysteresis import _kernels
 
         t = self.lattice
+        if not inputs.flags.writeable:
+            # For arrays that are read-only, as the columns of a record, numba would compile once more.
+            inputs = inputs.copy()
         return np.asarray(_kernels.evaluate(inputs, t.plane, t.below, t.offset, t.terms, self._pieces(state)))
 
     def step(self, state: MemoryCurve, value: float) -> tuple[MemoryCurve, float]:
@@ -303,6 +306,10 @@ class Preisach(Operator[MemoryCurve]):
         For a signed density the best memory curve over each input is found by dynamic programming over the
         columns. Either way each quadratic piece is tested at its ends and at its vertex.
         """
+        return self._extremes
+
+    @cached_property
+    def _extremes(self) -> tuple[float, float]:
         return -self._greatest(-1.0), self._greatest(1.0)
 
     def _greatest(self, sign: float) -> float:

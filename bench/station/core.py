@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from enum import Enum
 
 from bench.errors import BenchError, DeviceError, GuardianError, InterlockError
-from bench.safety import InterlockWatch
+from bench.interlocks import Finding, InterlockWatch, Level
 
 
 class State(Enum):
@@ -45,6 +45,10 @@ class StationCore:
         What tripped it.
     late : bool
         Whether that was a promise of the bench.
+    holding : bool
+        Whether an interlock has the bench hold its set-points and wait.
+    pause : str
+        Why an interlock has the bench pause; empty if none does. The caller clears it.
     """
 
     def __init__(self, watch: InterlockWatch, interval: float) -> None:
@@ -59,6 +63,9 @@ class StationCore:
         self.state = State.IDLE
         self.cause: BenchError | None = None
         self.late = False
+        self.holding = False
+        self.pause = ""
+        self._acts_at = math.inf
 
     @property
     def over(self) -> bool:
@@ -97,12 +104,15 @@ class StationCore:
         """Return when there is something to do next: a look, or the end of the promise."""
         if self.over:
             return math.inf
-        return min(self._next_look, self._lease())
+        return min(self._next_look, self._acts_at, self._lease())
 
     def look_due(self, now: float) -> bool:
         """Return whether the interlocks have to be looked at; the next look is an interval later then."""
-        if self.over or now < self._next_look:
+        if self.over or now < min(self._next_look, self._acts_at):
             return False
+        self._acts_at = math.inf
+        if now < self._next_look:
+            return True
         # Looks that were missed are not made up for.
         missed = math.floor((now - self._next_look) / self._interval)
         self._next_look += self._interval * (1 + missed)
@@ -119,15 +129,54 @@ class StationCore:
                 )
             )
 
-    def judge(self, t: float, values: Mapping[str, float]) -> None:
-        """Judge readings by the interlocks; trip if one is not met."""
+    def judge(
+        self,
+        t: float,
+        values: Mapping[str, float],
+        setpoints: Mapping[str, float] | None = None,
+        *,
+        now: float | None = None,
+        factor: float = 1.0,
+    ) -> tuple[Finding, ...]:
+        """Judge readings by the interlocks; trip if one acts.
+
+        Parameters
+        ----------
+        t : float
+            Laboratory time, s.
+        values : mapping of str to float
+            Readings by signal name.
+        setpoints : mapping of str to float, optional
+            Set-points by device, nan for an output that is off; without them those among the values count.
+        now : float, optional
+            The caller's own time, s, if that is not the laboratory's.
+        factor : float
+            Laboratory seconds in a second of the caller's time.
+
+        Returns
+        -------
+        tuple of Finding
+            What begins and what is over, below the level `safe`.
+        """
+        # The samples of a block are judged after it, when a look may have come in between.
+        t = t if self._seen is None else max(t, self._seen)
         self._seen = t
         if self.over:
-            return
+            return ()
         try:
-            self._watch.check(t, values)
+            findings = self._watch.check(t, values, setpoints)
         except InterlockError as error:
             self.trip(error)
+            return ()
+        due = self._watch.due
+        # One in the past waits for a signal that this look has not seen.
+        self._acts_at = (t if now is None else now) + (due - t) / factor if due > t else math.inf
+        if findings:
+            self.holding = any(each.level is Level.HOLD for each in self._watch.active)
+            for each in findings:
+                if each.level is Level.PAUSE and not each.over:
+                    self.pause = each.text
+        return findings
 
     def blind(self, error: DeviceError) -> None:
         """Trip as what the interlocks need cannot be read."""

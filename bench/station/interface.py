@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from bench.clock import Clock
 from bench.description import RigDescription
 from bench.devices import Device, Status
+from bench.interlocks import Finding
 from bench.rig import Look
 from bench.roles import Floats
 
@@ -71,6 +72,11 @@ def masked(devices: Iterable[Device]) -> list[News]:
     ]
 
 
+def news_of(findings: Iterable[Finding]) -> list[News]:
+    """Return what interlocks below the level `safe` have found, for the record."""
+    return [News("INFO" if each.over else "WARN", "interlock", each.text) for each in findings]
+
+
 class Station(ABC):
     """Devices, interlocks and safe state of one rig during one run.
 
@@ -89,6 +95,15 @@ class Station(ABC):
     @abstractmethod
     def has_operator(self) -> bool:
         """Whether an emulated laboratory does what a prompt asks for."""
+
+    @property
+    @abstractmethod
+    def is_holding(self) -> bool:
+        """Whether an interlock of the level `hold` has the set-points stand until its signal is back."""
+
+    @abstractmethod
+    def take_pause(self) -> str:
+        """Return why an interlock of the level `pause` asks for one, once; empty if none does."""
 
     @abstractmethod
     def promise(self, seconds: float, why: str) -> None:

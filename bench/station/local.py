@@ -9,11 +9,12 @@ from typing import TypeVar
 
 from bench.devices import Actuator, Status
 from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.interlocks import Finding, InterlockWatch
 from bench.rig import Look, Rig
 from bench.roles import Floats
-from bench.safety import InterlockWatch, make_safe
+from bench.safety import make_safe
 from bench.station.core import StationCore
-from bench.station.interface import Arrivals, News, Station, arrivals_of, masked
+from bench.station.interface import Arrivals, News, Station, arrivals_of, masked, news_of
 from bench.station.reconnection import reconnect
 
 _T = TypeVar("_T")
@@ -36,10 +37,9 @@ class LocalStation(Station):
         self.clock = rig.clock
         self.description = rig.description
         units = {signal.name: signal.unit for signal in rig.signals}
-        self._core = StationCore(
-            InterlockWatch(rig.file.interlocks, units), 1.0 / interlock_rate if interlock_rate else math.inf
-        )
-        self._watched = [interlock.signal for interlock in rig.file.interlocks]
+        watch = InterlockWatch(rig.file.interlocks, units)
+        self._core = StationCore(watch, 1.0 / interlock_rate if interlock_rate else math.inf)
+        self._watched = watch.signals
         self._core.begin(self.clock.now())
         self._statuses: list[Status] = []
         self._news: list[News] = []
@@ -49,6 +49,16 @@ class LocalStation(Station):
     def has_operator(self) -> bool:
         """Whether an emulated laboratory does what a prompt asks for."""
         return self._rig.laboratory is not None
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether an interlock has the set-points stand until its signal is back."""
+        return self._core.holding
+
+    def take_pause(self) -> str:
+        """Return why an interlock asks for a pause, once; empty if none does."""
+        pause, self._core.pause = self._core.pause, ""
+        return pause
 
     def promise(self, seconds: float, why: str) -> None:
         """Promise that each request from now on is followed by the next one within so many seconds."""
@@ -115,7 +125,7 @@ class LocalStation(Station):
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
         """Judge readings that were recorded by the interlocks."""
-        self._core.judge(t, values)
+        self._note(self._core.judge(t, values))
         self._raise_if_tripped()
 
     def sleep_until(self, instant: float) -> None:
@@ -125,7 +135,8 @@ class LocalStation(Station):
             now = self.clock.now()
             self._core.advance(now)
             if self._core.look_due(now):
-                self._core.judge(now, self.look(Look.PART, self._watched))
+                setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
+                self._note(self._core.judge(now, self.look(Look.PART, self._watched), setpoints))
             self._raise_if_tripped()
         self.clock.sleep_until(instant)
 
@@ -169,6 +180,10 @@ class LocalStation(Station):
             seconds = reconnect(device, error, self.clock, self._rig.file.safety.reconnect, lambda: self._core.over)
             self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
             return call()
+
+    def _note(self, findings: tuple[Finding, ...]) -> None:
+        if findings:
+            self._news += news_of(findings)
 
     def _raise_if_tripped(self) -> None:
         if self._core.cause is not None:

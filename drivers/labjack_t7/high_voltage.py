@@ -9,7 +9,6 @@ Assumption: a T7 takes several writes of an LJTick-DAC in one packet.
 from __future__ import annotations
 
 import math
-import struct
 from contextlib import suppress
 from functools import partial
 from typing import ClassVar, Self
@@ -24,7 +23,7 @@ from bench.roles import VoltageSupply
 from drivers.device import Slope, attempt
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings
-from drivers.labjack_t7.registers import DAC, TDAC, Floats, LabJackT7
+from drivers.labjack_t7.registers import DAC, TDAC, Floats, LabJackT7, Target
 
 _DAC_REACH = (0.0, 5.0)  # V, datasheet 15.0
 _TDAC_REACH = (-10.0, 10.0)  # V, datasheet of the LJTick-DAC
@@ -113,9 +112,10 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
     def __init__(self, name: str, settings: T7HighVoltageSettings, clock: Clock, line: LabJackT7) -> None:
         super().__init__(name, settings, clock, line)
         self._limits = Limits(*settings.voltage_limits, "V")
+        self._low, self._high = settings.voltage_limits
         kind, number = settings.analog_output.split("dac")
         self._register = (TDAC if kind else DAC).of(int(number))
-        self._encode = struct.Struct(f">{self._register.form}").pack
+        self._target = Target.of(self._register)
         self._offset, self._gain = settings.offset_volts, settings.gain
         self._enabled = False
         self._looked = -math.inf
@@ -142,7 +142,8 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         The status is complete at once: an amplifier settles within the time of the reply. An amplifier that does
         not go on or went off by itself is a `DeviceError`.
         """
-        self.check(value)
+        if not self._low <= value <= self._high:
+            self.check(value)
         if not self._enabled:
             self._switch_on()
         elif self._clock.now() - self._looked >= _STATUS_AGE:
@@ -199,8 +200,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
         self._switch_off()
 
     def _send(self, volts: float) -> None:
-        # As `write` does, but many thousand times a second.
-        self._line.write_span(self._register.address, self._encode(self._offset + volts / self._gain))
+        self._line.send(self._target, self._offset + volts / self._gain)
 
     def _switch_on(self) -> None:
         self._setpoint = 0.0

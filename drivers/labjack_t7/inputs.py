@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
+from bench.devices import Device
 from bench.errors import DeviceError
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
@@ -36,6 +37,7 @@ from drivers.labjack_t7.registers import (
     STREAM_SETTLING_US,
     Floats,
     LabJackT7,
+    Packet,
     Register,
     Span,
 )
@@ -112,11 +114,14 @@ class T7InputDevice(T7Device[InputSettingsT]):
         super().__init__(name, settings, clock, line)
         self._limit = RAIL * settings.range
         self._conversions = _spans(AIN, settings.channels)
-        self._averages = [
-            span
-            for register in (AIN_EF_READ_AVERAGE, AIN_EF_READ_MAXIMUM, AIN_EF_READ_MINIMUM)
-            for span in _spans(register, settings.channels)
-        ]
+        self._averages = Packet.of(
+            [
+                span
+                for register in (AIN_EF_READ_AVERAGE, AIN_EF_READ_MAXIMUM, AIN_EF_READ_MINIMUM)
+                for span in _spans(register, settings.channels)
+            ]
+        )
+        self._packet = Packet.of(self._conversions)
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
@@ -140,15 +145,42 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def glance(self) -> dict[str, float]:
         """Measure every signal by one conversion of each input; raises what `measure` does."""
-        if len(self._conversions) > 1:
-            return self._values(*self._convert())
-        # As above, but many thousand times a second.
-        voltages = self._line.read_span(self._conversions[0])
+        return self._taken(self._read())
+
+    def _taken(self, voltages: Sequence[float]) -> dict[str, float]:
+        """Return the signals of one conversion of each input."""
         limit = self._limit
         for volts in voltages:
             if not -limit < volts < limit:
                 raise self._invalid(voltages)
         return self._values(*voltages)
+
+    def joins(self, other: Device) -> bool:
+        """Return whether another device can be read in one request with this one: on the same connection."""
+        return isinstance(other, T7InputDevice) and other.is_on(self._line)
+
+    def joined(self, others: Sequence[Device]) -> Callable[[], dict[str, float]]:
+        """Return what glances at this device and others behind it in one request."""
+        spans: list[Span] = []
+        parts = []
+        begin = 0
+        for device in (self, *others):
+            assert isinstance(device, T7InputDevice)
+            spans += device.conversions
+            end = begin + len(device._settings.channels)
+            parts.append((slice(begin, end), device._taken))
+            begin = end
+        packet = Packet.of(spans)
+
+        def glance() -> dict[str, float]:
+            # Over the line of the moment, as it may have been renewed.
+            voltages = self._line.read_packet(packet)
+            values: dict[str, float] = {}
+            for part, taken in parts:
+                values.update(taken(voltages[part]))
+            return values
+
+        return glance
 
     @property
     def conversions(self) -> tuple[Span, ...]:
@@ -180,7 +212,7 @@ class T7InputDevice(T7Device[InputSettingsT]):
         if self._settings.samples == 1:
             return self._convert()
         # The averages come first: reading one starts the burst and waits for its end.
-        values = self._joined(self._averages)
+        values = self._line.read_packet(self._averages)
         count = len(self._settings.channels)
         means, maxima, minima = (values[start : start + count] for start in range(0, 3 * count, count))
         self._check(maxima)
@@ -189,15 +221,12 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def _convert(self) -> Sequence[float]:
         """Get one conversion of each input in V."""
-        return self._check(self._read(self._conversions))
+        return self._check(self._read())
 
-    def _read(self, spans: Sequence[Span]) -> Sequence[float]:
-        if len(spans) == 1:
-            return self._line.read_span(spans[0])
-        return self._joined(spans)
-
-    def _joined(self, spans: Sequence[Span]) -> list[float]:
-        return [value for values in self._line.read_spans(spans) for value in values]
+    def _read(self) -> tuple[float, ...]:
+        if len(self._conversions) == 1:
+            return self._line.read_span(self._conversions[0])
+        return self._line.read_packet(self._packet)
 
     def _check(self, voltages: Sequence[float]) -> Sequence[float]:
         """Return one voltage for each input; raise `DeviceError` for one that is not valid or over the range."""

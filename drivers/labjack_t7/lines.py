@@ -261,6 +261,12 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
         super().__init__(name, settings, clock, line)
         self._output = DigitalOutput(name, line, settings.line, active_high=settings.active_high)
 
+    def _renew_line(self) -> None:
+        super()._renew_line()
+        self._output = DigitalOutput(
+            self.name, self._line, self._settings.line, active_high=self._settings.active_high
+        )
+
     def close(self) -> None:
         """Release the connection; a line that is on is left to the watchdog."""
         # An instrument that cannot be reached any more keeps its watchdog, as it should.

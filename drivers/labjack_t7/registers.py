@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.modbus import RefusedError, exception_text, read_frame, read_request, swapped, write_frame
+from drivers.modbus import (
+    FEEDBACK,
+    RefusedError,
+    exception_text,
+    read_frame,
+    read_request,
+    swapped,
+    write_frame,
+    write_request,
+)
 from drivers.modbus_tcp import Connection, share
 
 Kind = Literal["F32", "U32", "U16"]
@@ -62,7 +71,7 @@ class Span(NamedTuple):
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
-    """Form of the reply: its function, the number of bytes of the values, and the values."""
+    """Form of the reply: its function, the number of bytes of the values (both skipped), and the values."""
     frame: bytes
     """Asks for them in function 76, among others."""
     values: struct.Struct
@@ -82,10 +91,58 @@ class Span(NamedTuple):
             address=register.address,
             request=read_request(register.address, words),
             size=2 + values.size,
-            reply=struct.Struct(f">xB{count}{register.form}"),
+            reply=struct.Struct(f">xx{count}{register.form}"),
             frame=read_frame(register.address, words),
             values=values,
         )
+
+
+class Packet(NamedTuple):
+    """Spans to be read in one packet of function 76 again and again, in their order."""
+
+    name: str
+    """Names their registers."""
+    request: bytes
+    """Asks for them."""
+    size: int
+    """Bytes of the reply."""
+    reply: struct.Struct
+    """Form of the reply: its function and the values of all spans."""
+
+    @classmethod
+    def of(cls, spans: Sequence[Span]) -> Packet:
+        """Return the packet of spans."""
+        reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in spans))
+        return cls(
+            name=", ".join(f"reading register {span.address}" for span in spans),
+            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in spans),
+            size=reply.size,
+            reply=reply,
+        )
+
+
+class Target(NamedTuple):
+    """A register to be set again and again."""
+
+    address: int
+    head: bytes
+    """What stands before its value in the request."""
+    echo: bytes
+    """The reply."""
+    encode: Callable[[float], bytes]
+    """Returns a value as it is sent."""
+
+    @classmethod
+    def of(cls, register: Register) -> Target:
+        """Return the target of a register.
+
+        Raises `ValueError` if it can only be read.
+        """
+        if "W" not in register.access:
+            raise ValueError(f"{register.name} can only be read")
+        value = struct.Struct(f">{register.form}")
+        head = write_request(register.address, bytes(value.size))[: -value.size]
+        return cls(register.address, head, head[:-1], value.pack)
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -202,19 +259,29 @@ class LabJackT7:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
         return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
 
-    def read_span(self, span: Span) -> list[float]:
+    def read_span(self, span: Span) -> tuple[float, ...]:
         """Get the values of neighbouring registers of one type."""
         if self._connection.ended or not self._connected:
             raise self._closed()
         try:
             with self._lock:
                 reply = self._client.request(span.request, span.size)
-            size, *values = span.reply.unpack(reply)
-            if size != span.size - 2:
-                raise OSError(f"the answer announces {size} bytes where {span.size - 2} were asked for")
+            if reply[1] != span.size - 2:
+                raise OSError(f"the answer announces {reply[1]} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
             raise self._failure(error, f"reading register {span.address}") from error
-        return values
+        return span.reply.unpack(reply)
+
+    def read_packet(self, packet: Packet) -> tuple[float, ...]:
+        """Get the values of several spans in one request, one behind the other."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                reply = self._client.request(packet.request, packet.size)
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, packet.name) from error
+        return packet.reply.unpack(reply)
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
         """Get the values of several spans in one request; what is to be written at addresses goes first in it."""
@@ -282,7 +349,7 @@ class LabJackT7:
 
     def read(self, register: Register, count: int = 1) -> list[float]:
         """Get the values of `count` registers of one type from `register` on."""
-        return self.read_span(Span.of(register, count))
+        return list(self.read_span(Span.of(register, count)))
 
     def read_integer(self, register: Register) -> int:
         """Get the value of a UINT32 or UINT16 register."""
@@ -311,6 +378,18 @@ class LabJackT7:
                 self._client.write(address, data)
         except (RefusedError, OSError) as error:
             raise self._failure(error, f"writing register {address}") from error
+
+    def send(self, target: Target, value: float) -> None:
+        """Set a register."""
+        if self._connection.ended or not self._connected:
+            raise self._closed()
+        try:
+            with self._lock:
+                reply = self._client.request(target.head + target.encode(value), len(target.echo))
+            if reply != target.echo:
+                raise OSError(f"the answer {reply.hex(' ')} is none to the request {target.head.hex(' ')} …")
+        except (RefusedError, OSError) as error:
+            raise self._failure(error, f"writing register {target.address}") from error
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type and read them back, in one request.

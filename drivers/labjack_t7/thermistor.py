@@ -10,9 +10,11 @@ from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
+from bench.clock import Clock
 from bench.errors import DeviceError
 from bench.roles import TemperatureSensor
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
+from drivers.labjack_t7.registers import LabJackT7
 
 _SHORTED, _OPEN = 0.01, 0.99  # shares of the excitation at a divider beyond which its thermistor is shorted or open
 _EXCITATION = 0.2  # share by which an excitation may be off
@@ -81,6 +83,12 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
 
     Settings: ClassVar[type[T7ThermistorSettings]] = T7ThermistorSettings
 
+    def __init__(self, name: str, settings: T7ThermistorSettings, clock: Clock, line: LabJackT7) -> None:
+        super().__init__(name, settings, clock, line)
+        self._signal = f"{name}_temperature"
+        lowest, highest = ((1 + side * _EXCITATION) * settings.excitation_volts for side in (-1, 1))
+        self._excitation = lowest, highest
+
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
 
@@ -88,7 +96,7 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
         settings = self._settings
         divider, excitation = volts
         divider_channel, excitation_channel = settings.channels
-        low, high = ((1 + side * _EXCITATION) * settings.excitation_volts for side in (-1, 1))
+        low, high = self._excitation
         if not low <= excitation <= high:
             raise DeviceError(
                 self.name,
@@ -109,10 +117,12 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
                 "excitation; check its wires for a short circuit",
             )
         temperature = _celsius(settings.steinhart_hart, settings.reference_ohms * share / (1 - share))
-        text = f"temperature {temperature:.4g} °C is outside of"
-        advice = "bring it back, or check the thermistor and `temperature_limits`"
-        self._check_range(text, temperature, settings.temperature_limits, "°C", advice)
-        return {f"{self.name}_temperature": temperature}
+        low, high = settings.temperature_limits
+        if not low <= temperature <= high:
+            text = f"temperature {temperature:.4g} °C is outside of"
+            advice = "bring it back, or check the thermistor and `temperature_limits`"
+            self._check_range(text, temperature, settings.temperature_limits, "°C", advice)
+        return {self._signal: temperature}
 
 
 def _celsius(steinhart_hart: tuple[float, float, float], ohms: float) -> float:

@@ -16,7 +16,6 @@ import numpy as np
 
 from bench.control.tracking import check_positive
 from bench.hysteresis import Polynomial
-from bench.hysteresis._checks import Floats
 from rigs.hybrid.network import ABSOLUTE_ZERO, ThermalNetwork
 
 # Points at which the polynomial of the thermal deflection is tabulated for its inverse.
@@ -38,28 +37,28 @@ class Bending:
         order = slice(None) if falls[0] > 0.0 else slice(None, None, -1)
         self._sorted = self._deflections[order].copy(), self._rises[order].copy()
         # Powers of the rise mapped to [-1, 1].
-        self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         series = np.append(polynomial.bias - polynomial.evaluate([0.0])[0], polynomial.series)
         powers = np.polynomial.chebyshev.cheb2poly(series)
-        self._powers: list[float] = powers[::-1].tolist()
-        self._slopes: list[float] = (powers[1:] * np.arange(1, powers.size))[::-1].tolist()
+        self.powers: list[float] = powers[::-1].tolist()
+        self.slopes: list[float] = (powers[1:] * np.arange(1, powers.size))[::-1].tolist()
 
     def deflection(self, rise: float) -> float:
         """Return the deflection (m) at a rise of the tip (K)."""
         inside = min(max(rise, self.low), self.high)
-        x = (inside - self._middle) / self._half
+        x = (inside - self.middle) / self.half
         total = 0.0
-        for power in self._powers:
+        for power in self.powers:
             total = total * x + power
         return total if inside == rise else total + self.slope(inside) * (rise - inside)
 
     def slope(self, rise: float) -> float:
         """Return the deflection per rise (m/K)."""
-        x = (min(max(rise, self.low), self.high) - self._middle) / self._half
+        x = (min(max(rise, self.low), self.high) - self.middle) / self.half
         total = 0.0
-        for slope in self._slopes:
+        for slope in self.slopes:
             total = total * x + slope
-        return total / self._half
+        return total / self.half
 
     def rise(self, deflection: float) -> float:
         """Return the rise of the tip (K) for a deflection (m), at most that at the end of the range."""
@@ -215,25 +214,6 @@ class ThermalNoise:
         check_positive(self)
 
 
-# Weights of the centre and of the 2 n other sigma points of n = 4 states. A spread of √n standard deviations gives
-# the centre none: the cubature rule, with equal positive weights and without cancellation.
-_STATES = 4
-_WEIGHTS = np.array([0.0] + [0.5 / _STATES] * (2 * _STATES))
-
-
-def _sigma_points(mean: Floats, covariance: Floats) -> Floats:
-    """Return the sigma points of a distribution, shape (9, 4)."""
-    spread = np.linalg.cholesky(_STATES * covariance).T
-    return np.concatenate([[mean], mean + spread, mean - spread])
-
-
-def _moments(points: Floats, noise: Floats) -> tuple[Floats, Floats]:
-    """Return mean and covariance of transformed sigma points, with additive noise."""
-    mean = np.dot(_WEIGHTS, points)
-    spread = points - mean
-    return mean, np.dot(spread.T, _WEIGHTS[:, np.newaxis] * spread) + noise
-
-
 class UnscentedEstimate(ThermalEstimate):
     """Unscented Kalman filter of base, tip, a disturbing heat and an offset of the deflection.
 
@@ -245,41 +225,44 @@ class UnscentedEstimate(ThermalEstimate):
     def __init__(
         self, bending: Bending, network: ReducedNetwork, noise: ThermalNoise, period: float, every: int
     ) -> None:
+        from rigs.hybrid import _kernels
+
         super().__init__(bending)
+        self._predict, self._correct = _kernels.predict, _kernels.correct
         self._network = network
         self._period = period
         self._step = period * every
         self._noise = noise
-        self._walk = np.diag(np.square([noise.base, noise.tip, noise.heat, noise.offset])) * self._step
-        self._reading_noise = np.diag(np.square([noise.thermistor, noise.thermistor, noise.deflection]))
-        self._reading_noise[2, 2] /= every
-        self._state, self._covariance = np.zeros(_STATES), np.eye(_STATES)
+        states, readings, points = _kernels.STATES, _kernels.READINGS, _kernels.POINTS
+        reading_noise = np.square([noise.thermistor, noise.thermistor, noise.deflection])
+        reading_noise[2] /= every
+        self._filter = _kernels.Filter(
+            mean=np.zeros(states),
+            covariance=np.eye(states),
+            walk=np.square([noise.base, noise.tip, noise.heat, noise.offset]) * self._step,
+            reading_noise=reading_noise,
+            network=np.array(
+                [self._step, network.along, network.tip_air, network.base_capacity, network.tip_capacity]
+            ),
+            bending=np.array([bending.low, bending.high, bending.middle, bending.half]),
+            powers=np.array(bending.powers),
+            slopes=np.array(bending.slopes),
+            points=np.zeros((points, states)),
+            seen=np.zeros((points, readings)),
+            expected=np.zeros(readings),
+            variance=np.zeros((readings, readings)),
+            factor=np.zeros((states, states)),
+            gain=np.zeros((states, readings)),
+        )
         self._sum, self._count = 0.0, 0
 
     def begin(self, deflection: float, base: float, tip: float) -> None:
         """Start in equilibrium with the first readings."""
         n = self._noise
-        self._state = np.array([base, tip, 0.0, deflection - self._bending.deflection(tip)])
+        self._filter.mean[:] = [base, tip, 0.0, deflection - self._bending.deflection(tip)]
         spread = 2.0 * abs(self._bending.slope(tip)) * n.thermistor
-        self._covariance = np.diag(np.square([n.thermistor, n.thermistor, 10.0 * n.heat, spread]))
+        self._filter.covariance[:] = np.diag(np.square([n.thermistor, n.thermistor, 10.0 * n.heat, spread]))
         self.value = deflection
-
-    def _move(self, points: Floats, current: float) -> Floats:
-        """Return states (9, 4) one thermal period later, at a current (A)."""
-        base, tip, heat, _ = points.T
-        n, dt = self._network, self._step
-        constant, slope = n.heat_flow(current)
-        along = (base - tip) * n.along
-        moved = points.copy()
-        moved[:, 0] = base + dt * (constant + slope * base + heat - along) / n.base_capacity
-        moved[:, 1] = tip + dt * (along - n.tip_air * tip) / n.tip_capacity
-        return moved
-
-    def _observe(self, points: Floats) -> Floats:
-        """Return what is read in states (9, 4): rises of base and tip (K) and deflection (m), shape (9, 3)."""
-        readings = points[:, :3].copy()
-        readings[:, 2] = [self._bending.deflection(tip) for tip in points[:, 1].tolist()] + points[:, 3]
-        return readings
 
     def sample(self, deflection: float) -> None:
         """Advance at the rate of the model, and keep the deflection for the next correction."""
@@ -289,11 +272,10 @@ class UnscentedEstimate(ThermalEstimate):
 
     def correct(self, base: float, tip: float, current: float) -> None:
         """Predict, and update with the mean of the deflections since the last thermal sample."""
-        moved = self._move(_sigma_points(self._state, self._covariance), current)
-        self._state, self._covariance = _moments(moved, self._walk)
+        self._predict(*self._network.heat_flow(current), self._filter)
         if self._count:
             self._take_in(base, tip)
-        here, there, _, offset = self._state.tolist()
+        here, there, _, offset = self._filter.mean.tolist()
         n = self._network
         cooling = ((here - there) * n.along - n.tip_air * there) / n.tip_capacity
         self.rate = self._bending.slope(there) * cooling
@@ -304,15 +286,8 @@ class UnscentedEstimate(ThermalEstimate):
         age = 0.5 * (self._count - 1) * self._period
         mean = self._sum / self._count + self.rate * age
         self._sum, self._count = 0.0, 0
-        points = _sigma_points(self._state, self._covariance)
-        readings = self._observe(points)
-        expected, variance = _moments(readings, self._reading_noise)
-        spread = _WEIGHTS[:, np.newaxis] * (points - self._state)
-        across = (spread[:, :, np.newaxis] * (readings - expected)[:, np.newaxis, :]).sum(axis=0)
-        gain = np.dot(across, np.linalg.inv(variance))
-        self._state = self._state + np.dot(gain, np.array([base, tip, mean]) - expected)
-        self._covariance = self._covariance - np.dot(gain, np.dot(variance, gain.T))
+        self._correct(base, tip, mean, self._filter)
 
     def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
         """Return the offset of the deflection and its standard deviation, m."""
-        return float(self._state[3]), math.sqrt(float(self._covariance[3, 3]))
+        return self._filter.mean.item(3), math.sqrt(self._filter.covariance.item(3, 3))

@@ -138,10 +138,6 @@ class Frame:
     ----------
     drum : EmulatedDrum or None
         The stage's drum, once it is there.
-    t7 : EmulatedT7 or None
-        The instrument that switches the fan, once it is there.
-    fan_stands : bool
-        A fault: the fan does not turn, also when it is on.
     is_broken : bool
         A fault: the muscle is torn, so that no current flows, nothing pulls, and its end lies at the bottom.
     """
@@ -149,8 +145,6 @@ class Frame:
     def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
-        self.t7: EmulatedT7 | None = None
-        self.fan_stands = False
         self.is_broken = False
         self._fastened = False
         self._voltage = 0.0
@@ -193,8 +187,6 @@ class Frame:
 
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds, with the end following the stage."""
-        if self.t7 is not None:
-            self.muscle.blow(self.t7.dio_level(FAN_LINE) and not self.fan_stands)
         if self._fastened and self.drum is not None:
             # A servo on its way is due every 20 ms, so that the world advances in pieces as short as that.
             reach = self.muscle.parameters.reach
@@ -266,7 +258,8 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
         self.magnet = RatiometricSensor(lambda: self._position_sensor() + settings.rest_position, rng=sensor)
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
-        self.frame.t7 = self.t7
+        self._fan_stands = False
+        self.t7.add_follower(self._blow)
         super().__init__(
             "muscle laboratory",
             {
@@ -349,8 +342,8 @@ class MuscleLaboratory(EmulatedLaboratory):
             "broken-muscle": Fault("the muscle is torn", self.frame.tear, undo=partial(self.frame.tear, False)),
             "fan-stands": Fault(
                 "the fan does not turn, also when it is on",
-                partial(setattr, self.frame, "fan_stands", True),
-                undo=partial(setattr, self.frame, "fan_stands", False),
+                partial(self._stop_fan, True),
+                undo=partial(self._stop_fan, False),
             ),
             "forgotten-load": Fault(
                 "the operator hangs nothing from now on",
@@ -366,6 +359,13 @@ class MuscleLaboratory(EmulatedLaboratory):
             **self._force_sensor.faults(),
             **self._position_sensor.faults(),
         }
+
+    def _blow(self) -> None:
+        self.muscle.blow(self.t7.dio_level(FAN_LINE) and not self._fan_stands)
+
+    def _stop_fan(self, stands: bool) -> None:
+        self._fan_stands = stands
+        self._blow()
 
     def _overload(self, factor: float) -> None:
         self._load_factor = factor

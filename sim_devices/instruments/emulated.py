@@ -80,6 +80,11 @@ class LineFaults:
         """Whether the instrument answers requests at the clock's present time."""
         return self.plugged_in
 
+    @property
+    def undisturbed(self) -> bool:
+        """Whether a request arrives, and its answer as it is."""
+        return self.plugged_in and not self._corrupt_next and not self._drop_next
+
     def attend(self) -> None:
         """Bring the instrument to the clock's present time: a request has arrived."""
         self.world.advance()

@@ -33,8 +33,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from bench.devices import Identity
 from bench.errors import DeviceError
 from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice
-from sim_devices.instruments.registers import Register, RegisterInstrument, Service
+from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
 
@@ -93,6 +93,29 @@ def time_constant(setting: int) -> float:
 def reading_interval(setting: int) -> float:
     """Return the time in s between two readings whose noise is nearly independent: half a period at cut-off."""
     return 0.5 / CUTOFF_HZ[setting]
+
+
+@lru_cache(maxsize=256)
+def _fading(lags: float) -> tuple[float, float, float, float]:
+    """Return how the noise behind two lags fades within some time constants, exactly for white noise before them.
+
+    Kept, as the instrument mostly converts at even intervals.
+
+    Returns
+    -------
+    tuple of float
+        What remains of a lag's output. What of the two fresh numbers is added behind the second lag: of the one that
+        also goes into the first, and of the other; and what of the one behind the first.
+    """
+    decay = math.exp(-lags)
+    # The stationary covariance is 2, 1, 1 in units of the output's variance. What the known values still say of it
+    # fades by `known`; the rest is new.
+    known = decay * decay
+    first = -2 * math.expm1(-2 * lags)
+    both = 1 - known * (1 + 2 * lags)
+    second = 1 - known * (1 + 2 * lags + 2 * lags * lags)
+    along = both / math.sqrt(first)
+    return decay, along, math.sqrt(max(second - along * along, 0.0)), math.sqrt(first)
 
 
 @dataclass(frozen=True)
@@ -193,7 +216,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._access_code = _FIRST_ACCESS_CODE
         self._span = _SATURATION * max(self._highest, -self._lowest) / self._scale
         self._peak = 0
-        self._service = Service(self._begin, self._end)
         self._set_map_up(self._register_map())
         self.power_cycle()
         world.add(self)
@@ -274,10 +296,12 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _convert(self) -> None:
         """Bring the filter from the last conversion to this instant."""
-        lags = (self.world.time - self._converted) / self._lag
+        now = self.world.time
+        elapsed = now - self._converted
+        lags = elapsed / self._lag
         if self.frozen or lags < _LEAST_LAGS:
             return
-        decay = math.exp(-lags)
+        decay, along, across, alone = _fading(lags)
         # Two equal lags with an input that runs straight from the last look to this one.
         signal = self._signal()
         trail = (signal - self._input) / lags
@@ -286,30 +310,17 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._first = signal - trail + first * decay
         self._second = signal - 2 * trail + (second + first * lags) * decay
         self._input = signal
-        elapsed = self.world.time - self._converted
-        self._converted = self.world.time
-        self._wander(lags, decay)
+        self._converted = now
+        spread = self._spread
+        fresh, other = self._draw(spread), self._draw(spread)
+        self._noise_second = decay * (self._noise_second + lags * self._noise_first) + along * fresh + across * other
+        self._noise_first = decay * self._noise_first + alone * fresh
         if self._tracking:
             self._track(elapsed)
         self._display()
         if abs(self._digits - self._reference) > self._set_up.motion_range:
             self._reference = self._digits
-            self._still_since = self._converted
-
-    def _wander(self, lags: float, decay: float) -> None:
-        """Bring the noise behind both lags to this instant, exactly for white noise before them."""
-        spread = self._spread
-        # The stationary covariance is 2, 1, 1 in units of the output's variance. What the known values still say
-        # of it fades by `known`; the rest is new.
-        known = decay * decay
-        first = -2 * math.expm1(-2 * lags)
-        both = 1 - known * (1 + 2 * lags)
-        second = 1 - known * (1 + 2 * lags + 2 * lags * lags)
-        along = both / math.sqrt(first)
-        across = math.sqrt(max(second - along * along, 0.0))
-        fresh, other = self._draw(spread), self._draw(spread)
-        self._noise_second = decay * (self._noise_second + lags * self._noise_first) + along * fresh + across * other
-        self._noise_first = decay * self._noise_first + math.sqrt(first) * fresh
+            self._still_since = now
 
     def _track(self, elapsed: float) -> None:
         """Move the zero towards the weight, if that is near enough (10.2.8)."""
@@ -323,10 +334,10 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _display(self) -> None:
         weight = self._second + self._noise_second
-        self._adc = min(max(round(weight / self._span * _FULL_SCALE), -_FULL_SCALE), _FULL_SCALE - 1)
         self._digits = round(weight * self._scale / self._step) * self._step
         self._weigh()
-        self._peak = max(self._peak, self._gross)
+        if self._gross > self._peak:
+            self._peak = self._gross
 
     def _weigh(self) -> None:
         """Count the gross weight from the zero."""
@@ -335,6 +346,11 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         else:
             weight = (self._second + self._noise_second) * self._scale - self._zero
             self._gross = round(weight / self._step) * self._step
+
+    @property
+    def _adc(self) -> int:
+        code = round((self._second + self._noise_second) / self._span * _FULL_SCALE)
+        return int(min(max(code, -_FULL_SCALE), _FULL_SCALE - 1))
 
     @property
     def _net(self) -> int:
@@ -358,9 +374,6 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         return (1 if self._still else 0) | (2 if self._zero else 0) | (4 if self._tare_set else 0)
 
     # The registers.
-
-    def _request(self) -> AbstractContextManager[None]:
-        return self._service
 
     def _begin(self) -> None:
         self.world.lock.acquire()

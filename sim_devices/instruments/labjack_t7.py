@@ -31,16 +31,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.devices import Identity
 from sim_devices.instruments.emulated import LineFaults
-from sim_devices.instruments.registers import Register, RegisterInstrument, Service
+from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
 from sim_devices.world import World
@@ -119,18 +118,6 @@ class _DetailedError(RegisterError):
 
 
 @dataclass
-class _Input:
-    range: float = 10.0
-    negative: int = SINGLE_ENDED
-    resolution: int = 0
-    settling: float = 0.0
-    feature: int = _EF_OFF
-    samples: int = 200
-    scan_rate: float = 6000.0
-    burst: Burst = _NO_BURST
-
-
-@dataclass
 class _Watchdog:
     enabled: int = 0
     timeout: int = 0
@@ -165,6 +152,29 @@ def _scale(volts: float, index: int) -> _Scale:
 
 _SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in range(1, len(CONVERSIONS) + 1)}
 """By range and resolution index."""
+
+
+def _ground() -> float:
+    return 0.0
+
+
+@dataclass
+class _Input:
+    range: float = 10.0
+    negative: int = SINGLE_ENDED
+    resolution: int = 0
+    settling: float = 0.0
+    feature: int = _EF_OFF
+    samples: int = 200
+    scan_rate: float = 6000.0
+    burst: Burst = _NO_BURST
+    scale: _Scale = _SCALES[10.0, _DEFAULT_INDEX]
+
+    def set_up(self, volts: float, resolution: int) -> None:
+        """Take a range and a resolution index, and what a single conversion is made of then."""
+        self.range = volts
+        self.resolution = resolution
+        self.scale = _SCALES[volts, resolution or _DEFAULT_INDEX]
 
 
 class EmulatedT7(LineFaults, RegisterInstrument):
@@ -204,10 +214,9 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.world = world
         self.serial_number = serial_number
         self.firmware = firmware
-        self._sources = dict(inputs)
+        self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._normals = normals(rng)
-        self._service = Service(self._begin, self._end)
-        self._converter = self._convert
+        self._held: dict[int, float] | None = None
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
@@ -247,11 +256,11 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def freeze(self) -> None:
         """Let each input stand at its next reading."""
-        self._converter = cache(self._convert)
+        self._held = {}
 
     def thaw(self) -> None:
         """Undo `freeze`."""
-        self._converter = self._convert
+        self._held = None
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -301,15 +310,12 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     # The requests.
 
-    def _request(self) -> AbstractContextManager[None]:
-        return self._service
-
     def _begin(self) -> None:
         """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
         world, dog = self.world, self._watchdog
         world.lock.acquire()
         try:
-            world.advance()
+            world.advance_locked()
             if not dog.enabled:
                 return
             if not dog.strict:
@@ -326,7 +332,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     def _end(self, error: BaseException | None) -> None:
         try:
-            if isinstance(error, RegisterError):
+            if error is not None and isinstance(error, RegisterError):
                 self._last_error = error.detail if isinstance(error, _DetailedError) else 0
             if self._touched:
                 self._lead()
@@ -413,10 +419,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
         with self._request():
-            return self._reading(channel)
-
-    def _reading(self, channel: int) -> float:
-        return self._converter(channel, self._inputs[channel].resolution or _DEFAULT_INDEX)
+            return self._convert(channel)
 
     def burst(self, channel: int) -> Burst:
         """Let a burst of conversions pass and return what it gave, as a read of AIN_EF_READ_A does.
@@ -432,32 +435,34 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 raise RegisterError(DEVICE_FAILURE, f"a burst of {duration:g} s is too long")
             begin = self.world.time
             readings = []
+            scale = _SCALES[settings.range, self._stream_index or _DEFAULT_STREAM_INDEX]
             for sample in range(1, settings.samples + 1):
                 self.world.clock.sleep_until(begin + sample / settings.scan_rate)
                 self.world.advance()
-                readings.append(self._converter(channel, self._stream_index or _DEFAULT_STREAM_INDEX))
+                readings.append(self._convert(channel, scale))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 
-    def _convert(self, channel: int, index: int) -> float:
+    def _convert(self, channel: int, scale: _Scale | None = None) -> float:
+        held = self._held
+        if held is not None and channel in held:
+            return held[channel]
         settings = self._inputs[channel]
-        source = self._sources.get(channel)
-        volts = 0.0 if source is None else source()
+        volts = self._sources[channel]()
         if settings.negative != SINGLE_ENDED:
-            volts -= self._terminal(settings.negative)
-        noise, step, lowest, highest = _SCALES[settings.range, index]
+            volts -= self._sources[settings.negative]()
+        noise, step, lowest, highest = scale or settings.scale
         volts = round((volts + noise * next(self._normals)) / step) * step
-        return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
-
-    def _terminal(self, channel: int) -> float:
-        source = self._sources.get(channel)
-        return 0.0 if source is None else source()
+        volts = volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        if held is not None:
+            held[channel] = volts
+        return volts
 
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default
         for each in RANGES:
             if math.isclose(wanted, each, rel_tol=1e-6):
-                self._inputs[channel].range = each
+                self._inputs[channel].set_up(each, self._inputs[channel].resolution)
                 return
         raise _DetailedError(ERROR_RANGE, f"AIN{channel}_RANGE: {value:g} is none of {RANGES}")
 
@@ -477,7 +482,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return value
 
     def _set_index(self, channel: int, value: float) -> None:
-        self._inputs[channel].resolution = self._checked_resolution(value)
+        self._inputs[channel].set_up(self._inputs[channel].range, self._checked_resolution(value))
 
     def _set_settling(self, channel: int, value: float) -> None:
         self._inputs[channel].settling = self._checked_settling(value, _LONGEST_SETTLING)
@@ -547,7 +552,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         """Return the emulated rows of `ljm_constants.json`."""
         inputs, dog = self._inputs, self._dog
         return (
-            Register("AIN#", 0, "F32", self._reading, None, CHANNELS),
+            Register("AIN#", 0, "F32", self._convert, None, CHANNELS),
             Register("DAC#", 1000, "F32", self._dacs.__getitem__, self._set_dac, len(self._dacs)),
             Register("DIO#", 2000, "U16", self._read_dio, self._set_dio, _DIOS),
             Register("DIO_STATE", 2800, "U32", self._levels, partial(self._set_dio_bank, "_dio_state")),

@@ -121,10 +121,19 @@ class RegisterInstrument(ABC):
         # What a request means is found once; a host asks the same few again and again.
         self._known_reads: dict[tuple[int, int], _Reads] = {}
         self._known_writes: dict[tuple[int, int], _Writes] = {}
+        self._service = Service(self._begin, self._end)
 
-    @abstractmethod
     def _request(self) -> AbstractContextManager[None]:
         """Serve a request: hold the lock, at the clock's present time."""
+        return self._service
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Begin a request; if it raises, the request does not begin."""
+
+    @abstractmethod
+    def _end(self, error: BaseException | None) -> None:
+        """End a request, with what it raised."""
 
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return `count` registers from `address` on, of one instant; reading half a value is allowed.
@@ -151,41 +160,42 @@ class RegisterInstrument(ABC):
             if writes.refusal is not None:
                 raise writes.refusal
 
-    def prepare(self, frames: Sequence[Frame], head: int) -> Packet | None:
-        """Return what carries such a packet of function 76 out, as one request; see `wire.modbus.PacketBank`."""
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
+        """Return what carries such a packet out, as one request; see `wire.modbus.PacketBank`."""
         sent, answered = ">", ">"
         parts: list[tuple[tuple[Callable[[], float], ...], tuple[Register, ...]]] = []
-        for frame in frames:
-            sent += f"{head}x"
+        for frame, head in zip(frames, heads, strict=True):
             try:
                 if frame.writes:
                     writes = self._writes(frame.address, frame.number)
                     if writes.refusal is not None:
                         return None
-                    sent += writes.values.format[1:]
+                    sent += f"{head}x{writes.values.format[1:]}"
                     parts.append(((), writes.registers))
                 else:
                     reads = self._reads(frame.address, frame.number)
                     if reads.values.size != reads.words.size:
                         return None
+                    sent += f"{head}x"
                     answered += reads.values.format[1:]
                     parts.append((reads.read, ()))
             except RegisterError:
                 return None
         unpack, pack = struct.Struct(sent).unpack, struct.Struct(answered).pack
-        request, after_frame, isfinite = self._request, self._after_frame, math.isfinite
-        if len(frames) == 1 and not frames[0].writes:
-            readers = parts[0][0]
+        writing = any(frame.writes for frame in frames)
+        if len(parts) == 1:
+            ((readers, registers),) = parts
+            if not writing:
+                return self._reader(readers, pack)
+            if len(registers) == 1:
+                return self._writer(registers[0], unpack)
+        begin, end, after_frame, isfinite = self._begin, self._end, self._after_frame, math.isfinite
 
-            def read_alone(body: bytes) -> bytes:  # noqa: ARG001
-                with request():
-                    return pack(*[read() for read in readers])
-
-            return read_alone
-
-        def carry_out(body: bytes) -> bytes:
-            given, values = iter(unpack(body)), []
-            with request():
+        def carry_out(packet: bytes) -> bytes:
+            given = iter(unpack(packet) if writing else ())
+            values: list[float] = []
+            begin()
+            try:
                 for readers, registers in parts:
                     for read in readers:
                         values.append(read())
@@ -196,9 +206,64 @@ class RegisterInstrument(ABC):
                         else:
                             register.write(value)
                     after_frame()
-                return pack(*values)
+                answer = pack(*values)
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return answer
 
         return carry_out
+
+    # What a fast loop sends, with as few calls as possible.
+
+    def _reader(self, readers: Sequence[Callable[[], float]], pack: Callable[..., bytes]) -> Packet:
+        """Return what only reads."""
+        begin, end = self._begin, self._end
+
+        def read_one(packet: bytes) -> bytes:  # noqa: ARG001
+            begin()
+            try:
+                answer = pack(read())
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return answer
+
+        def read_all(packet: bytes) -> bytes:  # noqa: ARG001
+            begin()
+            try:
+                answer = pack(*[read() for read in readers])
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return answer
+
+        read = readers[0]
+        return read_one if len(readers) == 1 else read_all
+
+    def _writer(self, register: Register, unpack: Callable[[bytes], tuple[float, ...]]) -> Packet:
+        """Return what writes one register."""
+        begin, end, isfinite, write = self._begin, self._end, math.isfinite, register.write
+        assert write is not None
+
+        def write_one(packet: bytes) -> bytes:
+            (value,) = unpack(packet)
+            begin()
+            try:
+                if isfinite(value):
+                    write(value)
+                else:
+                    self._take(register, value)
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return b""
+
+        return write_one
 
     @staticmethod
     def _take(register: Register, value: float) -> None:

@@ -23,9 +23,9 @@ BEAM_NODES = 10
 NODES = BEAM + BEAM_NODES
 
 # Rows of the node table: heat capacity (J/K), conductance to the next node, conductance to air, further
-# conductance to air at 1 K above it, which grows with the fourth root (W/K), share in the bending of the tip.
-CAPACITY, LINK, AIR, EXCESS, WEIGHT = range(5)
-NODE_ROWS = 5
+# conductance to air at 1 K above it, which grows with the fourth root (W/K).
+CAPACITY, LINK, AIR, EXCESS = range(4)
+NODE_ROWS = 4
 
 # Rows of the factorised matrix of a step: inverse pivots, what elimination adds of the row before, and what
 # substitution adds of the node behind.
@@ -48,6 +48,11 @@ VOLTAGE, LAG, DRIVE, COSINE, SINE, FIRST_REAL = range(6)
 REAL_MODES = 4
 FAST_SIZE = FIRST_REAL + REAL_MODES
 
+# Shape of the bent beam: rise at which it is straight (K), of the terms of its curvature (1/K, 1/K²), thermal
+# deflection per rise (m/K), and growth of the piezo deflection (1/K).
+STRAIGHT, QUADRATIC, CUBIC, SENSITIVITY, WARM_GAIN = range(5)
+SHAPE_SIZE = 5
+
 # Constants of the fast part: of the hysteresis, then steady gain, damping rate, angular frequency and gains
 # of the resonance, then rate and gain of each real mode.
 (
@@ -65,6 +70,14 @@ FAST_SIZE = FIRST_REAL + REAL_MODES
 ) = range(11)
 FIRST_GAIN = FIRST_RATE + REAL_MODES
 FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
+
+# Everything that the deflection of the tip depends on is one array, which passes into a compiled function sooner than
+# many: node temperatures, their change over the step under way, their shares in the bending, the shape of the bent
+# beam, fast state, and constants of the fast part.
+TIP_PARTS = (NODES, NODES, NODES, SHAPE_SIZE, FAST_SIZE, FAST_COEFFICIENT_SIZE)
+INCREMENT, SHARE, SHAPE = NODES, 2 * NODES, 3 * NODES
+FAST = SHAPE + SHAPE_SIZE
+FAST_COEFFICIENTS = FAST + FAST_SIZE
 
 
 class Thermal(NamedTuple):
@@ -184,19 +197,21 @@ def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
 
 
 @njit(cache=True)
-def bending(fraction: float, rise: Floats, increment: Floats, c: Record, nodes: Floats) -> tuple[float, float]:
+def bending(fraction: float, tip: Floats) -> tuple[float, float]:
     """Add up the bending of the beam, after a fraction of the step under way, in [0, 1].
 
     Returns the thermal deflection of the tip and the factor of the piezo deflection. Either is the local value
     weighted by the distance to the tip.
     """
+    shape = tip[SHAPE:FAST]
     bent = 0.0
     warm = 0.0
     for j in range(BEAM, NODES):
-        d = rise[j] + fraction * increment[j] + c[0].straight
-        bent += nodes[WEIGHT, j] * d * (1.0 + d * (c[0].quadratic + d * c[0].cubic))
-        warm += nodes[WEIGHT, j] * d
-    return c[0].sensitivity * bent, 1.0 + c[0].warm_gain * warm
+        weight = tip[SHARE + j]
+        d = tip[j] + fraction * tip[INCREMENT + j] + shape[STRAIGHT]
+        bent += weight * d * (1.0 + d * (shape[QUADRATIC] + d * shape[CUBIC]))
+        warm += weight * d
+    return shape[SENSITIVITY] * bent, 1.0 + shape[WARM_GAIN] * warm
 
 
 @njit(cache=True)
@@ -210,8 +225,9 @@ def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats,
 
 
 @njit(cache=True)
-def piezo_deflection(elapsed: float, fast: Floats, f: Floats) -> float:
+def piezo_deflection(elapsed: float, tip: Floats) -> float:
     """Evaluate the piezo deflection, at the temperature of the straight beam, some time after the last voltage."""
+    fast, f = tip[FAST:FAST_COEFFICIENTS], tip[FAST_COEFFICIENTS:]
     phase = f[FREQUENCY] * elapsed
     swing = math.exp(-f[DAMPING] * elapsed)
     total: float = f[STEADY] * fast[DRIVE]
@@ -222,19 +238,10 @@ def piezo_deflection(elapsed: float, fast: Floats, f: Floats) -> float:
 
 
 @njit(cache=True)
-def deflection(
-    fraction: float,
-    rise: Floats,
-    increment: Floats,
-    c: Record,
-    nodes: Floats,
-    elapsed: float,
-    fast: Floats,
-    f: Floats,
-) -> float:
+def deflection(fraction: float, elapsed: float, tip: Floats) -> float:
     """Add up the deflection of the tip; takes what `bending` and `piezo_deflection` take."""
-    thermal, warming = bending(fraction, rise, increment, c, nodes)
-    total: float = thermal + warming * piezo_deflection(elapsed, fast, f)
+    thermal, warming = bending(fraction, tip)
+    total: float = thermal + warming * piezo_deflection(elapsed, tip)
     return total
 
 
@@ -262,8 +269,9 @@ def hysteresis(lag: float, change: float, f: Floats) -> float:
 
 
 @njit(cache=True)
-def apply_voltage(voltage: float, elapsed: float, fast: Floats, f: Floats) -> None:
+def apply_voltage(voltage: float, elapsed: float, tip: Floats) -> None:
     """Change the voltage, some time after the last change."""
+    fast, f = tip[FAST:FAST_COEFFICIENTS], tip[FAST_COEFFICIENTS:]
     lag = hysteresis(fast[LAG], voltage - fast[VOLTAGE], f)
     drive = f[GAIN] * voltage - lag + f[VOLTAGE_QUADRATIC] * voltage * voltage
     step = drive - fast[DRIVE]

@@ -79,17 +79,21 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         super().__init__(parameters, rng)
         self._nodes = _node_table(parameters)
         self._coefficients = _coefficients(parameters)
-        self._fast_coefficients = _fast_coefficients(parameters)
-        self._increment = np.zeros(kernels.NODES)
+        self._tip = np.zeros(sum(kernels.TIP_PARTS))
+        self._rise, self._increment, share, shape, self._fast, self._fast_coefficients = np.split(
+            self._tip, np.cumsum(kernels.TIP_PARTS)[:-1]
+        )
+        share[:] = _shares()
+        shape[:] = _shape(parameters)
+        self._fast_coefficients[:] = _fast_coefficients(parameters)
         self._state = np.zeros(kernels.STATE_SIZE)
         self._command = np.zeros(kernels.COMMAND_SIZE)
-        self._fast = np.zeros(kernels.FAST_SIZE)
         # Whether the change over the step under way is known, and the time since the voltage last changed.
         self._ahead = False
         self._elapsed = 0.0
 
         deviation = parameters.ambient_sd * float(self._noise.standard_normal())
-        self._rise = np.full(kernels.NODES, deviation)
+        self._rise[:] = deviation
         self._thermal = kernels.Thermal(
             self._rise,
             self._increment,
@@ -166,7 +170,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         """
         if not abs(voltage) <= self._parameters.maximum_voltage:
             raise ValueError(f"voltage must lie within ±{self._parameters.maximum_voltage} V, not {voltage} V")
-        kernels.apply_voltage(voltage, self._elapsed, self._fast, self._fast_coefficients)
+        kernels.apply_voltage(voltage, self._elapsed, self._tip)
         self._elapsed = 0.0
 
     @property
@@ -174,17 +178,17 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         return self._pending / self._step if self._ahead else 0.0
 
     def _temperature(self, node: int) -> float:
-        rise = float(self._rise[node]) + self._fraction * float(self._increment[node])
+        rise: float = self._rise.item(node)
+        if self._ahead:
+            rise += self._pending / self._step * self._increment.item(node)
         return self._parameters.ambient_temperature + rise
 
     def _bending(self) -> tuple[float, float]:
-        parts: tuple[float, float] = kernels.bending(
-            self._fraction, self._rise, self._increment, self._coefficients, self._nodes
-        )
+        parts: tuple[float, float] = kernels.bending(self._fraction, self._tip)
         return parts
 
     def _unwarmed_piezo_deflection(self) -> float:
-        return float(kernels.piezo_deflection(self._elapsed, self._fast, self._fast_coefficients))
+        return float(kernels.piezo_deflection(self._elapsed, self._tip))
 
     @property
     def base_temperature(self) -> float:
@@ -243,14 +247,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         """Deflection of the tip, m."""
         # In one call, as a fast loop asks for it with each sample.
         total: float = kernels.deflection(
-            self._pending / self._step if self._ahead else 0.0,
-            self._rise,
-            self._increment,
-            self._coefficients,
-            self._nodes,
-            self._elapsed,
-            self._fast,
-            self._fast_coefficients,
+            self._pending / self._step if self._ahead else 0.0, self._elapsed, self._tip
         )
         return total
 
@@ -328,11 +325,27 @@ def _node_table(parameters: HybridParameters) -> Floats:
     area[-1] += strip.section  # the end face
     nodes[kernels.AIR, beam] = p.convection * (1.0 - p.convection_share) * area
     nodes[kernels.EXCESS, beam] = p.convection * p.convection_share * area / _CONVECTION_RISE**0.25
-
-    # (2/L²) times the distance to the tip, integrated over each element.
-    edges = np.linspace(0.0, 1.0, kernels.BEAM_NODES + 1)
-    nodes[kernels.WEIGHT, beam] = np.diff(2.0 * edges - edges**2)
     return nodes
+
+
+def _shares() -> Floats:
+    """Return the share of each node in the bending: (2/L²) times the distance to the tip, integrated over it."""
+    shares = np.zeros(kernels.NODES)
+    edges = np.linspace(0.0, 1.0, kernels.BEAM_NODES + 1)
+    shares[kernels.BEAM :] = np.diff(2.0 * edges - edges**2)
+    return shares
+
+
+def _shape(parameters: HybridParameters) -> Floats:
+    """Prepare the numbers that the bending needs."""
+    p = parameters
+    values = np.zeros(kernels.SHAPE_SIZE)
+    values[kernels.STRAIGHT] = p.ambient_temperature - p.straight_temperature
+    values[kernels.QUADRATIC] = p.bending_quadratic
+    values[kernels.CUBIC] = p.bending_cubic
+    values[kernels.SENSITIVITY] = thermal_sensitivity(p.bimorph)
+    values[kernels.WARM_GAIN] = p.piezo_warming
+    return values
 
 
 def _coefficients(parameters: HybridParameters) -> Record:
@@ -350,11 +363,6 @@ def _coefficients(parameters: HybridParameters) -> Record:
         loop_proportional=2.0 * p.loop_damping * p.loop_frequency * capacity,
         loop_integral=p.loop_frequency**2 * capacity * p.step,
         maximum_current=p.maximum_current,
-        straight=p.ambient_temperature - p.straight_temperature,
-        sensitivity=thermal_sensitivity(p.bimorph),
-        quadratic=p.bending_quadratic,
-        cubic=p.bending_cubic,
-        warm_gain=p.piezo_warming,
     )
 
 

@@ -232,6 +232,10 @@ class ControlSocket:
 def values_to_json(values: Mapping[str, TrueValue]) -> dict[str, dict[str, Any]]:
     """Return true values for JSON; what is no finite number becomes null."""
     return {
-        name: {"value": float(each.value) if math.isfinite(each.value) else None, "unit": each.unit}
+        name: {
+            "value": float(each.value) if math.isfinite(each.value) else None,
+            "unit": each.unit,
+            "is_output": each.is_output,
+        }
         for name, each in values.items()
     }

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sim_devices.noise import normals
 from sim_devices.world import World
 
 
@@ -76,7 +77,7 @@ class PiezoAmplifier:
         self._volts_per_volt = volts_per_volt * (1 + scale_error * rng.standard_normal())
         self._amperes_per_volt = amperes_per_volt
         self._noise = noise_volts
-        self._rng = rng
+        self._normals = normals(rng)
         self._input = offset_volts
         self._saturation = self.SATURATION
         self._enabled = False
@@ -122,12 +123,12 @@ class PiezoAmplifier:
 
     def voltage_monitor(self) -> float:
         """Return the voltage in V of the voltage monitor at this instant."""
-        return self.voltage / self._volts_per_volt + self._noise * self._rng.standard_normal()
+        return self.voltage / self._volts_per_volt + self._noise * next(self._normals)
 
     def current_monitor(self) -> float:
         """Return the voltage in V of the current monitor at this instant."""
         amperes = self.CAPACITANCE * (self._target - self.voltage) / self._time_constant
-        return amperes / self._amperes_per_volt + self._noise * self._rng.standard_normal()
+        return amperes / self._amperes_per_volt + self._noise * next(self._normals)
 
     def status(self) -> float:
         """Return the voltage in V of the status output: high while the amplifier is on."""

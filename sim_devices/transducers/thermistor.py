@@ -8,6 +8,8 @@ from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
+from sim_devices.noise import normals
+
 _KELVIN = 273.15
 
 STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
@@ -42,6 +44,7 @@ class Thermistor:
 
     def __post_init__(self) -> None:
         self.excitation_volts += self.excitation_error * self.rng.standard_normal()
+        self._normals = normals(self.rng)
 
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
@@ -49,7 +52,7 @@ class Thermistor:
             return 0.0
         if self.open:
             return self.excitation_volts
-        ohms = self._ohms(self.temperature() + self.noise * self.rng.standard_normal())
+        ohms = self._ohms(self.temperature() + self.noise * next(self._normals))
         return self.excitation_volts * ohms / (ohms + self.reference_ohms)
 
     def excitation(self) -> float:

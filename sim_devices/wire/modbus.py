@@ -74,18 +74,14 @@ Packet = Callable[[bytes], bytes]
 """Carries the frames of a packet out, with the values in it, and returns what the reads among them give."""
 
 
-_Known = tuple[int, Packet, bytes]
-"""Of a request that comes again: its length, what carries it out, and what stands before the values of its reply."""
-
-
 @runtime_checkable
 class PacketBank(Protocol):
     """A bank that can prepare for packets of the same frames with other values, as a fast loop sends them."""
 
-    def prepare(self, frames: Sequence[Frame], head: int) -> Packet | None:
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
         """Return what carries such packets out, with the result of frame by frame; None if it cannot.
 
-        `head` is the number of bytes of each frame before its values.
+        `heads` are the numbers of bytes of a packet that stand before the values of each frame.
         """
 
 
@@ -101,10 +97,10 @@ def answer(bank: RegisterBank, request: bytes, own: OwnFunctions = MappingProxyT
             return request[:1] + own[function](bank, request[1:])
         return request[:1] + _carry_out(bank, function, request)
     except Exception as error:
-        return _refusal(request, error)
+        return refusal(request, error)
 
 
-def _refusal(request: bytes, error: Exception) -> bytes:
+def refusal(request: bytes, error: Exception) -> bytes:
     """Return the reply to a request that was not carried out."""
     if isinstance(error, RegisterError):
         return bytes((request[0] | 0x80, error.code))
@@ -113,61 +109,56 @@ def _refusal(request: bytes, error: Exception) -> bytes:
     return bytes((request[0] | 0x80, DEVICE_FAILURE))
 
 
-class Answers:
-    """Answers the requests of one host, as `answer` does, and prepares for those that come again.
+class Prepared(NamedTuple):
+    """What a request takes that comes again, with other values if it writes."""
 
-    A fast loop sends the same few reads, and writes of the same registers with other values.
+    size: int
+    """Bytes of the request."""
+    same: int
+    """How many bytes at its beginning are always the same."""
+    packet: Packet
+    """Carries it out; takes the bytes before the request too."""
+    head: bytes
+    """What stands before the values of the reply."""
+    answered: int
+    """Bytes of the reply."""
+
+
+def prepare(bank: RegisterBank, request: bytes, before: int) -> Prepared | None:
+    """Prepare for a request that comes again; None if it is not well formed, or the instrument cannot.
+
+    These are reads, writes of several registers, and packets of function 76 that only read. What carries the request
+    out takes `before` bytes in front of it.
     """
-
-    _MOST_KNOWN = 256
-
-    def __init__(self, bank: RegisterBank, own: OwnFunctions = MappingProxyType({})) -> None:
-        self._bank = bank
-        self._preparing = bank if isinstance(bank, PacketBank) else None
-        self._own = own
-        # By what comes before the values, if any.
-        self._known: dict[bytes, _Known] = {}
-
-    def __call__(self, request: bytes) -> bytes:
-        """Return the reply to one request, both without a header and at least one byte long."""
-        function = request[0]
-        if function in self._own:
-            return answer(self._bank, request, self._own)
-        known = self._known.get(request[:_WRITE_HEAD])
-        if known is None or known[0] != len(request):
-            self._learn(request)
-            return answer(self._bank, request, self._own)
-        _, packet, head = known
-        try:
-            return head + packet(request)
-        except Exception as error:
-            return _refusal(request, error)
-
-    def _learn(self, request: bytes) -> None:
-        """Prepare for a request that is well formed, if the instrument can."""
-        bank, function = self._preparing, request[0]
-        if bank is None or len(request) < _BODY.size:
-            return
+    if not isinstance(bank, PacketBank) or len(request) < _BODY.size:
+        return None
+    function, size = request[0], len(request)
+    if function == FEEDBACK:
+        frames = _frames(request[1:])
+        if frames is None or any(frame.writes for frame in frames):
+            return None
+        same, heads, head = size, [0] * len(frames), request[:1]
+    else:
         _, address, number = _BODY.unpack_from(request)
-        if address + number > _REGISTERS:
-            return
-        if function == _READ_HOLDING and len(request) == _BODY.size and 1 <= number <= _MOST_READ:
-            packet = bank.prepare([Frame(False, address, number)], _BODY.size)
-            head = bytes((function, 2 * number))
+        frames = [Frame(function == _WRITE_MANY, address, number)]
+        if number == 0 or address + number > _REGISTERS:
+            return None
+        if function == _READ_HOLDING and size == _BODY.size and number <= _MOST_READ:
+            same, heads, head = size, [0], bytes((function, 2 * number))
         elif (
             function == _WRITE_MANY
-            and 1 <= number <= _MOST_WRITTEN
-            and len(request) == _WRITE_HEAD + 2 * number
+            and number <= _MOST_WRITTEN
+            and size == _WRITE_HEAD + 2 * number
             and request[5] == 2 * number
         ):
-            packet = bank.prepare([Frame(True, address, number)], _WRITE_HEAD)
-            head = request[: _BODY.size]
+            same, heads, head = _WRITE_HEAD, [before + _WRITE_HEAD], request[: _BODY.size]
         else:
-            return
-        if packet is not None:
-            if len(self._known) >= self._MOST_KNOWN:
-                self._known.clear()
-            self._known[request[:_WRITE_HEAD]] = len(request), packet, head
+            return None
+    packet = bank.prepare(frames, heads)
+    if packet is None:
+        return None
+    answered = len(head) + sum(2 * frame.number for frame in frames if not frame.writes)
+    return Prepared(size, same, packet, head, answered)
 
 
 def _carry_out(bank: RegisterBank, function: int, request: bytes) -> bytes:
@@ -249,7 +240,7 @@ class Feedback:
         elif len(self._known) >= self._MOST_KNOWN:
             self._known.clear()
         if isinstance(bank, PacketBank) and (frames := _frames(body)) is not None:
-            packet = bank.prepare(frames, _FRAME.size)
+            packet = bank.prepare(frames, [_FRAME.size] * len(frames))
             if packet is not None:
                 mask = int.from_bytes(
                     b"".join(b"\xff" * _FRAME.size + bytes(2 * frame.number * frame.writes) for frame in frames)

@@ -37,7 +37,7 @@ def rig():
 def test_a_request(rig, capsys):
     instrument = LabJackT7("t7", rig.devices["displacement"]._settings.port, 1.0)
     test, conversion, two = Span.of(TEST), Span.of(AIN), (Span.of(TEST), Span.of(AIN))
-    assert instrument.read_span(test) == [0x00112233]
+    assert instrument.read_span(test) == (0x00112233,)
     found = {
         "a constant": microseconds(lambda: instrument.read_span(test)),
         "a conversion": microseconds(lambda: instrument.read_span(conversion)),

@@ -1,4 +1,6 @@
-"""The pages of `docs/how-to`, executed: a reader who copies their blocks in order gets what the page says.
+"""The pages of `docs/how-to` and those of `docs/reference` with examples, executed.
+
+A reader who copies their blocks in order gets what the page says.
 
 A block with `file: NAME` after its language is written to that file, `sh` and `python` without it are run, and each
 line of a `text` block has to occur in what the block before it has printed.
@@ -11,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
-PAGES = Path(__file__).parents[2] / "docs" / "how-to"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = DOCS / "how-to"
+EXECUTED = [*sorted(PAGES.glob("*.md")), DOCS / "reference" / "interlocks.md"]
 BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -33,10 +37,10 @@ def environment(tmp_path):
     }
 
 
-@pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
-def test_page(page, tmp_path, environment, finished_process):
-    printed = None
-    for language, name, text in BLOCK.findall((PAGES / f"{page}.md").read_text()):
+@pytest.mark.parametrize("path", EXECUTED, ids=lambda path: path.stem)
+def test_page(path, tmp_path, environment, finished_process):
+    page, printed = path.stem, None
+    for language, name, text in BLOCK.findall(path.read_text()):
         if name:
             (tmp_path / name).write_text(text)
         elif language == "text":

@@ -1475,3 +1475,32 @@ def test_connecting_either_leaves_the_other_as_it_is(bench):
     assert sensor.measure()["psd_position"] == pytest.approx(0.0175, abs=1e-5)
     sensor.close()
     assert switch.measure() == {"fan_state": 1.0}
+
+
+@pytest.mark.parametrize("make", [Bench.supply, Bench.switch])
+def test_a_line_that_is_opened_again_is_switched_off_over_it(bench, make):
+    bench.volts[2] = 0.0
+    device = make(bench)
+    device._line._connection.end()
+    device.reconnect()
+    device.safe()
+    assert not bench.t7.dio_level(5, pulled_down=True)
+
+
+def test_devices_on_one_connection_are_read_in_one_request(bench):
+    sensor, thermistor = bench.sensor(channels=[0]), bench.thermistor(channels=[3, 4])
+    bench.volts |= {0: 1.0, 3: 1.2, 4: 2.5}
+    assert sensor.joins(thermistor)
+    assert not sensor.joins(bench.switch())
+    requests = []
+    client = sensor._line._client
+    send = client.request
+    client.request = lambda request, expected: requests.append(request) or send(request, expected)
+    values = sensor.joined([thermistor])()
+    assert len(requests) == 1
+    one_by_one = sensor.glance() | thermistor.glance()
+    assert len(requests) == 3
+    assert values == {name: pytest.approx(value, abs=1e-2, rel=1e-3) for name, value in one_by_one.items()}
+    bench.volts[3] = 2.5
+    with pytest.raises(DeviceError, match=r"^base: thermistor open"):
+        sensor.joined([thermistor])()

@@ -231,6 +231,8 @@ def judged(wanted, processes):
         for (rig, name, seed), result in waiting:
             try:
                 yield result.get(LONGEST)
+            except BenchError as error:
+                yield Cell(rig, name, seed, "refused", "", dict.fromkeys(CHECKS, ".") | {"ends": str(error)})
             except multiprocessing.TimeoutError:
                 hung = dict.fromkeys(CHECKS, ".") | {"ends": f"not within {LONGEST:.0f} s of wall-clock time"}
                 yield Cell(rig, name, seed, "hung", "", hung)

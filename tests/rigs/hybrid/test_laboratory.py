@@ -439,3 +439,17 @@ class TestSettings:
     )
     def test_what_is_wrong_is_one_message(self, name, key, value, words):
         assert_refused(name, key, value, words)
+
+
+def test_a_quick_reading_in_few_requests_is_that_of_the_devices_one_by_one():
+    """Also in the noise of each conversion: those of one request are taken in the order of the devices."""
+    wanted = ("displacement_position", "base_temperature", "tip_temperature", "witness_position")
+    with rig(WITNESSED) as joint, rig(WITNESSED) as single:
+        read = joint.quick_reader(wanted)
+        for instant in (1.0, 1.005, 1.01):
+            for each in (joint, single):
+                each.clock.sleep_until(instant)
+            values = {}
+            for name in ("displacement", "base", "tip", "witness"):
+                values |= single.devices[name].glance()
+            assert read() == values

@@ -151,7 +151,8 @@ def test_bandwidth_of_the_deflection():
     # A small sine at that frequency about no current: 3 dB less than at rest.
     frequency = model().bandwidth()
     dt = 1.0 / (200.0 * frequency)
-    sine = 1e-4 * np.sin(2.0 * np.pi * frequency * dt * np.arange(200 * 50))
+    # 20 periods are 10 time constants of the block.
+    sine = 1e-4 * np.sin(2.0 * np.pi * frequency * dt * np.arange(200 * 20))
     swing = 0.5 * np.ptp(model().simulate(sine, np.zeros(sine.size), dt).thermal[-200:])
     slope = abs(quartic(1e-4) - quartic(-1e-4)) / 2e-4
     steady = NETWORK.steady_rises(1e-4)[TIP]

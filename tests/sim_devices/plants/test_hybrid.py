@@ -1,6 +1,7 @@
 import copy
 import dataclasses
 import math
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -373,7 +374,9 @@ class TestPiezo:
 
 
 class TestHysteresis:
-    constants = make()._fast_coefficients
+    @cached_property
+    def constants(self):
+        return make()._fast_coefficients
 
     @given(st.floats(-1.8e-6, 1.8e-6), st.floats(-80.0, 80.0).filter(lambda change: abs(change) > 0.1))
     @settings(max_examples=40, deadline=None)

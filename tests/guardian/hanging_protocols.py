@@ -1,0 +1,58 @@
+"""Protocols that switch every output of a rig on, and then go wrong."""
+
+import ctypes
+import json
+from collections.abc import Generator
+
+from bench.protocol import Dwell, Messages, Note, ProtocolParameters, Step, parameter, protocol
+from bench.protocol.vocabulary import Message, Reading
+
+
+class Parameters(ProtocolParameters):
+    setpoints: str = parameter("{}", unit="", help="set-points by device, JSON")
+    seconds: float = parameter(600.0, unit="s", low=0, high=86400, help="how long it holds")
+
+
+def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading, Reading]:
+    # Zero first, and one after the other: a supply that was off is not switched on by the first set-point.
+    for device, value in json.loads(parameters.setpoints).items():
+        yield Step({device: value}, Dwell(0.2))
+    yield Note("everything is on")
+    return (yield Step({}, Dwell(seconds)))
+
+
+@protocol(needs=())
+def hold(parameters: Parameters) -> Messages:
+    """Hold everything on."""
+    yield from _hold(parameters, parameters.seconds)
+
+
+@protocol(needs=())
+def spin(parameters: Parameters) -> Messages:
+    """Compute for ever."""
+    reading = yield from _hold(parameters, 1.0)
+    yield Note("computing")
+    # Not in the dry run, whose readings are empty.
+    while reading.values:
+        pass
+
+
+@protocol(needs=())
+def keep_interpreter(parameters: Parameters) -> Messages:
+    """Run code that never gives up Python's lock."""
+    reading = yield from _hold(parameters, 1.0)
+    yield Note("computing")
+    if reading.values:
+        # PyDLL keeps the lock while the function runs.
+        ctypes.PyDLL(None).sleep(60)
+    yield Note("computed")
+
+
+@protocol(needs=())
+def talk(parameters: Parameters) -> Messages:
+    """Print more than any terminal holds, in notes."""
+    yield from _hold(parameters, 0.2)
+    for _ in range(int(parameters.seconds / 0.2)):
+        yield Note("x" * 1000)
+        yield Note("x" * 1000)
+        yield Step({}, Dwell(0.2))
