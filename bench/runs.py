@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.attachment import AttachedClock, attach
+from bench.attachment import AttachedClock, Attachment, attach
 from bench.binding import Slots
 from bench.clock import Stopwatch, wall_time
 from bench.description import RigDescription
@@ -139,6 +139,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
     laboratory: object = None
+    attachment: Attachment | None = None
     if run.attach is None:
         clock = clock_for(rig_file, run.clock)
     elif not rig_file.emulated:
@@ -155,6 +156,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     guardian: RemoteStation | None = None
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
+        if attachment is not None:
+            stack.callback(attachment.close)
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
         clock.interrupted = interrupts.abort_requested
