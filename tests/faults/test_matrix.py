@@ -23,7 +23,7 @@ def matrix():
         ("vo2", "tec.unplug"),
         ("vo2", "tec-over-current"),
         ("sma", "supply.double"),
-        ("sma", "load_cell.corrupt"),
+        ("sma", "stage.double"),
         ("sma", "broken-muscle"),
         ("hybrid", "tec.corrupt"),
         ("hybrid", "amplifier-trips"),
