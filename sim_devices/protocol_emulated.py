@@ -175,13 +175,15 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         """
         self._check()
         self._hear()
-        received, until = self._received, self._end_of_timeout()
+        received = self._received
         most = sys.maxsize if size is None else size
-        while (begin := received.find(expected)) < 0 and len(received) < most and self._timeout != 0:
-            before = len(received)
-            self._wait_until(before + 1, until)
-            if len(received) == before:
-                break
+        begin = received.find(expected)
+        if begin < 0 and self._timeout != 0:
+            until, before = self._end_of_timeout(), -1
+            while begin < 0 and before < len(received) < most:
+                before = len(received)
+                self._wait_until(before + 1, until)
+                begin = received.find(expected)
         count = min(len(received) if begin < 0 else begin + len(expected), most)
         data = bytes(received[:count])
         del received[:count]
