@@ -168,8 +168,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             laboratory = rig.laboratory
             station: Station = LocalStation(rig)
         else:
-            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed)
-            station = guardian = RemoteStation(guarded, clock, dict)
+            doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
+            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
+            station = guardian = RemoteStation(guarded, clock)
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
         if run.faults is not None:

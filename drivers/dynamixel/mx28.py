@@ -27,7 +27,7 @@ from typing import ClassVar, Literal, Self, TypeVar
 from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
-from bench.devices import Actuator, Identity, Limits, Status
+from bench.devices import Actuator, Finding, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.dynamixel.protocol2 import (
@@ -489,7 +489,8 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         return DeviceError(
             self.name,
             f"hardware error 0x{bits:02X} ({texts}; {volts:.1f} V, {celsius} °C): {advice}; "
-            "then switch the servo off and on, which loses the number of turns: check zero_counts",
+            f"then run `bench recover RIG {self.name}`, or switch the servo off and on, which loses the number of "
+            "turns: check zero_counts",
         )
 
     def _watchdog_error(self) -> DeviceError:
@@ -539,3 +540,15 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def _refusal(self, what: str, error: RefusedError) -> DeviceError:
         return DeviceError(self.name, f"refused {what}: {error}")
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Report the supply voltage and the temperature, and whether a power cycle can lose a turn.
+
+        Raises DeviceError if the servo does not answer.
+        """
+        _, _, _, voltage, temperature = self._feedback()
+        span = abs((self.limits.high - self.limits.low) / self._settings.per_radian) / (2.0 * math.pi)
+        turns = f"the limits span {span:.2g} turns"
+        if span >= 1.0:
+            turns += "; which of them it is in is lost when it is switched off"
+        return Finding("power supply", f"{0.1 * voltage:.1f} V, servo {temperature} °C"), Finding("turns", turns)

@@ -32,7 +32,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status
+from bench.devices import Finding, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.roles import VoltageSupply
 from drivers.device import RecoverableDevice, attempt
@@ -71,7 +71,10 @@ FAULT_FLAGS: Mapping[int, tuple[str, str]] = {
     0x02: ("over-voltage", "check the power supply"),
     0x04: ("under-voltage", "check the power supply, its cable and its current limit"),
     0x08: ("short circuit", "check the load and its cables"),
-    0x10: ("emergency stop", "find out who stopped it and why, then switch the controller off and on"),
+    0x10: (
+        "emergency stop",
+        "find out who stopped it and why, then run `bench recover`, or switch the controller off and on",
+    ),
     0x20: ("setup fault", "check the configuration with the maker's software"),
     0x40: ("MOSFET failure", "the power stage is damaged: have the controller repaired"),
     0x80: ("default configuration loaded", "load the configuration again with the maker's software"),
@@ -469,3 +472,17 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
     def _refused(self, item: Entry, value: int, sub: int, error: AbortedError) -> DeviceError:
         return DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}")
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare the battery voltage with the limits; the watchdog cannot be read by CANopen.
+
+        Raises DeviceError if the device does not answer.
+        """
+        with self._lock:
+            battery = self._read_battery()
+        highest = max(self._limits.high, -self._limits.low)
+        advice = ""
+        if battery < highest:
+            advice = f"check the power supply, or lower voltage_limits: {highest:g} V cannot be reached"
+        unread = f"^RWD cannot be read by CANopen; the rig file says {1e3 * self._settings.watchdog:g} ms"
+        return Finding("power supply", f"{battery:.1f} V", advice), Finding("watchdog read back", unread)
