@@ -33,14 +33,14 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import VoltageSupply
-from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.instruments.roboteq_objects import (
     CHANNELS,
     DICTIONARY,
@@ -90,7 +90,7 @@ class HeatingLoad(Protocol):
         """Current through the load, A."""
 
 
-class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
+class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
     """One SDC2160 with its load, as the object dictionary and as the role of a voltage supply.
 
     Parameters
@@ -116,6 +116,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
+
+    MEASURED = (0x2100, 0x2102, 0x210C, 0x210D)
 
     def __init__(
         self,
@@ -166,7 +168,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._quiet_until = -math.inf
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
-        self._readings: dict[int, Callable[[int], int]] = {
+        self._readings: dict[int, Callable[..., Any]] = {
             0x1000: lambda _: DEVICE_TYPE,
             0x1001: lambda _: 1 if self._faults() else 0,
             0x1016: lambda sub: self._consumer_heartbeats[sub - 1] if sub else len(self._consumer_heartbeats),
