@@ -170,9 +170,16 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         """
         self._check()
         self._hear()
-        end = self._received.find(expected)
-        found = len(self._received) + 1 if end < 0 else end + len(expected)
-        return self.read(found if size is None else min(found, size))
+        received = self._received
+        end = received.find(expected)
+        found = len(received) + 1 if end < 0 else end + len(expected)
+        if size is not None and size < found:
+            found = size
+        if found > len(received):
+            return self.read(found)
+        data = bytes(received[:found])
+        del received[:found]
+        return data
 
     def write(self, data: bytes, /) -> int:
         """Send bytes; the answer is ready for `read` when this returns.

@@ -126,7 +126,8 @@ class DigitalOutput:
     @property
     def is_on(self) -> bool:
         """Whether the level of the line is the one that is on, as the instrument reports now."""
-        return self._level(self._instrument.read_span(_STATE)[0])
+        ((state,),) = self._instrument.read_spans((_STATE,))
+        return self._level(state)
 
     def switch(self, on: bool) -> None:
         """Make the line an output with the level for on or off.
@@ -270,16 +271,23 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
         super().__init__(name, settings, clock, line)
         self._output = DigitalOutput(name, line, settings.line, active_high=settings.active_high)
 
-    def _renew_line(self) -> None:
-        super()._renew_line()
-        self._output = DigitalOutput(
-            self.name, self._line, self._settings.line, active_high=self._settings.active_high
-        )
+    @property
+    def watchdog(self) -> float:
+        """Silence of all hosts, s, after which the instrument switches the line off, at the latest."""
+        return float(self._settings.watchdog)
+
+    def safe(self) -> None:
+        """Bring the device into its safe state, over a connection of its own if the one in use is gone.
+
+        Raises `DeviceError` if the safe state could not be confirmed, after everything was tried: within 3 s.
+        """
+        with self._line.in_haste(unchecked=True):
+            self._make_safe()
 
     def close(self) -> None:
         """Release the connection; a line that is on is left to the watchdog."""
         # An instrument that cannot be reached any more keeps its watchdog, as it should.
-        with suppress(DeviceError):
+        with suppress(DeviceError), self._line.in_haste():
             if not self._output.is_on:
                 self._output.unguard()
         super().close()

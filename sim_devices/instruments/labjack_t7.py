@@ -3,7 +3,7 @@
 The register map is that of `ljm_constants.json` (repository labjack/ljm_constants), the behaviour that of the
 LabJack T-series datasheet: 14.1.7 (average, minimum and maximum), 14.3.0 (T7 analog inputs), 15.0 (analog
 outputs), A-3-1 (noise and resolution), the datasheet of the LJTick-DAC, and the descriptions of the watchdog
-registers in the map.
+registers in the map; LabJack's letter of volatility for USER_RAM, which is a plain memory here, as no script runs.
 
 Assumptions, where these say nothing:
 
@@ -90,6 +90,7 @@ _LONGEST_WAIT = 100_000  # µs
 _LONGEST_SETTLING = 50_000.0
 _LONGEST_STREAM_SETTLING = 4_400.0
 _TDACS = 23
+_USER_RAM = 40
 _DIOS = 23
 _DAC_TOP = 5.0
 _TDAC_TOP = 10.0
@@ -237,6 +238,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._dio_direction = 0
         self._dio_inhibit = 0
         self._last_error = 0
+        self._user_ram = [0.0] * _USER_RAM
         self._expired_at = None
         self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
 
@@ -558,6 +560,9 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 "AIN#_RESOLUTION_INDEX", 41500, "U16", lambda n: inputs[n].resolution, self._set_index, CHANNELS
             ),
             Register("AIN#_SETTLING_US", 42000, "F32", lambda n: inputs[n].settling, self._set_settling, CHANNELS),
+            Register(
+                "USER_RAM#_U32", 46100, "U32", self._user_ram.__getitem__, self._user_ram.__setitem__, _USER_RAM
+            ),
             Register("LAST_ERR_DETAIL", 55000, "U16", lambda: self._last_error),
             Register("TEST", 55100, "U32", lambda: 0x00112233),
             Register("TEST_FLOAT32", 55124, "F32", lambda: -9999.0),

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from sim_devices.instruments.emulated import LineFaults
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import RegisterBank, answer
 
@@ -81,6 +82,7 @@ class ModbusRtuServer(WireServer):
             raise ValueError(f"address: allowed are 1 to 247, got {address}")
         self._bank = bank
         self._address = address
+        self._line = bank if isinstance(bank, LineFaults) else None
         self._received = bytearray()
 
     @property
@@ -90,6 +92,9 @@ class ModbusRtuServer(WireServer):
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the line, in pieces of any size; return the replies to whole requests."""
+        if self._line is not None and not self._line.answering:
+            self._received.clear()
+            return b""
         if not self._received and self._is_request(data):
             # The usual case: a client that sends one request and waits.
             return self._serve(data)
@@ -134,7 +139,10 @@ class ModbusRtuServer(WireServer):
         if address not in (self._address, BROADCAST):
             return b""
         reply = bytes([address]) + answer(self._bank, frame[1:-2])
-        return b"" if address == BROADCAST else reply + crc16(reply)
+        if address == BROADCAST:
+            return b""
+        sealed = reply + crc16(reply)
+        return sealed if self._line is None else self._line.transmit(sealed)
 
 
 def _length(received: bytes | memoryview) -> int | None:

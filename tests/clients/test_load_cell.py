@@ -33,10 +33,10 @@ def hang(sma):
 SERIAL = ("-m", "rtu", "-a", 1, "-b", 38_400, "-P", "none", "-0", "-B", "-1", "-o", 10)
 
 
-def mbpoll(port, register, kind, *values):
-    """Read a register, or write values from it on; return exit code and output."""
+def mbpoll(*arguments):
+    """Call mbpoll; return exit code and output."""
     finished = subprocess.run(
-        [shutil.which("mbpoll"), *map(str, (*SERIAL, "-r", register, "-t", kind, port, *values))],
+        [shutil.which("mbpoll"), *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=2 * PATIENCE,
@@ -89,7 +89,7 @@ def test_minimalmodbus_opens_the_line_again_after_half_a_frame(minimal):
 @needs_mbpoll
 def test_mbpoll_weighs(port, hang):
     hang(4.0)
-    code, output = mbpoll(port, GROSS, "4:float")
+    code, output = mbpoll(*SERIAL, "-r", GROSS, "-t", "4:float", port)
     assert code == 0, output
     shown = re.search(rf"\[{GROSS}\]:\s+(\S+)", output)
     assert float(shown[1]) == pytest.approx(4.0, abs=0.2)
@@ -97,7 +97,7 @@ def test_mbpoll_weighs(port, hang):
 
 @needs_mbpoll
 def test_mbpoll_writes(port, minimal):
-    code, output = mbpoll(port, MOTION_TIME, "4:int", 900)
+    code, output = mbpoll(*SERIAL, "-r", MOTION_TIME, "-t", "4:int", port, 900)
     assert code == 0, output
     cell = minimal()
     assert cell.read_long(MOTION_TIME) == 900

@@ -103,7 +103,7 @@ def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Foun
             stack.callback(os.close, reading)
             out: int = writing
         else:
-            out = subprocess.DEVNULL
+            out = stack.enter_context((folder.parent / f"{folder.name}.txt").open("wb")).fileno()
         # In a session of its own, as its own terminal's would be.
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
@@ -144,7 +144,8 @@ def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: i
     since = time.monotonic()
     while len(found := outputs(control)) < count:
         if process.poll() is not None or time.monotonic() - since > 120:
-            raise AssertionError(f"the outputs did not all go on: {found}, exit code {process.poll()}")
+            said = (folder.parent / f"{folder.name}.txt").read_text()[-500:]
+            raise AssertionError(f"the outputs did not all go on: {found}, exit code {process.poll()}: {said}")
         time.sleep(0.01)
     _await_note(folder, "everything is on")
     return found
@@ -211,7 +212,8 @@ def main() -> int:
             for title in given.trial or TRIALS:
                 found = []
                 for _ in range(given.times):
-                    folder = Path(stack.enter_context(TemporaryDirectory()))
+                    folder = Path(stack.enter_context(TemporaryDirectory())) / "runs"
+                    folder.mkdir()
                     found.append(carry_out(rig, TRIALS[title], folder, instants.uniform(0.0, 2.0)))
                 good = [each for each in found if not each.problem]
                 times = [each.seconds for each in found]
