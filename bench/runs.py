@@ -157,8 +157,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         if run.attach is None and rig_file.in_process:
             station: Station = LocalStation(Rig(rig_file, clock, run.seed))
         else:
-            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed)
-            station = guardian = RemoteStation(guarded, clock, dict)
+            doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
+            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
+            station = guardian = RemoteStation(guarded, clock)
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
         description = station.description

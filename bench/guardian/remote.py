@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import math
+import os
 import signal
 import subprocess
 import tempfile
@@ -24,6 +25,7 @@ from bench.rig import Look
 from bench.rig_file import RigFile
 from bench.roles import Floats
 from bench.station.interface import Arrivals, News, Station
+from bench.upkeep.rescue import rescue_by_another_process
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
@@ -62,6 +64,8 @@ class GuardedRig:
         Endpoints file of `bench emulate`, where the instruments are served.
     seed : int
         Seed of everything random in an emulated laboratory.
+    doing : str
+        What it is opened for, in a few words, for who finds the rig in use.
     """
 
     file: RigFile
@@ -69,13 +73,14 @@ class GuardedRig:
     overrides: Mapping[str, str]
     attach: Path | None
     seed: int
+    doing: str
 
 
 class RemoteStation(Station):
     """A station in another process.
 
-    One request is outstanding at a time, and each has a number. A guardian that is lost is replaced by `rescue`,
-    which makes the devices safe; this process never opens a line.
+    One request is outstanding at a time, and each has a number. If the guardian is lost, `bench safe` in a process of
+    its own makes the devices safe; this one never opens a line.
 
     Parameters
     ----------
@@ -83,8 +88,6 @@ class RemoteStation(Station):
         What to open.
     clock : Clock
         The clock of the run.
-    rescue : callable
-        Makes the devices of the rig safe without a guardian; returns by device `safe`, or what went wrong.
 
     Raises
     ------
@@ -96,9 +99,9 @@ class RemoteStation(Station):
         If the guardian does not start.
     """
 
-    def __init__(self, guarded: GuardedRig, clock: Clock, rescue: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
         self.clock = clock
-        self._rescue = rescue
+        self._guarded = guarded
         self._answer_within = _ANSWER + guarded.file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
@@ -119,6 +122,8 @@ class RemoteStation(Station):
                 overrides=dict(guarded.overrides),
                 attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
+                doing=guarded.doing,
+                process=os.getpid(),
             )
         except BaseException:
             self._channel.close()
@@ -264,7 +269,8 @@ class RemoteStation(Station):
         self._process.kill()
         self._process.wait()
         self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
-        return self._rescue()
+        guarded = self._guarded
+        return rescue_by_another_process(guarded.rig, guarded.overrides, guarded.attach, self.description.devices)
 
     def _ask(self, do: str, within: float | None = None, **content: Any) -> Any:  # noqa: ANN401 - what JSON holds
         """Send a request and return what is replied.
