@@ -142,6 +142,10 @@ class Locks:
             for name in sorted(wanted.keys() - self._taken):
                 file = _take_file(_path(name))
                 if file is None:
+                    # One that has just come has to write its name, and one that is about to go is not in the way.
+                    WallClock().sleep(_WRITING)
+                    file = _take_file(_path(name))
+                if file is None:
                     raise ConfigurationError(
                         f"rig {self._holder.rig} is in use: {wanted[name]} is held by {_holder(name)}; wait for it, "
                         "or end it"
@@ -300,7 +304,6 @@ def _write(file: int, holder: Holder) -> None:
 
 def _holder(name: str) -> str:
     """Return who holds a lock, as it says itself."""
-    WallClock().sleep(_WRITING)
     try:
         return str(Holder(**json.loads(_path(name).read_text(encoding="utf-8"))))
     except (OSError, ValueError, TypeError):

@@ -188,7 +188,9 @@ class TestOneBench:
             # Only one line is the same, by another name.
             changed = json.loads(json.dumps(content))
             other = {"tec": "psd", "psd": "tec"}[name]
-            changed["instruments"][other]["port"] = "tcp://192.0.2.1:502" if other == "psd" else "/dev/null"
+            number = original["instruments"]["psd"]["port"].rpartition(":")[2]
+            elsewhere = f"tcp://192.0.2.1:{number}" if other == "psd" else str(tmp_path / "no-port")
+            changed["instruments"][other]["port"] = elsewhere
             file.write_text(json.dumps(changed))
             with client(rig):
                 code, _, err = bench("doctor", "vo2", "--attach", file)
