@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from bench.attachment import attach
-from bench.clock import WallClock
+from bench.clock import Stopwatch, WallClock
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.process import Guardian
 from bench.guardian.start import inherited
 from bench.rig import Rig
 from bench.rig_file import load_rig
+from bench.safety import make_safe
 
 _PATIENCE = 60.0
 """Time for the first message, s."""
@@ -48,10 +49,16 @@ def _describe(rig: Rig) -> dict[str, Any]:
 def main() -> int:
     """Hold the rig that the bench names until its run has ended and every device is safe."""
     channel = Channel(inherited(sys.argv[1:]))
+    waited = Stopwatch()
     try:
-        if not channel.wait(_PATIENCE):
-            return 1
-        (hello,) = channel.receive()
+        received: list[Message] = []
+        # It may come in pieces.
+        while not received:
+            if waited.seconds() > _PATIENCE:
+                return 1
+            if channel.wait(_PATIENCE):
+                received = channel.receive()
+        hello = received[0]
         try:
             rig = _open(hello)
         except Exception as error:
@@ -60,9 +67,13 @@ def main() -> int:
     except ChannelError:
         return 1
     try:
-        guardian = Guardian(channel, rig)
-        guardian.begin(hello["n"], _describe(rig))
+        guardian = Guardian(channel, rig, hello["process"])
+        guardian.begin(hello, _describe(rig))
         guardian.serve()
+    except BaseException:
+        # A defect; its lines may not be closed before the devices are safe.
+        make_safe(rig.devices.values())
+        raise
     finally:
         rig.close()
     return 0
