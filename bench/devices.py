@@ -34,7 +34,7 @@ from typing import Any, ClassVar, TypedDict
 from pydantic import BaseModel, ConfigDict
 
 from bench.clock import Clock
-from bench.errors import DeviceError, LimitError
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
 
 
 @dataclass(frozen=True)
@@ -201,11 +201,26 @@ class Status:
 
     def update(self) -> bool:
         """Ask the device once; return `done`."""
+        try:
+            return self.ask()
+        except DeviceConnectionError as error:
+            with self._lock:
+                if not self._done:
+                    self._finish(error)
+            return True
+
+    def ask(self) -> bool:
+        """Ask the device once; return `done`.
+
+        Raises DeviceConnectionError if it cannot be reached; it may be asked again once its line is back.
+        """
         with self._lock:
             if self._done:
                 return True
             try:
                 arrived = self._arrived()
+            except DeviceConnectionError:
+                raise
             # Every waiting thread must receive the exception.
             except Exception as error:
                 self._finish(error)

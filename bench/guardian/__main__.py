@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from bench.attachment import attach
-from bench.clock import WallClock
+from bench.clock import Stopwatch, WallClock
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.process import Guardian
 from bench.guardian.start import inherited
 from bench.locks import Holder, Locks, port_of
 from bench.rig import Rig
 from bench.rig_file import load_rig
+from bench.safety import make_safe
 
 _PATIENCE = 60.0
 """Time for the first message, s."""
@@ -63,9 +64,9 @@ def main() -> int:
     channel = Channel(inherited(sys.argv[1:]))
     with ExitStack() as stack:
         try:
-            if not channel.wait(_PATIENCE):
+            hello = _first_message(channel)
+            if hello is None:
                 return 1
-            (hello,) = channel.receive()
             try:
                 rig = _open(hello, stack)
             except Exception as error:
@@ -73,10 +74,24 @@ def main() -> int:
                 return 1
         except ChannelError:
             return 1
-        guardian = Guardian(channel, rig)
-        guardian.begin(hello["n"], _describe(rig))
-        guardian.serve()
+        try:
+            guardian = Guardian(channel, rig, hello["process"])
+            guardian.begin(hello, _describe(rig))
+            guardian.serve()
+        except BaseException:
+            # A defect; its lines may not be closed before the devices are safe.
+            make_safe(rig.devices.values())
+            raise
     return 0
+
+
+def _first_message(channel: Channel) -> Message | None:
+    """Return the first message, which may come in pieces; None if it does not come."""
+    waited = Stopwatch()
+    while waited.seconds() < _PATIENCE:
+        if channel.wait(_PATIENCE) and (received := channel.receive()):
+            return received[0]
+    return None
 
 
 if __name__ == "__main__":

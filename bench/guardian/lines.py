@@ -103,4 +103,7 @@ class LineThreads:
             device = self._devices[call.device]
             seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
             self._notify(call.device, seconds, str(lost))
+            # A set-point that waited for its line may not be sent after the end.
+            if self._ending.is_set():
+                raise
             return call.call()

@@ -7,13 +7,14 @@ a device cannot be read.
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import selectors
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -71,11 +72,14 @@ class Guardian:
         To the bench.
     rig : Rig
         Connected devices.
+    bench : int
+        Number of the bench's process.
     """
 
-    def __init__(self, channel: Channel, rig: Rig) -> None:
+    def __init__(self, channel: Channel, rig: Rig, bench: int) -> None:
         self._channel = channel
         self._rig = rig
+        self._bench = bench
         self._wall: Clock = WallClock()
         safety = rig.file.safety
         self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
@@ -98,7 +102,8 @@ class Guardian:
         self._bench_is_there = True
         self._writes_stacks = False
         self._ending: float | None = None
-        self._unsafe: dict[str, str] = {}
+        # Every device counts as unsafe until it has said otherwise, whatever fails here.
+        self._unsafe = dict.fromkeys(rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
         self._safe: dict[str, str] | None = None
         self._next_try = 0.0
         self._stages: list[list[str]] = []
@@ -106,10 +111,10 @@ class Guardian:
         self._reported = False
         self._terminated = False
 
-    def begin(self, number: int, description: dict[str, Any]) -> None:
+    def begin(self, hello: Message, description: dict[str, Any]) -> None:
         """Tell the bench what was connected, as the reply to its first request."""
-        self._request = {"n": number}
-        self._reply(description)
+        self._request = hello
+        self._reply(hello, description)
 
     def serve(self) -> None:
         """Serve until the run has ended and every device is safe, or 10 min were not enough for that."""
@@ -121,10 +126,13 @@ class Guardian:
         with selectors.DefaultSelector() as selector:
             selector.register(self._channel, selectors.EVENT_READ, self._receive)
             selector.register(self._woken, selectors.EVENT_READ, self._wake_up)
-            parent = _parent()
+            parent = self._watch_bench()
             if parent is not None:
                 selector.register(parent, selectors.EVENT_READ, partial(self._lose_bench, "the bench has died"))
             while not self._is_over():
+                if self._bench_is_there:
+                    events = selectors.EVENT_READ | selectors.EVENT_WRITE * self._channel.is_sending
+                    selector.modify(self._channel, events, self._receive)
                 wait = min(_LONGEST_WAIT, max(0.0, self._due() - self._wall.now()))
                 for key, _ in selector.select(wait):
                     # Whatever fails here must not keep the devices from being made safe.
@@ -148,7 +156,7 @@ class Guardian:
     def _due(self) -> float:
         if self._ending is None:
             return self._core.due()
-        return self._next_try
+        return self._next_try if self._unsafe else math.inf
 
     def _turn(self) -> None:
         now = self._wall.now()
@@ -166,11 +174,12 @@ class Guardian:
             self._start(LOOK, self._looked_at, self._seen, self._blind)
 
     def _is_over(self) -> bool:
-        if self._ending is None or self._safe is None or self._pending:
+        if self._ending is None or self._safe is None:
             return False
-        if self._bench_is_there:
-            return not self._unsafe and self._reported
-        return not self._unsafe or self._is_in_vain()
+        if not (self._unsafe or self._pending):
+            return self._reported or not self._bench_is_there
+        # A driver that hangs for good does not keep this process for good.
+        return not self._bench_is_there and self._is_in_vain()
 
     def _is_in_vain(self) -> bool:
         """Return whether it is of no use to try again: after 10 min, or as the emulated laboratory is gone."""
@@ -183,6 +192,7 @@ class Guardian:
 
     def _receive(self) -> None:
         try:
+            self._channel.flush()
             messages = self._channel.receive()
         except ChannelError as error:
             self._lose_bench(str(error))
@@ -209,20 +219,21 @@ class Guardian:
             self._core.request(self._wall.now())
             _REQUESTS[str(do)](self, message)
         except Exception as error:
-            self._refuse(error)
+            self._refuse(message, error)
 
-    def _reply(self, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
-        self._answer(result=result)
+    def _reply(self, request: Message, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
+        self._answer(request, result=result)
 
-    def _refuse(self, error: BaseException) -> None:
+    def _refuse(self, request: Message, error: BaseException) -> None:
         if not isinstance(error, BenchError):
             self._box.note("defect", error=f"{type(error).__name__}: {error}")
-        self._answer(error=to_message(error))
+        self._answer(request, error=to_message(error))
 
-    def _answer(self, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
-        if self._request is None:
+    def _answer(self, request: Message, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+        # What the bench no longer waits for must not be taken for the answer to its `end`.
+        if request is not self._request:
             return
-        request, self._request = self._request, None
+        self._request = None
         self._core.reply(self._wall.now())
         news, self._news = self._news, []
         cause = self._core.cause
@@ -245,23 +256,23 @@ class Guardian:
 
     def _promise(self, message: Message) -> None:
         self._core.promise(float(message["seconds"]), str(message["why"]))
-        self._reply()
+        self._reply(message)
 
     def _keep_record(self, message: Message) -> None:
         self._box.keep_in(Path(message["folder"]))
         self._writes_stacks = bool(message["stacks"])
         self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
-        self._reply()
+        self._reply(message)
 
     def _look(self, message: Message) -> None:
         readers = self._rig.readers(Look(message["look"]), message["wanted"])
 
         def done(readings: dict[str, Any]) -> None:
             values = self._rig.assembled({name: readings[name] for name in readers})
-            self._judge(values)
-            self._reply(values)
+            self._judge(self._rig.clock.now(), values)
+            self._reply(message, values)
 
-        self._start(BENCH, readers, done, self._refuse)
+        self._start(BENCH, readers, done, partial(self._refuse, message))
 
     def _apply(self, message: Message) -> None:
         setpoints = message["setpoints"]
@@ -273,33 +284,35 @@ class Guardian:
 
         def done(statuses: dict[str, Status]) -> None:
             self._statuses = [statuses[name] for name in setpoints]
-            self._reply({name: actuator.setpoint for name, actuator in actuators.items()})
+            self._reply(message, {name: actuator.setpoint for name, actuator in actuators.items()})
 
-        self._start(BENCH, calls, done, self._refuse)
+        self._start(BENCH, calls, done, partial(self._refuse, message))
 
     def _check(self, message: Message) -> None:
         for name, values in message["setpoints"].items():
             for value in values:
                 self._actuator(name).check(value)
-        self._reply()
+        self._reply(message)
 
-    def _arrivals(self, _message: Message) -> None:
+    def _arrivals(self, message: Message) -> None:
         statuses = {status.device: status for status in self._statuses}
 
         def done(arrived: dict[str, bool]) -> None:
             errors = [each for status in self._statuses if (each := status.exception()) is not None]
             self._reply(
+                message,
                 {
                     "waiting": [name for name in statuses if not arrived[name]],
                     "error": to_message(errors[0]) if errors else None,
-                }
+                },
             )
 
-        self._start(BENCH, {name: status.update for name, status in statuses.items()}, done, self._refuse)
+        calls = {name: status.ask for name, status in statuses.items()}
+        self._start(BENCH, calls, done, partial(self._refuse, message))
 
     def _can_play(self, message: Message) -> None:
         player = self._rig.block_player(message["inputs"], message["actuators"], message["period"])
-        self._reply(player is not None)
+        self._reply(message, player is not None)
 
     def _play(self, message: Message) -> None:
         name = message["actuators"][0]
@@ -308,18 +321,19 @@ class Guardian:
             raise ConfigurationError(f"{name} cannot carry out blocks by itself")
         self._core.arm()
         setpoints = np.array(message["setpoints"], dtype=np.float64)
-        self._start(
-            BENCH,
-            {name: lambda: player(setpoints)},
-            lambda readings: self._reply(readings[name].tolist()),
-            self._refuse,
-        )
+
+        def done(readings: dict[str, Any]) -> None:
+            rows: list[list[float]] = readings[name].tolist()
+            self._judge_block(message["inputs"], rows, message["period"])
+            self._reply(message, rows)
+
+        self._start(BENCH, {name: lambda: player(setpoints)}, done, partial(self._refuse, message))
 
     def _operate(self, message: Message) -> None:
         if self._rig.laboratory is None:
             raise ConfigurationError("there is no emulated laboratory that could do it")
         self._rig.laboratory.operate(message["task"], message["value"])
-        self._reply()
+        self._reply(message)
 
     def _actuator(self, name: str) -> Actuator:
         device = self._rig.devices.get(name)
@@ -342,14 +356,22 @@ class Guardian:
         self._looking = False
         values = self._rig.assembled({name: readings[name] for name in self._looked_at})
         self._box.saw(values)
-        self._judge(values)
+        self._judge(self._rig.clock.now(), values)
 
-    def _judge(self, values: dict[str, float]) -> None:
+    def _judge_block(self, names: Sequence[str], rows: Sequence[Sequence[float]], period: float) -> None:
+        """Judge the samples of a block, which no look has seen."""
+        if self._watched.isdisjoint(names):
+            return
+        start = self._rig.clock.now() - period * len(rows)
+        for k, row in enumerate(rows):
+            self._judge(start + k * period, dict(zip(names, row, strict=True)))
+
+    def _judge(self, t: float, values: dict[str, float]) -> None:
         now = self._wall.now()
         if self._watched <= values.keys():
             self._last_seen = now
         setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
-        findings = self._core.judge(self._rig.clock.now(), values, setpoints, now=now, factor=self._factor)
+        findings = self._core.judge(t, values, setpoints, now=now, factor=self._factor)
         self._news += news_of(findings)
 
     def _blind(self, error: BaseException) -> None:
@@ -376,24 +398,22 @@ class Guardian:
     def _keep_safe(self, now: float) -> None:
         """Bring the devices into the safe state, and try again those that are not."""
         if self._ending is None:
+            # What makes safe comes before every record of it.
+            self._lines.end()
+            self._stages = stages(self._rig)
             self._ending = now
             self._next_try = now + _SAFE_WITHIN
-            self._lines.end()
+            self._next_stage()
             cause = self._core.cause
             self._box.note("safe", cause=None if cause is None else str(cause))
             if self._core.late and self._writes_stacks:
-                _show_where_the_bench_stands()
-            order = [name for name in self._rig.file.safety.order if name in self._rig.devices]
-            others = [name for name in self._rig.devices if name not in order]
-            self._stages = [[name] for name in order] + ([others] if others else [])
-            self._unsafe = dict.fromkeys(self._rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
-            self._make_safe(self._stages.pop(0))
+                self._show_where_the_bench_stands()
         if not self._pending and self._stages:
-            self._make_safe(self._stages.pop(0))
+            self._next_stage()
         complete = not self._pending and not self._stages
         if self._safe is None and (complete or now - self._ending >= _SAFE_WITHIN):
             while self._stages:
-                self._make_safe(self._stages.pop(0))
+                self._next_stage()
             self._report_safe()
             self._next_try = now + _TRY_AGAIN
         if self._safe is not None:
@@ -402,10 +422,14 @@ class Guardian:
                 self._make_safe([name for name in self._unsafe if name not in self._pending])
             self._report()
 
+    def _next_stage(self) -> None:
+        self._make_safe(self._stages[0])
+        del self._stages[0]
+
     def _make_safe(self, names: list[str]) -> None:
         for name in names:
-            self._pending.add(name)
             self._submit(SAFE, name, self._rig.devices[name].safe, self._is_safe)
+            self._pending.add(name)
 
     def _is_safe(self, result: Result) -> None:
         self._pending.discard(result.device)
@@ -425,10 +449,10 @@ class Guardian:
             return
         assert self._safe is not None
         if self._request.get("do") == "end":
-            self._answer(result=self._safe)
+            self._reply(self._request, self._safe)
             self._reported = True
         else:
-            self._refuse(self._core.cause or GuardianError("the run has ended already"))
+            self._refuse(self._request, self._core.cause or GuardianError("the run has ended already"))
 
     # Devices
 
@@ -460,7 +484,11 @@ class Guardian:
             self._woken.recv(4096)
         while not self._results.empty():
             take, result = self._results.get()
-            take(result)
+            # One that cannot be used must not keep back those after it.
+            try:
+                take(result)
+            except Exception as error:
+                self._core.trip(_as_bench_error(error))
 
     def _take_part(self, job: _Job, result: Result) -> None:
         job.waiting.discard(result.device)
@@ -476,6 +504,28 @@ class Guardian:
         # A derived signal, say, that cannot be computed.
         except Exception as error:
             job.failed(error)
+
+    def _watch_bench(self) -> int | None:
+        """Return a descriptor that becomes readable when the bench dies, where the system has one.
+
+        The channel alone does not do: a forked child of the bench keeps its end open.
+        """
+        if not hasattr(os, "pidfd_open"):
+            return None
+        with suppress(OSError):
+            descriptor = os.pidfd_open(self._bench)
+            # The parent of an orphan is another process.
+            if os.getppid() == self._bench:
+                return descriptor
+        if os.getppid() != self._bench:
+            self._lose_bench("the bench has died")
+        return None
+
+    def _show_where_the_bench_stands(self) -> None:
+        """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
+        if hasattr(signal, "SIGUSR1") and sys.platform != "win32" and os.getppid() == self._bench:
+            with suppress(OSError):
+                os.kill(self._bench, signal.SIGUSR1)
 
     def _terminate(self, _number: int, _frame: object) -> None:
         self._terminated = True
@@ -499,25 +549,14 @@ def lines_of(rig: Rig) -> dict[str, str]:
     return {entry.name: str(getattr(entry.settings, "port", entry.name)) for entry in rig.file.devices}
 
 
+def stages(rig: Rig) -> list[list[str]]:
+    """Return which devices are made safe at the same time: the ordered ones one after another, all others at once."""
+    order = rig.file.safety.order
+    others = [name for name in rig.devices if name not in order]
+    return [[*order[:1], *others], *([name] for name in order[1:])]
+
+
 def _as_bench_error(error: BaseException) -> BenchError:
     if isinstance(error, BenchError):
         return error
     return GuardianError(f"the guardian failed: {type(error).__name__}: {error}")
-
-
-def _parent() -> int | None:
-    """Return a descriptor that becomes readable when the bench dies, where the system has one.
-
-    The channel alone does not do: a forked child of the bench keeps its end open.
-    """
-    if hasattr(os, "pidfd_open"):
-        with suppress(OSError):
-            return os.pidfd_open(os.getppid())
-    return None
-
-
-def _show_where_the_bench_stands() -> None:
-    """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
-    if hasattr(signal, "SIGUSR1") and sys.platform != "win32":
-        with suppress(OSError):
-            os.kill(os.getppid(), signal.SIGUSR1)

@@ -14,7 +14,7 @@ from bench.rig import Look, Rig
 from bench.roles import Floats
 from bench.safety import make_safe
 from bench.station.core import StationCore
-from bench.station.interface import Arrivals, News, Station, arrivals_of, masked, news_of
+from bench.station.interface import Arrivals, News, Station, masked, news_of
 from bench.station.reconnection import reconnect
 
 _T = TypeVar("_T")
@@ -76,9 +76,12 @@ class LocalStation(Station):
     def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
         """Return a function that sends those of some set-points that have changed."""
         devices = [self._actuator(name) for name in actuators]
-        self._core.arm()
+        core = self._core
+        core.arm()
 
         def move(setpoints: Sequence[float]) -> None:
+            if core.over:
+                core.raise_if_over()
             changed = [
                 (actuator, value)
                 for actuator, value in zip(devices, setpoints, strict=True)
@@ -109,6 +112,7 @@ class LocalStation(Station):
 
     def apply(self, setpoints: Mapping[str, float]) -> None:
         """Send set-points; all are checked before any is sent."""
+        self._core.raise_if_over()
         self.check({name: (value,) for name, value in setpoints.items()})
         self._core.arm()
         self._statuses = []
@@ -121,7 +125,9 @@ class LocalStation(Station):
 
     def arrivals(self) -> Arrivals:
         """Ask the devices that were sent set-points last how far they have come."""
-        return arrivals_of(self._statuses)
+        waiting = [status.device for status in self._statuses if not self._ask(status.device, status.ask)]
+        errors = (status.exception() for status in self._statuses)
+        return Arrivals(tuple(waiting), next((each for each in errors if isinstance(each, Exception)), None))
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
         """Judge readings that were recorded by the interlocks."""
@@ -157,7 +163,10 @@ class LocalStation(Station):
         """Bring every device into its safe state; return by device `safe`, or what went wrong."""
         self._core.end()
         if self._safe is None:
-            self._safe = make_safe(self._rig.devices.values())
+            order = self._rig.file.safety.order
+            # A stable sort: those that have no order come after the others, as they stand.
+            ranked = sorted(self._rig.devices, key=lambda name: order.index(name) if name in order else len(order))
+            self._safe = make_safe(self._rig.devices[name] for name in ranked)
             self._news += masked(self._rig.devices.values())
         return self._safe
 
