@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import main
-from bench.compilation_display import MESSAGE
+# Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
+# wait for one another, and a product of small matrices takes ten times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.hookimpl(trylast=True)
@@ -83,6 +85,8 @@ def bench(capsys):
 
     Without the line of a first use, which depends on what ran before on this machine.
     """
+    from bench.cli import main
+    from bench.compilation_display import MESSAGE
 
     def run(*arguments):
         with pytest.raises(SystemExit) as stopped:

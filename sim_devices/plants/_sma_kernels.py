@@ -220,7 +220,8 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
     c, scratch = parts.c, parts.scratch
     count = parts.martensite.size
     limit = float(c[0].stress_limit)
-    below = np.zeros(2, dtype=np.int64)
+    # As floats: the counts of the state are, and the lengths are compiled once.
+    below = np.zeros(2)
     inside = np.zeros(2, dtype=np.int64)
     low = 0.0
     high = limit
