@@ -10,8 +10,8 @@ MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types kernels tests all-tests \
-	benchmark busy clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
+.PHONY: kernels tests all-tests benchmark busy clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
