@@ -173,6 +173,8 @@ class Journal:
             )
             for key, value in {"schema": SCHEMA, **meta}.items():
                 self._put_meta(key, value)
+        made = path.stat()
+        self._file = made.st_dev, made.st_ino
         marks = ", ?" * len(self.signals)
         self._waiting: list[tuple[float, ...]] = []
         self._since_write = Stopwatch()
@@ -238,6 +240,19 @@ class Journal:
                 self._db.execute(statement, values)
             self._waiting.clear()
         self._since_write = Stopwatch()
+        self._check_file()
+
+    def _check_file(self) -> None:
+        """Raise `DataError` if the file is no longer where it was made: SQLite goes on with one that is removed."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            found = None
+        if found is None or (found.st_dev, found.st_ino) != self._file:
+            raise DataError(
+                f"{self.path} was {'removed' if found is None else 'replaced'} while the run went on; what is "
+                "recorded would be lost, so the run ends here"
+            )
 
     def _write_waiting(self) -> None:
         if self._waiting:
