@@ -10,7 +10,9 @@ from bench.protocol.vocabulary import Message, Reading
 
 class Parameters(ProtocolParameters):
     setpoints: str = parameter("{}", unit="", help="set-points by device, JSON")
+    then: str = parameter("{}", unit="", help="set-points by device, JSON, sent once everything is on")
     seconds: float = parameter(600.0, unit="s", low=0, high=86400, help="how long it holds")
+    before: float = parameter(1.0, unit="s", low=0, high=86400, help="how long it holds before it computes")
 
 
 def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading, Reading]:
@@ -18,7 +20,7 @@ def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading,
     for device, value in json.loads(parameters.setpoints).items():
         yield Step({device: value}, Dwell(0.2))
     yield Note("everything is on")
-    return (yield Step({}, Dwell(seconds)))
+    return (yield Step(json.loads(parameters.then), Dwell(seconds)))
 
 
 @protocol(needs=())
@@ -30,7 +32,7 @@ def hold(parameters: Parameters) -> Messages:
 @protocol(needs=())
 def spin(parameters: Parameters) -> Messages:
     """Compute for ever."""
-    reading = yield from _hold(parameters, 1.0)
+    reading = yield from _hold(parameters, parameters.before)
     yield Note("computing")
     # Not in the dry run, whose readings are empty.
     while reading.values:
