@@ -1,8 +1,9 @@
-"""Protocols that switch every output of a rig on, and then go wrong."""
+"""Protocols that switch outputs of a rig on, and then go wrong or are to be disturbed."""
 
 import ctypes
 import json
 from collections.abc import Generator
+from pathlib import Path
 
 from bench.protocol import Dwell, Messages, Note, ProtocolParameters, Step, parameter, protocol
 from bench.protocol.vocabulary import Message, Reading
@@ -58,3 +59,20 @@ def talk(parameters: Parameters) -> Messages:
         yield Note("x" * 1000)
         yield Note("x" * 1000)
         yield Step({}, Dwell(0.2))
+
+
+class CycleParameters(ProtocolParameters):
+    until: str = parameter("", unit="", help="file at which it ends, once it has cycled twice")
+
+
+@protocol(needs=())
+def cycle(parameters: CycleParameters) -> Messages:
+    """Heat and cool the plate of the VO2 rig, and read it at rest."""
+    cycles = 0
+    while cycles < 2 or not Path(parameters.until).exists():
+        yield Step({"tec": 30.0}, Dwell(4.0))
+        reading = yield Step({"tec": 34.0}, Dwell(4.0))
+        cycles += 1
+        # The dry run waits for no file.
+        if not reading.values:
+            return

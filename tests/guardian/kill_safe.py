@@ -83,7 +83,7 @@ TRIALS = {
     "SIGSTOP": Trial("hold", signal.SIGSTOP, PROMISE),
     "endless loop": Trial("spin", None, PATIENCE),
     "endless loop, SIGTERM": Trial("spin", signal.SIGTERM, 3.0),
-    "interpreter kept": Trial("keep_interpreter", None, PATIENCE),
+    "interpreter kept": Trial("keep-interpreter", None, PATIENCE),
     "stalled reader": Trial("talk", signal.SIGTERM, 3.0, stalled=True),
 }
 
@@ -165,7 +165,9 @@ def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[s
             problem = problem or f"exit code {run.process.returncode}: {run.said[-300:]}"
         if not run.has_freed_lines():
             problem = problem or "the guardian is still there"
-        return {"": Found(found.seconds, within, problem)}
+        found = Found(found.seconds, within, problem)
+    restart(rig)
+    return {"": found}
 
 
 def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wait: float) -> dict[str, Found]:
@@ -206,7 +208,15 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
         if not run.has_freed_lines():
             problem = problem or "the guardian is still there"
         found["mended"] = Found(mended.seconds, mended.within, mended.problem or problem)
+    restart(rig)
     return found
+
+
+def restart(rig: EmulatedRig) -> None:
+    """Switch every instrument off and on: a watchdog that has expired keeps its output off until then."""
+    for name, instrument in rig.instruments.items():
+        if instrument.devices:
+            rig.control.power_cycle(name)
 
 
 def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[str, Found]]]]:
