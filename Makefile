@@ -11,7 +11,7 @@ MAKEFLAGS += --jobs=2
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy clean
+.PHONY: kernels tests all-tests benchmark busy fault-matrix clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -59,6 +59,10 @@ benchmark: $(SETUP)
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)
 	$(BIN)/python tests/bench/test_busy_machine.py --runs 50 --busy 16
+
+# Each fault of each rig with five seeds, and a table of what passed.
+fault-matrix: $(SETUP)
+	$(BIN)/python tests/faults/matrix.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -151,7 +151,10 @@ class Template:
         if found is None:
             return None
         numbers = {name: float(text) for name, text in found.groupdict().items()}
-        return numbers if all(abs(number) < _NOT_A_NUMBER for number in numbers.values()) else None
+        for number in numbers.values():
+            if abs(number) >= _NOT_A_NUMBER:
+                return None
+        return numbers
 
 
 @cache

@@ -34,7 +34,7 @@ from typing import Any, ClassVar, TypedDict
 from pydantic import BaseModel, ConfigDict
 
 from bench.clock import Clock
-from bench.errors import DeviceError, LimitError
+from bench.errors import DeviceConnectionError, DeviceError, LimitError
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,25 @@ class Limits:
     def __str__(self) -> str:
         """Return the range with its unit."""
         return f"{self.low:g} to {self.high:g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check of an instrument found.
+
+    Attributes
+    ----------
+    subject : str
+        What was looked at, in a word or two, such as `watchdog`.
+    text : str
+        What was found, with numbers and units.
+    advice : str
+        What to do; empty if all is well.
+    """
+
+    subject: str
+    text: str
+    advice: str = ""
 
 
 class BlueskyReading(TypedDict):
@@ -182,11 +201,26 @@ class Status:
 
     def update(self) -> bool:
         """Ask the device once; return `done`."""
+        try:
+            return self.ask()
+        except DeviceConnectionError as error:
+            with self._lock:
+                if not self._done:
+                    self._finish(error)
+            return True
+
+    def ask(self) -> bool:
+        """Ask the device once; return `done`.
+
+        Raises DeviceConnectionError if it cannot be reached; it may be asked again once its line is back.
+        """
         with self._lock:
             if self._done:
                 return True
             try:
                 arrived = self._arrived()
+            except DeviceConnectionError:
+                raise
             # Every waiting thread must receive the exception.
             except Exception as error:
                 self._finish(error)
@@ -332,6 +366,13 @@ class Device(ABC):
     def repeats(self) -> int:
         """Number of requests that were repeated since the device was connected, as their answers were lost."""
         return 0
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare what the instrument itself says with the settings; nothing moves, and nothing is changed.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        return ()
 
     def reconnect(self) -> None:
         """Open the line again after it was lost, and check that the instrument is as it was left.

@@ -73,9 +73,7 @@ class Rig:
                 self.devices[entry.name] = device
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
-            self.description = RigDescription(
-                file, {name: DeviceDescription.of(device) for name, device in self.devices.items()}, self.signals
-            )
+            self.description = RigDescription(file, self._describe_devices(), self.signals)
             self._check_references()
             self._stack = stack.pop_all()
 
@@ -122,7 +120,7 @@ class Rig:
 
         Devices on different lines may be asked at the same time.
         """
-        sources = self._sources(wanted)
+        sources = self.sources(wanted)
         readers = {}
         for name, device in self.devices.items():
             is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
@@ -137,7 +135,7 @@ class Rig:
 
         It returns what these devices deliver and the derived ones of the signals; set-points are not among them.
         """
-        sources = self._sources(wanted)
+        sources = self.sources(wanted)
         names = self.readers(Look.PART, wanted)
         readers = _quick_readers([self.devices[name] for name in names])
         derived = [(name, each.compute) for name, each in self.derived.items() if name in sources]
@@ -169,7 +167,7 @@ class Rig:
                 return partial(_play, player, sensor, period)
         return None
 
-    def _sources(self, wanted: Collection[str]) -> set[str]:
+    def sources(self, wanted: Collection[str]) -> set[str]:
         """Return signals, and those that the derived ones among them come from."""
         sources = {*wanted}
         # Each derived signal comes from what stands before it.
@@ -196,6 +194,16 @@ class Rig:
             if len(readings) == len(self.devices) or all(source in values for source in derived.sources):
                 values[name] = derived.compute(values)
         return values
+
+    def _describe_devices(self) -> dict[str, DeviceDescription]:
+        described = {}
+        for name, device in self.devices.items():
+            try:
+                described[name] = DeviceDescription.of(device)
+            # Limits in the wrong order, say, which its settings did not check.
+            except ValueError as error:
+                raise ConfigurationError(f"{self.file.path}: devices.{name}: {error}") from None
+        return described
 
     def _bind_signals(self) -> tuple[Signal, ...]:
         """Return the signals of devices and derived ones; each derived one may use those above it in the file."""

@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ class TECAmplifier(Actuator):
 
     Signals: `NAME_temperature` °C (object), `NAME_sink_temperature` °C, `NAME_current` A, `NAME_voltage` V.
     """
+
+    heats: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -81,6 +83,8 @@ class VoltageSupply(Actuator):
 
     Signals: `NAME_voltage` V, `NAME_current` A.
     """
+
+    heats: ClassVar[bool] = True
 
     @property
     @abstractmethod

@@ -9,10 +9,21 @@ newtons. Nothing is saved in its EEPROM: a power cycle restores the filter that 
 tracking takes loads that change slowly for a drift of the zero, so it has to be off (ZT = 0). It belongs to the
 calibration, which is sealed by a counter (TAC); so the driver refuses an instrument that tracks, and changes nothing.
 
-Assumptions: register 0x202C holds the 1410 that the command ID returns, as a number or digit by digit; the first
-byte of the firmware register is the higher one, and holds the minor version; an integer weight has the digits of
-the floating-point one without the decimal point; a tare that the instrument refuses leaves the tare bit as it
-was; characters have 8 bits and one stop bit.
+Modbus RTU does not say which request a reply belongs to, and this instrument reads its registers by functions 3 and 4
+alike. So the driver takes them in turn: a doubled or late reply to the request before shows by its function. After a
+reply that is missing or damaged it asks for as many registers as for no other request, until a reply of that length
+comes: what the instrument sent before has passed then.
+
+An instrument that is switched on is silent for longer than 0.3 s (0.4 s after the command SR, says the manual). So
+after a longer silence, and after a lost reply, the filter is read again: if it has fallen back to the saved one, the
+instrument has restarted. Where the saved filter is the same and there is no tare, a restart changes nothing, and is
+not noticed.
+
+Assumptions: functions 3 and 4 read the same, and registers 0x202A to 0x2031 may be read at once; register 0x202C
+holds the 1410 that the command ID returns, as a number or digit by digit; the first byte of the firmware register is
+the higher one, and holds the minor version; an integer weight has the digits of the floating-point one without the
+decimal point; a tare that the instrument refuses leaves the tare bit as it was; characters have 8 bits and one stop
+bit.
 """
 
 from __future__ import annotations
@@ -20,17 +31,20 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
+from contextlib import suppress
+from typing import ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
-from bench.devices import Identity
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.devices import Finding, Identity
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import LoadCell
 from drivers.device import LineDevice, Slope
 from drivers.modbus import (
     EMULATED,
+    READ,
+    READ_INPUT,
     NoReplyError,
     RefusedError,
     RtuClient,
@@ -40,15 +54,14 @@ from drivers.modbus import (
     unpack,
 )
 from drivers.pymodbus_client import SerialClient
-from drivers.serial_line import SerialSettings, lost_line, open_port
+from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
 """3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
 
-_ADC_SAMPLE = 0x202A
+_FIRST_OF_ECHO = _ADC_SAMPLE = 0x202A
 _DEVICE_ID = 0x202C
 _FIRMWARE = 0x202E
 _SERIAL_NUMBER = 0x2034
@@ -69,12 +82,18 @@ _TARE_SET = 0x0020
 
 _IIR = 0
 _MOST_DECIMALS = 5
+_ORDER_LOOKS = 3
 _TARE_TIMEOUT = 1.0  # s that the instrument is given to show a change of tare
 _POLL = 0.05
+_CONVERSIONS = 5  # looked at by the check of the instrument itself
 
-_RESENDS = 1
 _BLOCK = struct.Struct(">ffH")
 _READING_BLOCK = f"reading register 0x{_COMBINED:04X}"
+_ECHO_REGISTERS = (6, 8)  # numbers that no other request reads
+_LATEST = 3.0  # time-outs after a request by which even a reply that others overtook has come
+_QUIET = 0.25  # time-outs of silence after which a damaged reply is over
+_SHORTEST_RESTART = 0.3  # s of silence that no restart of the instrument goes below
+_SAME_TARE = 1e-6  # of the weights, by which a tare of single precision may differ from itself
 _STALE_LOOKS = 10
 _FAST_LINE = 19200  # Bd above which the pause between frames does not get shorter
 _FAST_PAUSE = 1.75e-3  # s
@@ -91,7 +110,10 @@ class DAD141Settings(SerialSettings):
         default="N", description="parity (menu 8.7): N for none, E for even, O for odd"
     )
     timeout: float = Field(
-        default=0.2, ge=0.02, le=10.0, description="wait for a reply, s: 0.02 to 10; a request is sent twice at most"
+        default=0.2,
+        ge=0.02,
+        le=10.0,
+        description="wait for a reply, s: 0.02 to 10; a request is sent three times at most",
     )
     pause: float | None = Field(
         default=None,
@@ -152,12 +174,23 @@ class _Block(NamedTuple):
     net: float
     qualifier: int
 
+    @property
+    def tare(self) -> float:
+        """The tare, in the unit of weight."""
+        return self.gross - self.net
+
 
 class _Line:
     """The serial line to one instrument: its registers, and sending again.
 
-    Modbus RTU does not say which request a reply belongs to. So after a request without a good reply the line
-    is given time for a late one to pass before anything else is sent.
+    Attributes
+    ----------
+    lost : bool
+        Whether the line itself failed, so that it has to be opened again.
+    longest_silence : float
+        Longest time between two replies since the attribute was last set to zero, s.
+    repeats : int
+        Number of requests that were repeated.
     """
 
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock) -> None:
@@ -165,13 +198,19 @@ class _Line:
         self._settings = settings
         self._clock = clock
         self._pause = _frame_pause(settings)
-        self._silent_since = clock.now()
+        self._silent_since = self._answered_at = self._late_until = clock.now()
+        self._function = READ
+        self._in_step = True
+        self._echoes = 0
+        self._is_open = True
+        self.lost = False
+        self.longest_silence = 0.0
+        self.repeats = 0
         self._client: RtuClient | SerialClient
         if settings.port.startswith(EMULATED):
             self._client = RtuClient(open_port(name, settings), settings.address)
         else:
             self._client = SerialClient(name, settings, settings.address, settings.parity)
-        self._is_open = True
 
     def close(self) -> None:
         """Release the line."""
@@ -180,7 +219,7 @@ class _Line:
 
     def read(self, address: int, count: int) -> list[int]:
         """Get `count` registers from `address` on, each 0 to 65535."""
-        data = self._exchange(f"reading register 0x{address:04X}", self._client.read, address, count)
+        data = self._read(f"reading register 0x{address:04X}", address, count)
         return list(struct.unpack(f">{count}H", data))
 
     def read_integer(self, address: int) -> int:
@@ -189,12 +228,12 @@ class _Line:
 
     def read_block(self) -> _Block:
         """Get the combined registers."""
-        return _Block(*_BLOCK.unpack(self._exchange(_READING_BLOCK, self._client.read, _COMBINED, 5)))
+        return _Block(*_BLOCK.unpack(self._read(_READING_BLOCK, _COMBINED, 5)))
 
     def set_integer(self, title: str, address: int, value: int) -> None:
         """Set a 32-bit integer and read it back; `title` is its name for messages."""
         data = struct.pack(">i", value)
-        self._exchange(f"writing register 0x{address:04X}", self._client.write, address, data)
+        self._exchange(f"writing register 0x{address:04X}", lambda: self._client.write(address, data))
         actual = self.read_integer(address)
         if actual != value:
             raise DeviceError(
@@ -204,46 +243,87 @@ class _Line:
 
     def command(self, value: int) -> None:
         """Give a command of register 0x2061."""
-        self._exchange(f"command 0x{value:02X}", self._client.write_one, _COMMAND, value)
+        self._exchange(f"command 0x{value:02X}", lambda: self._client.write_one(_COMMAND, value))
 
-    def _exchange(self, doing: str, request: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+    def _read(self, doing: str, address: int, count: int) -> bytes:
+        self._function = READ_INPUT if self._function == READ else READ
+        return self._exchange(doing, lambda: self._client.read(address, count, self._function))
+
+    def _exchange(self, doing: str, request: Callable[[], T]) -> T:
         if not self._is_open:
             raise DeviceConnectionError(
                 self._name, f"the line {self._settings.port} is closed; connect again, so that the set-up is checked"
             )
+        if self.lost:
+            raise DeviceConnectionError(self._name, f"the line {self._settings.port} was lost; open it again")
+        problem: NoReplyError | None = None
         try:
-            for _ in range(_RESENDS):
+            for attempt in range(1 + RESENDS):
+                self.repeats += attempt > 0
                 try:
-                    return self._once(request, *arguments, **options)
-                except NoReplyError:
-                    self._client.drain()
-            return self._once(request, *arguments, **options)
+                    if not self._in_step:
+                        self._catch_up()
+                    return self._once(request)
+                except NoReplyError as error:
+                    problem = problem or error
+                    self._in_step = False
         except RefusedError as error:
             raise _RefusalError(self._name, error.code, doing) from error
-        except UnexpectedReplyError as error:
-            raise DeviceError(self._name, f"{error}; check that no other master is on the line") from error
         except OSError as error:
-            raise self._lost(error) from error
-
-    def _once(self, request: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
-        self._clock.sleep_until(self._silent_since + self._pause)
-        try:
-            return request(*arguments, **options)
-        finally:
-            self._silent_since = self._clock.now()
-
-    def _lost(self, error: OSError) -> DeviceConnectionError:
-        # An instrument that was off has lost its set-up, so the line ends here.
+            self.lost = True
+            raise lost_line(self._name, self._settings, error, ", then connect again") from error
+        if isinstance(problem, UnexpectedReplyError):
+            raise DeviceConnectionError(
+                self._name, f"{problem}; check that no other master is on the line"
+            ) from problem
         settings = self._settings
-        self.close()
-        if not isinstance(error, NoReplyError):
-            return lost_line(self._name, settings, error, ", then connect again")
-        return DeviceConnectionError(
+        raise no_answer(
             self._name,
-            f"no good reply within {settings.timeout:g} s at {settings.port}, address {settings.address}, after "
-            f"{1 + _RESENDS} requests; check power, cable, address (menu 8.3), speed ({settings.baudrate} Bd, menu "
-            f"8.1), parity ({settings.parity}, menu 8.7) and that the mode is RTU (menu 8.8), then connect again",
-        )
+            settings,
+            f"no good reply within {settings.timeout:g} s",
+            "address",
+            settings.address,
+            speed=f"{settings.baudrate} Bd, menu 8.1; parity {settings.parity}, menu 8.7; mode RTU, menu 8.8",
+        ) from problem
+
+    def _once(self, request: Callable[[], T]) -> T:
+        self._clock.sleep_until(self._silent_since + self._pause)
+        sent_at = self._clock.now()
+        try:
+            reply = request()
+        except RefusedError:
+            self._note_answer()
+            raise
+        except NoReplyError:
+            self._silent_since = self._clock.now()
+            self._late_until = sent_at + _LATEST * self._settings.timeout
+            raise
+        self._note_answer()
+        return reply
+
+    def _note_answer(self) -> None:
+        now = self._clock.now()
+        if now - self._answered_at > self.longest_silence:
+            self.longest_silence = now - self._answered_at
+        self._silent_since = self._answered_at = now
+
+    def _catch_up(self) -> None:
+        """Let late replies pass: what comes before the reply to a request like no other is old.
+
+        Raises `NoReplyError` if that has no reply, and `OSError` if the line is lost or does not fall silent.
+        """
+        settings = self._settings
+        self._client.settle(_QUIET * settings.timeout)
+        late_until = self._late_until
+        self._echoes += 1
+        count = _ECHO_REGISTERS[self._echoes % len(_ECHO_REGISTERS)]
+        function = READ if self._echoes & len(_ECHO_REGISTERS) else READ_INPUT
+        with suppress(RefusedError):
+            self._once(lambda: self._client.read(_FIRST_OF_ECHO, count, function))
+        # No line turns replies round, but what is between two may.
+        if (left := late_until - self._clock.now()) > 0.0:
+            self._client.settle(left)
+        self._in_step = True
 
 
 class _RefusalError(DeviceError):
@@ -258,8 +338,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
     Every reading is one request for gross weight, net weight and qualifier together, so that they belong to one
     conversion. The force is the net one while the instrument has a tare, and the gross one otherwise; a tare
-    that was set or lost without the bench is an error, as the force would jump by it. `measure` averages
-    `samples` readings, `glance` takes one.
+    that was set, changed or lost without the bench is an error, as the force would jump by it. `measure` averages
+    `samples` readings, `glance` takes one. A call after the line was lost opens it again (`reconnect`).
 
     `connect` checks the order of words in the instrument's values and that zero tracking is off, and sets filter and
     tare.
@@ -270,6 +350,9 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
         super().__init__(name, settings, clock, line)
         self._tared = False
+        self._tare = math.nan
+        self._restart = ""
+        self._earlier_repeats = 0
         # Half a period of the filter's cut-off makes the noise of the readings nearly independent.
         self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
         self._gross = math.nan
@@ -292,9 +375,11 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             )
         line.set_integer("filter mode", _FILTER_MODE, _IIR)
         line.set_integer("filter", _FILTER, settings.filter)
-        self._tared = settings.keep_tare and bool(line.read_block().qualifier & _TARE_SET)
-        if not self._tared:
+        if settings.keep_tare and (block := line.read_block()).qualifier & _TARE_SET:
+            self._tared, self._tare = True, block.tare
+        else:
             self.clear_tare()
+        line.longest_silence = 0.0
 
     @property
     def tared(self) -> bool:
@@ -339,18 +424,43 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 )
             self._clock.sleep(_POLL)
         self._line.command(_SET_TARE)
-        self._await_tare(True)
+        self._await_tare(wanted=True)
 
     def clear_tare(self) -> None:
         """Read gross force again.
 
         Raises `DeviceError` if the instrument keeps its tare.
         """
+        self._begin()
         self._line.command(_RESET_TARE)
-        self._await_tare(False)
+        self._await_tare(wanted=False)
 
     def safe(self) -> None:
         """Do nothing: a load cell is safe in any state."""
+
+    @property
+    def safe_within(self) -> float:
+        """Longest time of `safe`, s: none."""
+        return 0.0
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected, as their answers were lost."""
+        return self._earlier_repeats + self._line.repeats
+
+    def close(self) -> None:
+        """Release the line."""
+        super().close()
+        self._line.lost = False
+
+    def _renew_line(self) -> None:
+        repeats = self.repeats
+        super()._renew_line()
+        self._earlier_repeats = repeats
+
+    def _check_unchanged(self) -> None:
+        self._checked_block()
+        self._check_set_up()
 
     def _identify(self) -> Identity:
         """Check that the instrument is the right one and orders words as this driver does."""
@@ -380,30 +490,32 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def _check_order(self) -> None:
         """Raise unless the peak weight as floating-point number and as integer has the same digits.
 
-        Both are read in one request, and the peak stands still between two new ones.
+        Both are read in one request; as the weight may pass its peak in between, several times if they differ.
         """
-        weight, digits = unpack("fi", self._line.read(_PEAK, 4))
-        if not _agree(weight, digits):
-            raise self._wrong(
-                f"gives the same weight as {weight:g} and, as an integer, {digits}; is there a gateway in between "
-                "that changes the order of words or bytes?"
-            )
+        for _ in range(_ORDER_LOOKS):
+            weight, digits = unpack("fi", self._line.read(_PEAK, 4))
+            if _agree(weight, digits):
+                return
+        raise self._wrong(
+            f"gives the same weight as {weight:g} and, as an integer, {digits}; is there a gateway in between that "
+            "changes the order of words or bytes?"
+        )
 
     def _wrong(self, what: str) -> DeviceConnectionError:
         return DeviceConnectionError(
             self.name, f"the device at {self._settings.port}, address {self._settings.address}, {what}"
         )
 
-    def _await_tare(self, wanted: bool) -> None:
+    def _await_tare(self, *, wanted: bool) -> None:
         end = self._clock.now() + _TARE_TIMEOUT
-        while bool(self._line.read_block().qualifier & _TARE_SET) is not wanted:
+        while bool((block := self._line.read_block()).qualifier & _TARE_SET) is not wanted:
             if self._clock.now() >= end:
                 done, advice = (
                     ("took no tare", "is the load at rest?") if wanted else ("keeps its tare", "reset it by its keys")
                 )
                 raise DeviceError(self.name, f"the instrument {done}; {advice}")
             self._clock.sleep(_POLL)
-        self._tared = wanted
+        self._tared, self._tare = wanted, block.tare
 
     def _force(self) -> float:
         """Take one reading, in N."""
@@ -413,9 +525,9 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             what = (
                 "lost its tare; was it switched off?" if self._tared else "was tared by its keys or another program;"
             )
-            raise DeviceError(
-                self.name, f"the instrument {what} Set the tare again, or clear it, so that its force can be trusted"
-            )
+            raise self._untrusted_tare(what)
+        if self._tared and abs(block.tare - self._tare) > _SAME_TARE * (abs(block.gross) + abs(block.net)):
+            raise self._untrusted_tare(f"has another tare than the bench set, {block.tare:.6g} not {self._tare:.6g};")
         gross = settings.newtons_per_unit * block.gross + settings.zero_newtons
         text = f"force {gross:.6g} N is outside of its calibrated range"
         advice = "take load off, or extend the calibration and `force_limits`"
@@ -423,9 +535,35 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         self._check_fresh(block.gross)
         return settings.newtons_per_unit * block.net if self._tared else gross
 
+    def _untrusted_tare(self, what: str) -> DeviceError:
+        return DeviceError(
+            self.name, f"the instrument {what} Set the tare again, or clear it, so that its force can be trusted"
+        )
+
+    def _begin(self) -> None:
+        """Raise if the instrument has restarted; open the line again if it was lost."""
+        if self._restart:
+            raise DeviceRestartedError(self.name, self._restart)
+        if self._line.lost:
+            self.reconnect()
+
+    def _check_set_up(self) -> None:
+        """Raise `DeviceRestartedError` if the instrument has lost its set-up."""
+        found, wanted = self._line.read_integer(_FILTER), self._settings.filter
+        if found != wanted:
+            self._restart = (
+                f"the instrument was switched off, or set up by its keys: its filter (FL) is {found}, not {wanted}; "
+                "connect again, so that filter and tare are set"
+            )
+            raise DeviceRestartedError(self.name, self._restart)
+        self._line.longest_silence = 0.0
+
     def _checked_block(self) -> _Block:
         """Read the combined registers; raise what they say is wrong."""
+        self._begin()
         block = self._line.read_block()
+        if self._line.longest_silence > _SHORTEST_RESTART:
+            self._check_set_up()
         if block.qualifier & (_UNDER_RANGE | _OVER_RANGE):
             side = "over" if block.qualifier & _OVER_RANGE else "under"
             raise DeviceError(
@@ -463,6 +601,27 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 f"readings are stale: the converter has stood at {adc} for {now - self._adc_since:.3g} s; switch the "
                 "instrument off and on, and connect again",
             )
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Read the filter back, and see that the converter works.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        wanted, found = self._settings.filter, self._line.read_integer(_FILTER)
+        advice = "" if found == wanted else f"another program changed it from {wanted}; end that"
+        conversions = set()
+        for _ in range(_CONVERSIONS):
+            conversions.add(self._line.read_integer(_ADC_SAMPLE))
+            self._clock.sleep(_POLL)
+        works = len(conversions) > 1
+        return (
+            Finding("filter", f"{found} in the instrument", advice),
+            Finding(
+                "converter",
+                f"from {min(conversions)} to {max(conversions)} in {_CONVERSIONS} readings",
+                "" if works else "switch the instrument off and on, if its converter stands still for longer",
+            ),
+        )
 
 
 def _agree(weight: float, digits: int) -> bool:

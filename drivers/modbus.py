@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
+from drivers.serial_line import settle_line
+
 # The drivers raise everything that pymodbus logs as an error, with the name of the device.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -36,8 +38,8 @@ _EXCEPTIONS = {
 EMULATED = "emulated://"
 """Scheme of an instrument in this process."""
 
-READ, WRITE_ONE, WRITE, FEEDBACK = 3, 6, 16, 76
-"""Functions: read holding registers, write one, write several, and LabJack's own for both in one packet."""
+READ, READ_INPUT, WRITE_ONE, WRITE, FEEDBACK = 3, 4, 6, 16, 76
+"""Functions: read holding or input registers, write one, write several, and LabJack's own for both in one packet."""
 
 _READ = struct.Struct(">BHH")  # function, address, number of registers
 _WRITE = struct.Struct(">BHHB")  # the same, and number of bytes
@@ -62,9 +64,9 @@ class RefusedError(Exception):
         self.code = code
 
 
-def read_request(address: int, count: int) -> bytes:
+def read_request(address: int, count: int, function: int = READ) -> bytes:
     """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
-    return _READ.pack(READ, address, count)
+    return _READ.pack(function, address, count)
 
 
 def write_request(address: int, data: bytes) -> bytes:
@@ -89,9 +91,9 @@ class ModbusClient(ABC):
     and `OSError` if it does not answer, its answer belongs to no question, or the line is lost.
     """
 
-    def read(self, address: int, count: int) -> bytes:
+    def read(self, address: int, count: int, function: int = READ) -> bytes:
         """Return the values of `count` registers from `address` on, two bytes each."""
-        reply = self.request(read_request(address, count), 2 + 2 * count)
+        reply = self.request(read_request(address, count, function), 2 + 2 * count)
         if reply[1] != 2 * count:
             raise OSError(f"the answer has {reply[1]} bytes of values where {2 * count} were asked for")
         return reply[2:]
@@ -201,7 +203,7 @@ class TcpClient(_PortClient):
             raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
         if length != expected + 1:
             raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
-        return self._receive(reply, size)[_MBAP.size :]
+        return self._receive(reply, size)[_MBAP.size : size]
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -228,8 +230,8 @@ class NoReplyError(OSError):
     """No good reply came; the line itself works."""
 
 
-class UnexpectedReplyError(OSError):
-    """A good reply came, of another form than the request asks for."""
+class UnexpectedReplyError(NoReplyError):
+    """Only good replies of another form than the request asks for came."""
 
     def __init__(self, request: bytes, expected: int, function: int, length: int) -> None:
         super().__init__(
@@ -242,21 +244,25 @@ SHORTEST_REPLY = 5
 """Bytes of the shortest reply on a serial line: address, function, one byte, CRC."""
 LONGEST_REPLY = 256
 """Bytes of the longest reply on a serial line (2.5.1.1)."""
-MOST_STRAY = 4096
-"""Bytes that may come unasked before a serial line counts as unusable."""
 
 _WRITE_REPLY = 8
+_MOST_STRAY_REPLIES = 8
 _KNOWN_FRAMES = 64
 
 
 def reply_length(head: bytes) -> int:
     """Return the bytes of the reply on a serial line whose first 5 are known; 5 if it is none."""
     function = head[1]
-    if function == READ:
+    if function in (READ, READ_INPUT):
         return SHORTEST_REPLY + head[2]
     if function in (WRITE_ONE, WRITE):
         return _WRITE_REPLY
     return SHORTEST_REPLY
+
+
+def is_reply_to(request: bytes, expected: int, frame: bytes) -> bool:
+    """Return whether a good frame has the form of a reply to a request, or of its refusal."""
+    return frame[1] == request[0] | _REFUSED or (frame[1] == request[0] and len(frame) == expected + 3)
 
 
 @lru_cache(_KNOWN_FRAMES)
@@ -269,8 +275,7 @@ def _framed(unit: int, request: bytes) -> bytes:
 class RtuClient(_PortClient):
     """Modbus RTU over a port of pyserial, for `emulated://` addresses.
 
-    A reply does not say which request it belongs to. So after a request without a good reply, `drain` lets a late one
-    pass before anything else is sent.
+    A reply does not say which request it belongs to. One that has the form of another than the request is skipped.
 
     Parameters
     ----------
@@ -294,31 +299,42 @@ class RtuClient(_PortClient):
             port.reset_input_buffer()
         port.write(_framed(self._unit, request))
         reply: bytes = port.read_all()
-        if len(reply) < SHORTEST_REPLY:
-            reply += port.read(SHORTEST_REPLY - len(reply))
-        if len(reply) >= SHORTEST_REPLY:
-            length = reply_length(reply)
-            if len(reply) < length:
-                reply += port.read(length - len(reply))
-            reply = reply[:length]
-        if len(reply) < SHORTEST_REPLY or reply[0] != self._unit or crc16(reply[:-2]) != reply[-2:]:
-            raise NoReplyError(f"{len(reply)} bytes that are no good reply")
+        if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
+            reply = self._reply_among(reply, request, expected)
+        elif crc16(reply[:-2]) != reply[-2:]:
+            raise NoReplyError("damaged reply")
         if reply[1] == request[0] | _REFUSED:
             raise RefusedError(reply[2])
-        content = reply[1:-2]
-        if content[0] != request[0] or len(content) != expected:
-            raise UnexpectedReplyError(request, expected, content[0], len(content))
-        return content
+        return reply[1:-2]
 
-    def drain(self) -> None:
-        """Discard what still arrives, until nothing has come for a timeout.
+    def settle(self, silence: float) -> None:
+        """Discard what comes until nothing has come for `silence` seconds; raises `OSError` if that does not end."""
+        settle_line(self._port, silence)
 
-        Raises `OSError` if the line does not fall silent.
-        """
-        for _ in range(MOST_STRAY // LONGEST_REPLY):
-            if not self._port.read(LONGEST_REPLY):
-                return
-        raise OSError("the line does not fall silent")
+    def _reply_among(self, received: bytes, request: bytes, expected: int) -> bytes:
+        """Return the reply among what has come and comes."""
+        stray = b""
+        for _ in range(_MOST_STRAY_REPLIES):
+            received = self._fill(received, SHORTEST_REPLY)
+            if len(received) < SHORTEST_REPLY:
+                break
+            length = reply_length(received)
+            received = self._fill(received, length)
+            reply, received = received[:length], received[length:]
+            if len(reply) < length or reply[0] != self._unit or crc16(reply[:-2]) != reply[-2:]:
+                raise NoReplyError(f"{len(reply)} bytes that are no good reply")
+            if is_reply_to(request, expected, reply):
+                return reply
+            stray = reply
+        if stray:
+            raise UnexpectedReplyError(request, expected, stray[1], len(stray) - 3)
+        raise NoReplyError(f"{len(received)} bytes that are no good reply")
+
+    def _fill(self, received: bytes, size: int) -> bytes:
+        """Wait until so many bytes are there, for the timeout at most; return what is there."""
+        if len(received) < size:
+            received += self._port.read(size - len(received))
+        return received
 
 
 def exception_text(code: int, doing: str) -> str:

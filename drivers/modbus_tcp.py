@@ -85,7 +85,7 @@ class Connection:
                 self.end()
 
     def end(self) -> None:
-        """Close the connection for all its devices: each has to connect again, so that it is set up again."""
+        """Close the connection for all its devices; each has to share another one."""
         with _registry:
             self.ended = True
             if _connections.get(self._port) is self:
@@ -96,9 +96,13 @@ class Connection:
         """Begin the use by one more device, which waits for a reply so long at most, s."""
         self._users += 1
         if timeout > self.timeout:
-            with self.lock:
-                self.timeout = timeout
-                self.client.wait_for(timeout)
+            self.wait_for_reply(timeout)
+
+    def wait_for_reply(self, timeout: float) -> None:
+        """Wait for a reply so long at most from now on, s."""
+        with self.lock:
+            self.timeout = timeout
+            self.client.wait_for(timeout)
 
 
 _registry = threading.RLock()

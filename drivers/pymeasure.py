@@ -25,6 +25,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import reduce
@@ -32,6 +33,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
+from bench import registry
 from bench.clock import Clock
 from bench.command_table import (
     ANY_TEXT,
@@ -44,10 +46,10 @@ from bench.command_table import (
     template,
 )
 from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import GeneralActuator, GeneralSensor
 from drivers.device import LineDevice, attempt
-from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, signals_of
+from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
 
 _NOT_A_NUMBER = 9.9e37  # SCPI's infinity
 
@@ -106,13 +108,18 @@ def instrument_class(reference: str) -> Any:  # noqa: ANN401 - a class of the li
     Raises
     ------
     ValueError
-        If PyMeasure is not installed, or there is no such class, or it is no instrument.
+        If PyMeasure is not installed, the class may not be imported, there is none, or it is no instrument.
     """
     if importlib.util.find_spec("pymeasure") is None:
         raise ValueError("needs PyMeasure; install it by: pip install 'actuator-bench[pymeasure]'")
     from pymeasure.instruments import Instrument
 
     module, _, name = reference.partition(":")
+    try:
+        if module.partition(".")[0] != "pymeasure":
+            registry.check_import(module)
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from None
     try:
         found = getattr(importlib.import_module(module), name)
     # A module of the user's own may fail in any way.
@@ -206,11 +213,18 @@ def _check_property(info: ValidationInfo, key: str, path: str) -> None:
 
 
 class InstrumentLine:
-    """A connected PyMeasure instrument, whose errors are those of the bench."""
+    """A connected PyMeasure instrument, whose errors are those of the bench.
+
+    Attributes
+    ----------
+    lost : bool
+        Whether a request has failed on the line. As a late answer could be taken for the next, it is opened again.
+    """
 
     def __init__(self, device: str, instrument: Any) -> None:  # noqa: ANN401 - of an optional library
         self._device = device
         self.instrument = instrument
+        self.lost = False
 
     def get(self, path: str) -> Any:  # noqa: ANN401 - of any type
         """Return a property."""
@@ -250,6 +264,7 @@ class InstrumentLine:
         # The library passes on the errors of each of its adapters, and those of its validators.
         except Exception as error:
             kind = DeviceConnectionError if _is_of_the_line(error) else DeviceError
+            self.lost = self.lost or kind is DeviceConnectionError
             raise kind(self._device, f"{doing}: {type(error).__name__}: {error}") from None
 
 
@@ -279,6 +294,14 @@ class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
                 name, f"cannot open {settings.address}: {type(error).__name__}: {error}"
             ) from None
 
+    def _begin(self) -> None:
+        """Open the line again if it was lost."""
+        if self._line.lost:
+            self.reconnect()
+
+    def _check_unchanged(self) -> None:
+        self._read_quantities()
+
     def _identify(self) -> Identity:
         settings = self._settings
         if not hasattr(type(self._line.instrument), "id"):
@@ -296,6 +319,7 @@ class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
 
     def measure_quantities(self) -> dict[str, float]:
         """Measure every quantity."""
+        self._begin()
         values = self._read_quantities()
         self._check_errors("measuring")
         return values
@@ -324,8 +348,11 @@ class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
 class Adapter(SensorAdapter, GeneralActuator):
     """A PyMeasure instrument that takes a set-point, and measures its signals.
 
-    `set` sets the property, reads it back, and carries out `on` if the output is off. `safe` carries out all of the
-    key `safe`; it is confirmed by the property `output` where there is one.
+    `set` checks that the output is as it was left, sets the property and reads it back. It switches an output on that
+    is off by `on`, after `setup` and `before_on` once more. `safe` carries out all of the key `safe`, over a line of
+    its own if the one in use does not answer; it is confirmed by the property `output` where there is one. An output
+    that is off without the bench is found by the next reading: a protection, or a restart if the set-point is lost
+    as well, after which nothing is set.
     """
 
     Settings: ClassVar[type[SensorSettings]] = ActuatorSettings
@@ -346,47 +373,88 @@ class Adapter(SensorAdapter, GeneralActuator):
         self._settings, self._line = settings, line
         self._actuator_settings = settings
         self._on = False
+        self._left = math.nan
+        self._restart: DeviceRestartedError | None = None
 
     def send(self, value: float) -> Status:
         """Send a set-point that is within the limits, and switch the output on if it is off."""
-        settings = self._actuator_settings
+        settings, was_on = self._actuator_settings, self._on
         target = settings.setpoint
-        for action in () if self._on else settings.before_on:
+        self._begin()
+        self._check_output()
+        for action in () if was_on else (*settings.setup, *settings.before_on):
             self._line.act(action)
         self._line.set(target.property, value / target.scale)
         if target.read_back:
-            found = self._line.number(target.property) * target.scale
-            check_read_back(self.name, target, value, found)
-        for action in () if self._on else settings.on:
+            check_read_back(self.name, target, value, self._ask_setpoint())
+        for action in () if was_on else settings.on:
             self._line.act(action)
         self._check_errors(f"set-point {value:g} {target.unit}")
-        self._on = True
-        self._check_output()
+        self._on, self._left = True, value
+        if not was_on:
+            self._check_output()
         return arrival_of(self.name, self._clock, target, value, self._read_quantities)
 
     def switch_off(self) -> None:
-        """Carry out what reaches the safe state."""
-        settings = self._actuator_settings
+        """Carry out what reaches the safe state, over a fresh line if the one in use does not answer."""
         self._on = False
-        failures = attempt(*(lambda action=action: self._line.act(action) for action in settings.safe))
-        if not failures and settings.output is not None and self._line.get(settings.output):
-            failures = [DeviceError(self.name, f"{settings.output} is true")]
+        # A lost line may take its whole time-out for each message.
+        failures = [] if self._line.lost else self._try_off()
+        if self._line.lost:
+            try:
+                self._renew_line()
+            except DeviceError as error:
+                failures = failures or [error]
+            else:
+                failures = self._try_off()
         if failures:
             raise DeviceError(
                 self.name, f"does not confirm that its output is off ({failures[0]}); switch it off by hand"
             )
 
+    def _try_off(self) -> list[DeviceError]:
+        """Try everything that switches off; return what failed."""
+        settings = self._actuator_settings
+        failures = attempt(*(lambda action=action: self._line.act(action) for action in settings.safe))
+        return failures or attempt(self._confirm_off)
+
+    def _confirm_off(self) -> None:
+        output = self._actuator_settings.output
+        if output is not None and self._line.get(output):
+            raise DeviceError(self.name, f"{output} is true")
+
+    def _begin(self) -> None:
+        if self._restart is not None:
+            raise self._restart
+        super()._begin()
+
+    def _check_unchanged(self) -> None:
+        self._check_output()
+        if self._on:
+            target = self._actuator_settings.setpoint
+            if target.read_back:
+                check_read_back(self.name, target, self._left, self._ask_setpoint())
+
+    def _ask_setpoint(self) -> float:
+        target = self._actuator_settings.setpoint
+        return self._line.number(target.property) * target.scale
+
     def measure_quantities(self) -> dict[str, float]:
         """Measure every quantity, and check that the output is still on if it was switched on."""
         values = super().measure_quantities()
-        if self._on:
-            self._check_output()
+        self._check_output()
         return values
 
     def _check_output(self) -> None:
-        output = self._actuator_settings.output
-        if output is not None and not self._line.get(output):
-            raise DeviceError(
-                self.name,
-                "its output is off although it was switched on: a protection, a restart, or another program",
-            )
+        """Raise if an output that was switched on is off, or the instrument has restarted before."""
+        if self._restart is not None:
+            raise self._restart
+        settings = self._actuator_settings
+        target = settings.setpoint
+        if not self._on or settings.output is None or self._line.get(settings.output):
+            return
+        lost = target.read_back and abs(self._ask_setpoint() - self._left) > target.tolerance * (1.0 + 1e-9)
+        problem = output_lost(self.name, setpoint_lost=lost)
+        if isinstance(problem, DeviceRestartedError):
+            self._restart = problem
+        raise problem

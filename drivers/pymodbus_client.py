@@ -12,15 +12,16 @@ from pymodbus.pdu import ModbusPDU
 
 from drivers.modbus import (
     LONGEST_REPLY,
-    MOST_STRAY,
     SHORTEST_REPLY,
     ModbusClient,
     NoReplyError,
     RefusedError,
     UnexpectedReplyError,
+    crc16,
+    is_reply_to,
     reply_length,
 )
-from drivers.serial_line import SerialSettings, open_port
+from drivers.serial_line import MOST_STRAY, SerialSettings, open_port, settle_line
 
 
 class _Request(ModbusPDU):
@@ -107,13 +108,23 @@ class SerialClient(PymodbusClient):
         self._line = _BlockingClient(device, settings, parity)
         super().__init__(self._line, unit)
 
-    def drain(self) -> None:
-        """Discard what still arrives, until nothing has come for a timeout.
+    def request(self, request: bytes, expected: int) -> bytes:
+        """Send a request, from its function on, and return its reply; others are skipped.
 
-        Raises `OSError` if the line is lost or does not fall silent.
+        Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
+        self._line.expect(request, expected)
         try:
-            self._line.drain()
+            return super().request(request, expected)
+        except NoReplyError:
+            if (stray := self._line.stray) is not None:
+                raise UnexpectedReplyError(request, expected, stray[1], len(stray) - 3) from None
+            raise
+
+    def settle(self, silence: float) -> None:
+        """Discard what comes until nothing has come for `silence` seconds; raises `OSError` if that does not end."""
+        try:
+            self._line.settle(silence)
         except ConnectionException as error:
             raise ConnectionError(error.string) from error
 
@@ -131,8 +142,14 @@ class _BlockingClient(ModbusSerialClient):
         super().__init__(
             settings.port, baudrate=settings.baudrate, parity=parity, timeout=settings.timeout, retries=0
         )
-        self.socket: Any = open_port(device, settings, parity=parity, exclusive=True)
+        self.socket: Any = open_port(device, settings, parity=parity)
         self._received = 0
+        self._request, self._expected = b"", 0
+        self.stray: bytes | None = None
+
+    def expect(self, request: bytes, expected: int) -> None:
+        """Say what is asked for next, so that a late reply of another form can be skipped."""
+        self._request, self._expected, self.stray = request, expected, None
 
     def connect(self) -> bool:
         """Return whether the line is open; a line that was lost stays closed."""
@@ -150,6 +167,13 @@ class _BlockingClient(ModbusSerialClient):
         """Wait for a reply, up to the timeout, and return what has come of it."""
         if self._received > LONGEST_REPLY:
             return b""  # it never becomes a reply
+        reply = self._frame()
+        while self._received <= LONGEST_REPLY and self._is_stray(reply):
+            self.stray = reply
+            reply = self._frame()
+        return reply
+
+    def _frame(self) -> bytes:
         with self._line_errors():
             reply: bytes = self.socket.read(SHORTEST_REPLY)
             if len(reply) == SHORTEST_REPLY and (missing := reply_length(reply) - SHORTEST_REPLY) > 0:
@@ -157,13 +181,18 @@ class _BlockingClient(ModbusSerialClient):
         self._received += len(reply)
         return reply
 
-    def drain(self) -> None:
-        """Discard what still arrives, until nothing has come for a timeout."""
+    def _is_stray(self, frame: bytes) -> bool:
+        """Return whether this is a good reply, and none to the present request."""
+        return (
+            len(frame) >= SHORTEST_REPLY
+            and crc16(frame[:-2]) == frame[-2:]
+            and not is_reply_to(self._request, self._expected, frame)
+        )
+
+    def settle(self, silence: float) -> None:
+        """Discard what comes until nothing has come for `silence` seconds."""
         with self._line_errors():
-            for _ in range(MOST_STRAY // LONGEST_REPLY):
-                if not self.socket.read(LONGEST_REPLY):
-                    return
-        raise ConnectionException("the line does not fall silent")
+            settle_line(self.socket, silence)
 
     def _discard(self) -> None:
         # A socket says only that something is waiting, not how much; hence byte by byte at worst.

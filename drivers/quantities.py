@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from bench.clock import Clock
 from bench.command_table import QuantityTable, TargetTable
 from bench.devices import Identity, Signal, Status
-from bench.errors import DeviceError
+from bench.errors import DeviceError, DeviceRestartedError
 
 _ARRIVAL_INTERVAL = 0.1  # s
 
@@ -56,6 +56,22 @@ def check_read_back(device: str, target: TargetTable, written: float, found: flo
             f"reads its set-point back as {found:g} {target.unit}, not {written:g} {target.unit}"
             f"{f' ({reported})' if reported else ''}; was it restarted, or set by another program or by hand?",
         )
+
+
+def output_lost(device: str, *, setpoint_lost: bool, reported: str = "") -> DeviceError:
+    """Return the error for an output that is off without the bench; `reported` are the instrument's own errors.
+
+    An instrument that has also lost its set-point has restarted.
+    """
+    reported = f" ({reported})" if reported else ""
+    if setpoint_lost:
+        return DeviceRestartedError(
+            device, f"its output is off and its set-point is lost: it has restarted{reported}; connect again"
+        )
+    return DeviceError(
+        device,
+        f"its output is off although it was switched on: a protection, a restart, or another program{reported}",
+    )
 
 
 def identity_of(answer: str) -> Identity:

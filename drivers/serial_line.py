@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from pathlib import Path
 from typing import Any
 
 import serial
@@ -26,10 +29,21 @@ class SerialSettings(DriverSettings):
     )
 
 
-def open_port(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401 - pyserial is untyped
-    """Open a serial port; `options` are pyserial's beside speed and timeouts.
+MOST_STRAY = 4096
+"""Bytes that may come unasked before a serial line counts as unusable."""
 
-    Raises `DeviceConnectionError` if the port cannot be opened.
+_LONGEST_PIECE = 256  # bytes that are discarded at once
+_HELD = (errno.EAGAIN, errno.EBUSY)
+
+
+def open_port(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401 - pyserial is untyped
+    """Open a serial port that no other process holds; `options` are pyserial's beside speed and timeouts.
+
+    A port is held by a lock of the system that ends with the process (`flock`; on Windows the port itself). So it
+    keeps out every program that asks for the lock as well, pseudo-terminals included, and leaves nothing behind.
+
+    Raises `DeviceConnectionError` if the port cannot be opened; it names the process that holds it where the system
+    tells.
     """
     try:
         return serial.serial_for_url(
@@ -37,10 +51,47 @@ def open_port(device: str, settings: SerialSettings, **options: object) -> Any: 
             baudrate=settings.baudrate,
             timeout=settings.timeout,
             write_timeout=settings.timeout,
+            exclusive=True,
             **options,
         )
     except Exception as error:  # pyserial passes on system errors that are no OSError
+        if getattr(error, "errno", None) in _HELD:
+            raise DeviceConnectionError(
+                device,
+                f"cannot open {settings.port}: it is in use by {_holder(settings.port)}; end that program first",
+            ) from None
         raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
+
+
+def _holder(port: str) -> str:
+    """Return which process holds the lock of a port, as far as Linux says so."""
+    try:
+        node = Path(port).stat()
+        place = f"{os.major(node.st_dev):02x}:{os.minor(node.st_dev):02x}:{node.st_ino}"
+        locks = (line.split() for line in Path("/proc/locks").read_text().splitlines())
+        process = next(words[4] for words in locks if words[1] == "FLOCK" and words[5] == place)
+        return f"process {process} ({Path(f'/proc/{process}/comm').read_text().strip()})"
+    except (OSError, StopIteration, IndexError):
+        return "another process"
+
+
+def settle_line(port: Any, silence: float) -> None:  # noqa: ANN401 - pyserial is untyped
+    """Discard what comes on a line until nothing has come for `silence` seconds.
+
+    After an answer that was missing, damaged or doubled, one more may be on its way; this lets it pass. An answer can
+    be later than any silence: a protocol without numbers also needs a question whose answer is like no other.
+
+    Raises `OSError` if the line is lost or does not fall silent.
+    """
+    timeout = port.timeout
+    port.timeout = silence
+    try:
+        for _ in range(MOST_STRAY // _LONGEST_PIECE):
+            if not port.read(_LONGEST_PIECE):
+                return
+    finally:
+        port.timeout = timeout
+    raise OSError("the line does not fall silent")
 
 
 def lost_line(device: str, settings: SerialSettings, error: object, advice: str = "") -> DeviceConnectionError:

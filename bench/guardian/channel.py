@@ -16,8 +16,8 @@ from bench import errors
 from bench.errors import BenchError, DeviceError
 
 _HEAD = struct.Struct(">I")
-_LONGEST = 1 << 20
-"""Longest message, bytes; a block of samples is far shorter."""
+_LONGEST = 1 << 24
+"""Longest message, bytes; a block of 40 000 samples takes some 2 MB."""
 
 Message = dict[str, Any]
 
@@ -39,6 +39,12 @@ class Channel:
         connection.setblocking(False)
         self._socket = connection
         self._received = bytearray()
+        self._unsent = bytearray()
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether the system has not taken all of a message yet; `flush` goes on when the socket can be written."""
+        return bool(self._unsent)
 
     def fileno(self) -> int:
         """Return the descriptor, for a selector."""
@@ -49,17 +55,25 @@ class Channel:
         self._socket.close()
 
     def send(self, message: Message) -> None:
-        """Send a message; raise `ChannelError` if the other side is gone, or takes nothing more.
+        """Send a message; raise `ChannelError` if the other side is gone, or has not taken the message before.
 
-        It never waits: one that does not read is as good as gone.
+        It never waits: what the system does not take at once is sent by `flush` and `wait`.
         """
+        if self._unsent:
+            raise ChannelError("the other side does not read")
         body = json.dumps(message).encode()
         if len(body) > _LONGEST:
             raise ChannelError(f"a message of {len(body)} bytes; {_LONGEST} are allowed")
-        frame = _HEAD.pack(len(body)) + body
+        self._unsent += _HEAD.pack(len(body)) + body
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what is left of a message, as far as the system takes it; raise `ChannelError` if nobody is there."""
         try:
-            if self._socket.send(frame) != len(frame):
-                raise ChannelError("the other side does not read")
+            while self._unsent:
+                del self._unsent[: self._socket.send(self._unsent)]
+        except BlockingIOError:
+            pass
         except OSError as error:
             raise ChannelError(f"the other side is gone: {error}") from None
 
@@ -83,10 +97,15 @@ class Channel:
         return messages
 
     def wait(self, seconds: float) -> bool:
-        """Wait until something has come, for so many wall-clock seconds at most; return whether it has."""
+        """Wait until something has come, for so many wall-clock seconds at most; return whether it has.
+
+        Raises `ChannelError` if a message is on its way still, and nobody is there to take it.
+        """
         with selectors.DefaultSelector() as selector:
-            selector.register(self._socket, selectors.EVENT_READ)
-            return bool(selector.select(seconds))
+            selector.register(self._socket, selectors.EVENT_READ | selectors.EVENT_WRITE * self.is_sending)
+            ready = selector.select(seconds)
+        self.flush()
+        return any(events & selectors.EVENT_READ for _, events in ready)
 
     def _next(self) -> Message | None:
         if len(self._received) < _HEAD.size:
@@ -101,19 +120,28 @@ class Channel:
         del self._received[:end]
         try:
             message = json.loads(body)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ChannelError(f"no JSON: {error}") from None
         if not isinstance(message, dict):
             raise ChannelError("a message is an object of JSON")
         return message
 
 
+_KINDS: dict[str, type[BenchError]] = {
+    name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, BenchError)
+}
+"""The errors that both sides know, by name."""
+
+
 def to_message(error: BaseException) -> Message:
-    """Return an error as a message."""
+    """Return an error as a message.
+
+    One of a class of its own, of a driver, say, goes as the nearest class that both sides know.
+    """
     known = isinstance(error, BenchError)
     text = str(error) if known else f"{type(error).__name__}: {error}"
     return {
-        "kind": type(error).__name__ if known else BenchError.__name__,
+        "kind": next((kind.__name__ for kind in type(error).__mro__ if kind in _KINDS.values()), BenchError.__name__),
         "text": text,
         "device": error.device if isinstance(error, DeviceError) else None,
     }
@@ -121,7 +149,7 @@ def to_message(error: BaseException) -> Message:
 
 def to_error(message: Message) -> BenchError:
     """Return the error that a message stands for."""
-    kind = getattr(errors, message["kind"], BenchError)
+    kind = _KINDS[message["kind"]]
     text, device = message["text"], message["device"]
     if device is not None:
         error: BenchError = kind(device, text.removeprefix(f"{device}: "))

@@ -20,11 +20,12 @@ SAFE, BENCH, LOOK = range(3)
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a call of a device."""
+    """What came of a call of a device; `was_away` is whether its line was lost and came back meanwhile."""
 
     device: str
     value: Any
     error: BaseException | None
+    was_away: bool
 
 
 @dataclass(order=True)
@@ -83,19 +84,18 @@ class LineThreads:
     def _work(self, calls: queue.PriorityQueue[_Call]) -> None:
         while True:
             call = calls.get()
-            value, problem = None, None
             try:
-                value = self._carry(call)
+                result = self._carry(call)
             # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
             except BaseException as error:
-                problem = error
-            call.done(Result(call.device, value, problem))
+                result = Result(call.device, None, error, was_away=False)
+            call.done(result)
 
-    def _carry(self, call: _Call) -> Any:  # noqa: ANN401 - what a device returns
+    def _carry(self, call: _Call) -> Result:
         if call.priority != SAFE and self._ending.is_set():
             raise DeviceConnectionError(call.device, "was not asked, as the run has ended")
         try:
-            return call.call()
+            return Result(call.device, call.call(), None, was_away=False)
         except DeviceConnectionError as lost:
             # The safe state opens a line of its own.
             if call.priority == SAFE or self._ending.is_set():
@@ -103,4 +103,7 @@ class LineThreads:
             device = self._devices[call.device]
             seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
             self._notify(call.device, seconds, str(lost))
-            return call.call()
+            # A set-point that waited for its line may not be sent after the end.
+            if self._ending.is_set():
+                raise
+            return Result(call.device, call.call(), None, was_away=True)

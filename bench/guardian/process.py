@@ -7,13 +7,14 @@ a device cannot be read.
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import selectors
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -22,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.attachment import AttachedClock
 from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
-from bench.errors import BenchError, ConfigurationError, GuardianError
+from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianError
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
@@ -46,6 +48,12 @@ _TRY_FOR = 600.0
 _BLIND = 2.0
 """Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
 
+_TRIES = 3
+"""How often all devices are read again after a line was lost and came back while they were read."""
+
+_NOTHING = Result("", None, None, was_away=False)
+"""The result of a request that concerns no device."""
+
 _LONGEST_WAIT = 0.5
 """Longest time between two turns of the loop, s."""
 
@@ -59,6 +67,8 @@ class _Job:
     failed: Callable[[BaseException], None]
     values: dict[str, Any] = field(default_factory=dict)
     error: BaseException | None = None
+    was_late: bool = False
+    """Whether a line was away meanwhile, so that the values are of different times."""
 
 
 class Guardian:
@@ -70,11 +80,14 @@ class Guardian:
         To the bench.
     rig : Rig
         Connected devices.
+    bench : int
+        Number of the bench's process.
     """
 
-    def __init__(self, channel: Channel, rig: Rig) -> None:
+    def __init__(self, channel: Channel, rig: Rig, bench: int) -> None:
         self._channel = channel
         self._rig = rig
+        self._bench = bench
         self._wall: Clock = WallClock()
         safety = rig.file.safety
         self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
@@ -91,13 +104,16 @@ class Guardian:
         for each in (self._wake, self._woken):
             each.setblocking(False)
         self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
-        self._looking = False
+        self._looking: set[str] = set()
+        self._latest: dict[str, dict[str, float]] = {}
+        self._concerned = {name: self._signals_of(name) for name in self._looked_at}
         self._request: Message | None = None
-        self._last_seen = self._wall.now()
+        self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
         self._bench_is_there = True
         self._writes_stacks = False
         self._ending: float | None = None
-        self._unsafe: dict[str, str] = {}
+        # Every device counts as unsafe until it has said otherwise, whatever fails here.
+        self._unsafe = dict.fromkeys(rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
         self._safe: dict[str, str] | None = None
         self._next_try = 0.0
         self._stages: list[list[str]] = []
@@ -105,10 +121,10 @@ class Guardian:
         self._reported = False
         self._terminated = False
 
-    def begin(self, number: int, description: dict[str, Any]) -> None:
+    def begin(self, hello: Message, description: dict[str, Any]) -> None:
         """Tell the bench what was connected, as the reply to its first request."""
-        self._request = {"n": number}
-        self._reply(description)
+        self._request = hello
+        self._reply(hello, description)
 
     def serve(self) -> None:
         """Serve until the run has ended and every device is safe, or 10 min were not enough for that."""
@@ -120,10 +136,13 @@ class Guardian:
         with selectors.DefaultSelector() as selector:
             selector.register(self._channel, selectors.EVENT_READ, self._receive)
             selector.register(self._woken, selectors.EVENT_READ, self._wake_up)
-            parent = _parent()
+            parent = self._watch_bench()
             if parent is not None:
                 selector.register(parent, selectors.EVENT_READ, partial(self._lose_bench, "the bench has died"))
             while not self._is_over():
+                if self._bench_is_there:
+                    events = selectors.EVENT_READ | selectors.EVENT_WRITE * self._channel.is_sending
+                    selector.modify(self._channel, events, self._receive)
                 wait = min(_LONGEST_WAIT, max(0.0, self._due() - self._wall.now()))
                 for key, _ in selector.select(wait):
                     # Whatever fails here must not keep the devices from being made safe.
@@ -147,7 +166,7 @@ class Guardian:
     def _due(self) -> float:
         if self._ending is None:
             return self._core.due()
-        return self._next_try
+        return self._next_try if self._unsafe else math.inf
 
     def _turn(self) -> None:
         now = self._wall.now()
@@ -155,27 +174,37 @@ class Guardian:
             self._core.trip(GuardianError("the guardian was asked to end by SIGTERM"))
         self._core.advance(now)
         if self._request is not None:
-            self._last_seen = now
-        elif self._watched and now - self._last_seen > _BLIND + self._blind_allowance():
-            self._core.trip(GuardianError(f"the interlocks could not be looked at for {now - self._last_seen:.1f} s"))
+            self._seen_at = dict.fromkeys(self._seen_at, now)
+        for name, seen in self._seen_at.items():
+            if now - seen > _BLIND + self._longest_away(name):
+                self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
         if self._core.over:
             self._keep_safe(now)
-        elif self._core.look_due(now) and not self._looking and self._looked_at:
-            self._looking = True
-            self._start(LOOK, self._looked_at, self._seen, self._blind)
+        elif self._core.look_due(now):
+            for name in self._looked_at.keys() - self._looking:
+                self._looking.add(name)
+                self._submit(LOOK, name, self._looked_at[name], self._take_look)
 
     def _is_over(self) -> bool:
-        if self._ending is None or self._safe is None or self._pending:
+        if self._ending is None or self._safe is None:
             return False
-        all_safe = not self._unsafe
-        return (all_safe and (self._reported or not self._bench_is_there)) or (
-            not self._bench_is_there and self._wall.now() - self._ending > _TRY_FOR
-        )
+        if not (self._unsafe or self._pending):
+            return self._reported or not self._bench_is_there
+        # A driver that hangs for good does not keep this process for good.
+        return not self._bench_is_there and self._is_in_vain()
+
+    def _is_in_vain(self) -> bool:
+        """Return whether it is of no use to try again: after 10 min, or as the emulated laboratory is gone."""
+        assert self._ending is not None
+        clock = self._rig.clock
+        gone = isinstance(clock, AttachedClock) and clock.is_alone
+        return gone or self._wall.now() - self._ending > _TRY_FOR
 
     # The bench
 
     def _receive(self) -> None:
         try:
+            self._channel.flush()
             messages = self._channel.receive()
         except ChannelError as error:
             self._lose_bench(str(error))
@@ -202,22 +231,25 @@ class Guardian:
             self._core.request(self._wall.now())
             _REQUESTS[str(do)](self, message)
         except Exception as error:
-            self._refuse(error)
+            self._refuse(message, error)
 
-    def _reply(self, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
-        self._answer(result=result)
+    def _reply(self, request: Message, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
+        self._answer(request, result=result)
 
-    def _refuse(self, error: BaseException) -> None:
+    def _refuse(self, request: Message, error: BaseException) -> None:
         if not isinstance(error, BenchError):
             self._box.note("defect", error=f"{type(error).__name__}: {error}")
-        self._answer(error=to_message(error))
+        self._answer(request, error=to_message(error))
 
-    def _answer(self, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
-        if self._request is None:
+    def _answer(self, request: Message, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+        # What the bench no longer waits for must not be taken for the answer to its `end`.
+        if request is not self._request:
             return
-        request, self._request = self._request, None
+        self._request = None
         self._core.reply(self._wall.now())
-        news, self._news = self._news, []
+        # Threads of lines append to it.
+        news = self._news[:]
+        del self._news[: len(news)]
         cause = self._core.cause
         pause, self._core.pause = self._core.pause, ""
         try:
@@ -238,23 +270,27 @@ class Guardian:
 
     def _promise(self, message: Message) -> None:
         self._core.promise(float(message["seconds"]), str(message["why"]))
-        self._reply()
+        self._reply(message)
 
     def _keep_record(self, message: Message) -> None:
         self._box.keep_in(Path(message["folder"]))
         self._writes_stacks = bool(message["stacks"])
         self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
-        self._reply()
+        self._reply(message)
 
-    def _look(self, message: Message) -> None:
+    def _look(self, message: Message, tries: int = _TRIES) -> None:
         readers = self._rig.readers(Look(message["look"]), message["wanted"])
 
         def done(readings: dict[str, Any]) -> None:
+            # What other devices gave before a line was back is too old to stand beside it.
+            if job.was_late and tries > 1:
+                self._look(message, tries - 1)
+                return
             values = self._rig.assembled({name: readings[name] for name in readers})
-            self._judge(values)
-            self._reply(values)
+            self._judge(self._rig.clock.now(), values)
+            self._reply(message, values)
 
-        self._start(BENCH, readers, done, self._refuse)
+        job = self._start(BENCH, readers, done, partial(self._refuse, message))
 
     def _apply(self, message: Message) -> None:
         setpoints = message["setpoints"]
@@ -266,33 +302,35 @@ class Guardian:
 
         def done(statuses: dict[str, Status]) -> None:
             self._statuses = [statuses[name] for name in setpoints]
-            self._reply({name: actuator.setpoint for name, actuator in actuators.items()})
+            self._reply(message, {name: actuator.setpoint for name, actuator in actuators.items()})
 
-        self._start(BENCH, calls, done, self._refuse)
+        self._start(BENCH, calls, done, partial(self._refuse, message))
 
     def _check(self, message: Message) -> None:
         for name, values in message["setpoints"].items():
             for value in values:
                 self._actuator(name).check(value)
-        self._reply()
+        self._reply(message)
 
-    def _arrivals(self, _message: Message) -> None:
+    def _arrivals(self, message: Message) -> None:
         statuses = {status.device: status for status in self._statuses}
 
         def done(arrived: dict[str, bool]) -> None:
             errors = [each for status in self._statuses if (each := status.exception()) is not None]
             self._reply(
+                message,
                 {
                     "waiting": [name for name in statuses if not arrived[name]],
                     "error": to_message(errors[0]) if errors else None,
-                }
+                },
             )
 
-        self._start(BENCH, {name: status.update for name, status in statuses.items()}, done, self._refuse)
+        calls = {name: status.ask for name, status in statuses.items()}
+        self._start(BENCH, calls, done, partial(self._refuse, message))
 
     def _can_play(self, message: Message) -> None:
         player = self._rig.block_player(message["inputs"], message["actuators"], message["period"])
-        self._reply(player is not None)
+        self._reply(message, player is not None)
 
     def _play(self, message: Message) -> None:
         name = message["actuators"][0]
@@ -301,18 +339,19 @@ class Guardian:
             raise ConfigurationError(f"{name} cannot carry out blocks by itself")
         self._core.arm()
         setpoints = np.array(message["setpoints"], dtype=np.float64)
-        self._start(
-            BENCH,
-            {name: lambda: player(setpoints)},
-            lambda readings: self._reply(readings[name].tolist()),
-            self._refuse,
-        )
+
+        def done(readings: dict[str, Any]) -> None:
+            rows: list[list[float]] = readings[name].tolist()
+            self._judge_block(message["inputs"], rows, message["period"])
+            self._reply(message, rows)
+
+        self._start(BENCH, {name: lambda: player(setpoints)}, done, partial(self._refuse, message))
 
     def _operate(self, message: Message) -> None:
         if self._rig.laboratory is None:
             raise ConfigurationError("there is no emulated laboratory that could do it")
         self._rig.laboratory.operate(message["task"], message["value"])
-        self._reply()
+        self._reply(message)
 
     def _actuator(self, name: str) -> Actuator:
         device = self._rig.devices.get(name)
@@ -331,33 +370,43 @@ class Guardian:
                 readers.setdefault(name, device.glance)
         return {name: readers[name] for name in self._rig.devices if name in readers}
 
-    def _seen(self, readings: dict[str, Any]) -> None:
-        self._looking = False
-        values = self._rig.assembled({name: readings[name] for name in self._looked_at})
+    def _signals_of(self, name: str) -> frozenset[str]:
+        """Return the signals of a device, and the derived ones that come from them."""
+        own = {signal_.name for signal_ in self._rig.devices[name].signals}
+        return frozenset(own | {each for each in self._rig.derived if not own.isdisjoint(self._rig.sources({each}))})
+
+    def _take_look(self, result: Result) -> None:
+        """Judge what a device has shown at a look; a line that is away keeps no other from being looked at."""
+        self._looking.discard(result.device)
+        if result.error is not None:
+            self._core.trip(_as_bench_error(result.error))
+            return
+        self._latest[result.device] = result.value
+        known = self._rig.assembled({name: self._latest[name] for name in self._looked_at if name in self._latest})
+        values = {name: known[name] for name in self._concerned[result.device] if name in known}
         self._box.saw(values)
-        self._judge(values)
+        self._judge(self._rig.clock.now(), values)
 
-    def _judge(self, values: dict[str, float]) -> None:
+    def _judge_block(self, names: Sequence[str], rows: Sequence[Sequence[float]], period: float) -> None:
+        """Judge the samples of a block, which no look has seen."""
+        if self._watched.isdisjoint(names):
+            return
+        start = self._rig.clock.now() - period * len(rows)
+        for k, row in enumerate(rows):
+            self._judge(start + k * period, dict(zip(names, row, strict=True)))
+
+    def _judge(self, t: float, values: dict[str, float]) -> None:
         now = self._wall.now()
-        if self._watched <= values.keys():
-            self._last_seen = now
+        for name in self._seen_at:
+            if self._concerned[name] & self._watched <= values.keys():
+                self._seen_at[name] = now
         setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
-        findings = self._core.judge(self._rig.clock.now(), values, setpoints, now=now, factor=self._factor)
+        findings = self._core.judge(t, values, setpoints, now=now, factor=self._factor)
         self._news += news_of(findings)
-
-    def _blind(self, error: BaseException) -> None:
-        self._looking = False
-        self._core.trip(_as_bench_error(error))
-
-    def _blind_allowance(self) -> float:
-        return max((self._longest_away(name) for name in self._looked_at), default=0.0)
 
     def _longest_away(self, name: str) -> float:
         longest = self._rig.file.safety.reconnect
-        device = self._rig.devices[name]
-        if any(signal_.name in self._watched for signal_ in device.signals):
-            return min(longest, _BLIND)
-        return longest
+        return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
         text = f"{name}: line lost for {seconds:.1f} s: {why}"
@@ -369,24 +418,22 @@ class Guardian:
     def _keep_safe(self, now: float) -> None:
         """Bring the devices into the safe state, and try again those that are not."""
         if self._ending is None:
+            # What makes safe comes before every record of it.
+            self._lines.end()
+            self._stages = stages(self._rig)
             self._ending = now
             self._next_try = now + _SAFE_WITHIN
-            self._lines.end()
+            self._next_stage()
             cause = self._core.cause
             self._box.note("safe", cause=None if cause is None else str(cause))
             if self._core.late and self._writes_stacks:
-                _show_where_the_bench_stands()
-            order = [name for name in self._rig.file.safety.order if name in self._rig.devices]
-            others = [name for name in self._rig.devices if name not in order]
-            self._stages = [[name] for name in order] + ([others] if others else [])
-            self._unsafe = dict.fromkeys(self._rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
-            self._make_safe(self._stages.pop(0))
+                self._show_where_the_bench_stands()
         if not self._pending and self._stages:
-            self._make_safe(self._stages.pop(0))
+            self._next_stage()
         complete = not self._pending and not self._stages
         if self._safe is None and (complete or now - self._ending >= _SAFE_WITHIN):
             while self._stages:
-                self._make_safe(self._stages.pop(0))
+                self._next_stage()
             self._report_safe()
             self._next_try = now + _TRY_AGAIN
         if self._safe is not None:
@@ -395,10 +442,14 @@ class Guardian:
                 self._make_safe([name for name in self._unsafe if name not in self._pending])
             self._report()
 
+    def _next_stage(self) -> None:
+        self._make_safe(self._stages[0])
+        del self._stages[0]
+
     def _make_safe(self, names: list[str]) -> None:
         for name in names:
-            self._pending.add(name)
             self._submit(SAFE, name, self._rig.devices[name].safe, self._is_safe)
+            self._pending.add(name)
 
     def _is_safe(self, result: Result) -> None:
         self._pending.discard(result.device)
@@ -418,10 +469,10 @@ class Guardian:
             return
         assert self._safe is not None
         if self._request.get("do") == "end":
-            self._answer(result=self._safe)
+            self._reply(self._request, self._safe)
             self._reported = True
         else:
-            self._refuse(self._core.cause or GuardianError("the run has ended already"))
+            self._refuse(self._request, self._core.cause or GuardianError("the run has ended already"))
 
     # Devices
 
@@ -431,12 +482,15 @@ class Guardian:
         calls: Mapping[str, Callable[[], Any]],
         done: Callable[[dict[str, Any]], None],
         failed: Callable[[BaseException], None],
-    ) -> None:
+    ) -> _Job:
+        """Have something done by several devices; return what the results are collected in."""
         job = _Job(set(calls), done, failed)
-        if not calls:
-            done({})
         for name, call in calls.items():
             self._submit(priority, name, call, partial(self._take_part, job))
+        if not calls:
+            self._results.put((partial(self._take_part, job), _NOTHING))
+            self._wake_main()
+        return job
 
     def _submit(self, priority: int, device: str, call: Callable[[], Any], take: Callable[[Result], None]) -> None:
         """Have something done on the line of a device; `take` is called by the main loop with what came of it."""
@@ -445,6 +499,9 @@ class Guardian:
     def _hand_over(self, take: Callable[[Result], None], result: Result) -> None:
         # In the thread of a line.
         self._results.put((take, result))
+        self._wake_main()
+
+    def _wake_main(self) -> None:
         with suppress(OSError):
             self._wake.send(b"\0")
 
@@ -453,12 +510,17 @@ class Guardian:
             self._woken.recv(4096)
         while not self._results.empty():
             take, result = self._results.get()
-            take(result)
+            # One that cannot be used must not keep back those after it.
+            try:
+                take(result)
+            except Exception as error:
+                self._core.trip(_as_bench_error(error))
 
     def _take_part(self, job: _Job, result: Result) -> None:
         job.waiting.discard(result.device)
         job.values[result.device] = result.value
         job.error = job.error or result.error
+        job.was_late = job.was_late or result.was_away
         if job.waiting:
             return
         if job.error is not None:
@@ -469,6 +531,28 @@ class Guardian:
         # A derived signal, say, that cannot be computed.
         except Exception as error:
             job.failed(error)
+
+    def _watch_bench(self) -> int | None:
+        """Return a descriptor that becomes readable when the bench dies, where the system has one.
+
+        The channel alone does not do: a forked child of the bench keeps its end open.
+        """
+        if not hasattr(os, "pidfd_open"):
+            return None
+        with suppress(OSError):
+            descriptor = os.pidfd_open(self._bench)
+            # The parent of an orphan is another process.
+            if os.getppid() == self._bench:
+                return descriptor
+        if os.getppid() != self._bench:
+            self._lose_bench("the bench has died")
+        return None
+
+    def _show_where_the_bench_stands(self) -> None:
+        """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
+        if hasattr(signal, "SIGUSR1") and sys.platform != "win32" and os.getppid() == self._bench:
+            with suppress(OSError):
+                os.kill(self._bench, signal.SIGUSR1)
 
     def _terminate(self, _number: int, _frame: object) -> None:
         self._terminated = True
@@ -492,25 +576,14 @@ def lines_of(rig: Rig) -> dict[str, str]:
     return {entry.name: str(getattr(entry.settings, "port", entry.name)) for entry in rig.file.devices}
 
 
+def stages(rig: Rig) -> list[list[str]]:
+    """Return which devices are made safe at the same time: the ordered ones one after another, all others at once."""
+    order = rig.file.safety.order
+    others = [name for name in rig.devices if name not in order]
+    return [[*order[:1], *others], *([name] for name in order[1:])]
+
+
 def _as_bench_error(error: BaseException) -> BenchError:
     if isinstance(error, BenchError):
         return error
     return GuardianError(f"the guardian failed: {type(error).__name__}: {error}")
-
-
-def _parent() -> int | None:
-    """Return a descriptor that becomes readable when the bench dies, where the system has one.
-
-    The channel alone does not do: a forked child of the bench keeps its end open.
-    """
-    if hasattr(os, "pidfd_open"):
-        with suppress(OSError):
-            return os.pidfd_open(os.getppid())
-    return None
-
-
-def _show_where_the_bench_stands() -> None:
-    """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
-    if hasattr(signal, "SIGUSR1") and sys.platform != "win32":
-        with suppress(OSError):
-            os.kill(os.getppid(), signal.SIGUSR1)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import faulthandler
 import math
+import os
 import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -24,6 +26,7 @@ from bench.rig import Look
 from bench.rig_file import RigFile
 from bench.roles import Floats
 from bench.station.interface import Arrivals, News, Station
+from bench.upkeep.rescue import rescue_by_another_process
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
@@ -62,6 +65,8 @@ class GuardedRig:
         Endpoints file of `bench emulate`, where the instruments are served.
     seed : int
         Seed of everything random in an emulated laboratory.
+    doing : str
+        What it is opened for, in a few words, for who finds the rig in use.
     """
 
     file: RigFile
@@ -69,13 +74,14 @@ class GuardedRig:
     overrides: Mapping[str, str]
     attach: Path | None
     seed: int
+    doing: str
 
 
 class RemoteStation(Station):
     """A station in another process.
 
-    One request is outstanding at a time, and each has a number. A guardian that is lost is replaced by `rescue`,
-    which makes the devices safe; this process never opens a line.
+    One request is outstanding at a time, and each has a number. If the guardian is lost, `bench safe` in a process of
+    its own makes the devices safe; this one never opens a line.
 
     Parameters
     ----------
@@ -83,8 +89,6 @@ class RemoteStation(Station):
         What to open.
     clock : Clock
         The clock of the run.
-    rescue : callable
-        Makes the devices of the rig safe without a guardian; returns by device `safe`, or what went wrong.
 
     Raises
     ------
@@ -96,9 +100,9 @@ class RemoteStation(Station):
         If the guardian does not start.
     """
 
-    def __init__(self, guarded: GuardedRig, clock: Clock, rescue: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
         self.clock = clock
-        self._rescue = rescue
+        self._guarded = guarded
         self._answer_within = _ANSWER + guarded.file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
@@ -109,6 +113,8 @@ class RemoteStation(Station):
         self._is_holding = False
         self._pause = ""
         self._stacks: TextIO | None = None
+        self._lost: GuardianError | None = None
+        self._last_words = ""
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process, self._channel = start_guardian(self._log)
         try:
@@ -119,9 +125,13 @@ class RemoteStation(Station):
                 overrides=dict(guarded.overrides),
                 attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
+                doing=guarded.doing,
+                process=os.getpid(),
             )
-        except BaseException:
-            self._channel.close()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, GuardianError) and (said := self._last_words):
+                raise GuardianError(f"{error}; it said: {said}") from None
             raise
         self.description = _description(guarded.file, found)
         self._setpoints = dict.fromkeys(self.description.limits, math.nan)
@@ -252,19 +262,29 @@ class RemoteStation(Station):
                 path.unlink()
             self._stacks = None
         self._channel.close()
-        try:
-            self._process.wait(_END)
-        except subprocess.TimeoutExpired:
+        if not self._has_ended():
             # It goes on until what is not safe yet is safe.
             self._process.returncode = 0
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").splitlines()
+        self._last_words = lines[-1] if lines else ""
         self._log.close()
+
+    def _has_ended(self) -> bool:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END)
+        return self._process.returncode is not None
 
     def _rescued(self, error: BenchError) -> Mapping[str, str]:
         """Make sure that the guardian is dead, and make the devices safe without it."""
         self._process.kill()
-        self._process.wait()
+        self._has_ended()
         self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
-        return self._rescue()
+        guarded = self._guarded
+        try:
+            return rescue_by_another_process(guarded.rig, guarded.overrides, guarded.attach, self.description.devices)
+        except Exception as failure:
+            return dict.fromkeys(self.description.devices, f"{type(failure).__name__}: {failure}")
 
     def _ask(self, do: str, within: float | None = None, **content: Any) -> Any:  # noqa: ANN401 - what JSON holds
         """Send a request and return what is replied.
@@ -278,6 +298,8 @@ class RemoteStation(Station):
         """
         if self._tripped is not None and do != "end":
             raise self._tripped
+        if self._lost is not None:
+            raise self._lost
         self._number += 1
         waited = Stopwatch()
         within = within or self._answer_within
@@ -293,9 +315,9 @@ class RemoteStation(Station):
                 elif do != "end" and self.clock.interrupted() and waited.seconds() > _ABORT:
                     raise AbortError(f"ended while the guardian had not answered for {waited.seconds():.0f} s")
         except ChannelError as error:
-            raise GuardianError(
-                f"the guardian, which holds the lines of the instruments, was lost: {error}"
-            ) from None
+            # What it answers from now on is not asked for any more.
+            self._lost = GuardianError(f"the guardian, which holds the lines of the instruments, was lost: {error}")
+            raise self._lost from None
 
     def _taken(self, reply: Message) -> Any:  # noqa: ANN401 - what JSON holds
         self._news += [News(**each) for each in reply.get("news", ())]

@@ -10,8 +10,11 @@ import math
 from collections.abc import Mapping
 from enum import Enum
 
-from bench.errors import BenchError, DeviceError, GuardianError, InterlockError
+from bench.errors import BenchError, GuardianError, InterlockError
 from bench.interlocks import Finding, InterlockWatch, Level
+
+_FIRST_PROMISE = 10.0
+"""What counts before the bench has promised anything, s."""
 
 
 class State(Enum):
@@ -56,8 +59,8 @@ class StationCore:
         self._interval = interval
         self._next_look = math.inf
         self._lease_end = math.inf
-        self._promised = math.inf
-        self._why = ""
+        self._promised = _FIRST_PROMISE
+        self._why = "it has promised nothing yet"
         self._asked = False
         self._seen: float | None = None
         self.state = State.IDLE
@@ -77,7 +80,12 @@ class StationCore:
         self._next_look = now + self._interval
 
     def promise(self, seconds: float, why: str) -> None:
-        """Take the promise that each request is followed by the next one within so many seconds."""
+        """Take the promise that each request is followed by the next one within so many seconds.
+
+        Raises ValueError if that is no time.
+        """
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"a promise of {seconds} s; expected a time, s")
         self._promised, self._why = seconds, why
 
     def arm(self) -> None:
@@ -91,9 +99,13 @@ class StationCore:
         Raises what tripped the station, or a promise that was broken before the request came.
         """
         self.advance(now)
+        self.raise_if_over()
+        self._asked = True
+
+    def raise_if_over(self) -> None:
+        """Raise what tripped the station, or that the run has ended."""
         if self.over:
             raise self.cause or GuardianError("the run has ended already")
-        self._asked = True
 
     def reply(self, now: float) -> None:
         """End a request of the bench: its promise counts from here."""
@@ -177,10 +189,6 @@ class StationCore:
                 if each.level is Level.PAUSE and not each.over:
                     self.pause = each.text
         return findings
-
-    def blind(self, error: DeviceError) -> None:
-        """Trip as what the interlocks need cannot be read."""
-        self.trip(error)
 
     def trip(self, cause: BenchError) -> None:
         """End the run in the safe state; the first cause counts."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from bench.clock import Clock
 from bench.description import RigDescription
-from bench.devices import Device, Status
+from bench.devices import Device
 from bench.interlocks import Finding
 from bench.rig import Look
 from bench.roles import Floats
@@ -52,15 +52,6 @@ class Arrivals:
 
     waiting: tuple[str, ...]
     error: Exception | None
-
-
-def arrivals_of(statuses: Sequence[Status]) -> Arrivals:
-    """Ask devices how far their set-points have come."""
-    waiting = [status for status in statuses if not status.update()]
-    for status in statuses:
-        if isinstance(error := status.exception(), Exception):
-            return Arrivals((), error)
-    return Arrivals(tuple(status.device for status in waiting), None)
 
 
 def masked(devices: Iterable[Device]) -> list[News]:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
 from bench.devices import Actuator, Status
-from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.interlocks import Finding, InterlockWatch
 from bench.rig import Look, Rig
 from bench.roles import Floats
 from bench.safety import make_safe
 from bench.station.core import StationCore
-from bench.station.interface import Arrivals, News, Station, arrivals_of, masked, news_of
+from bench.station.interface import Arrivals, News, Station, masked, news_of
 from bench.station.reconnection import reconnect
 
 _T = TypeVar("_T")
+
+_TRIES = 3
+"""How often all devices are read again after a line was lost and came back while they were read."""
 
 
 class LocalStation(Station):
@@ -44,6 +48,7 @@ class LocalStation(Station):
         self._statuses: list[Status] = []
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
+        self._lost = 0
 
     @property
     def has_operator(self) -> bool:
@@ -67,18 +72,35 @@ class LocalStation(Station):
     def look(self, look: Look, wanted: Collection[str] = ()) -> dict[str, float]:
         """Read the devices; values by signal name."""
         readers = self._rig.readers(look, wanted)
-        return self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+        for _ in range(_TRIES):
+            lost = self._lost
+            values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+            # What other devices gave before a line was back is too old to stand beside it.
+            if self._lost == lost:
+                break
+        return values
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
         """Return a function that takes a quick reading of the devices that some signals come from."""
-        return self._rig.quick_reader(wanted)
+        read = self._rig.quick_reader(wanted)
+
+        def read_again() -> dict[str, float]:
+            try:
+                return read()
+            except DeviceConnectionError:
+                return self.look(Look.PART, wanted)
+
+        return read_again
 
     def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
         """Return a function that sends those of some set-points that have changed."""
         devices = [self._actuator(name) for name in actuators]
-        self._core.arm()
+        core = self._core
+        core.arm()
 
         def move(setpoints: Sequence[float]) -> None:
+            if core.over:
+                core.raise_if_over()
             changed = [
                 (actuator, value)
                 for actuator, value in zip(devices, setpoints, strict=True)
@@ -89,7 +111,11 @@ class LocalStation(Station):
                 for actuator, value in changed:
                     actuator.check(value)
             for actuator, value in changed:
-                actuator.set(value)
+                try:
+                    actuator.set(value)
+                except DeviceConnectionError as error:
+                    self._reconnect(actuator.name, error)
+                    actuator.set(value)
 
         return move
 
@@ -109,6 +135,7 @@ class LocalStation(Station):
 
     def apply(self, setpoints: Mapping[str, float]) -> None:
         """Send set-points; all are checked before any is sent."""
+        self._core.raise_if_over()
         self.check({name: (value,) for name, value in setpoints.items()})
         self._core.arm()
         self._statuses = []
@@ -121,7 +148,9 @@ class LocalStation(Station):
 
     def arrivals(self) -> Arrivals:
         """Ask the devices that were sent set-points last how far they have come."""
-        return arrivals_of(self._statuses)
+        waiting = [status.device for status in self._statuses if not self._ask(status.device, status.ask)]
+        errors = (status.exception() for status in self._statuses)
+        return Arrivals(tuple(waiting), next((each for each in errors if isinstance(each, Exception)), None))
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
         """Judge readings that were recorded by the interlocks."""
@@ -157,7 +186,10 @@ class LocalStation(Station):
         """Bring every device into its safe state; return by device `safe`, or what went wrong."""
         self._core.end()
         if self._safe is None:
-            self._safe = make_safe(self._rig.devices.values())
+            order = self._rig.file.safety.order
+            # A stable sort: those that have no order come after the others, as they stand.
+            ranked = sorted(self._rig.devices, key=lambda name: order.index(name) if name in order else len(order))
+            self._safe = make_safe(self._rig.devices[name] for name in ranked)
             self._news += masked(self._rig.devices.values())
         return self._safe
 
@@ -176,10 +208,23 @@ class LocalStation(Station):
         try:
             return call()
         except DeviceConnectionError as error:
-            device = self._rig.devices[name]
-            seconds = reconnect(device, error, self.clock, self._rig.file.safety.reconnect, lambda: self._core.over)
-            self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
+            self._reconnect(name, error)
             return call()
+
+    def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
+        longest = self._rig.file.safety.reconnect
+        seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
+        self._lost += 1
+        self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
+
+    def _feed_others(self, name: str) -> bool:
+        """Keep the watchdogs of other instruments from expiring; return False, as the run has not ended."""
+        for other, device in self._rig.devices.items():
+            if other != name and device.watchdog:
+                # What is wrong with it the next reading finds.
+                with suppress(DeviceError):
+                    device.glance()
+        return False
 
     def _note(self, findings: tuple[Finding, ...]) -> None:
         if findings:

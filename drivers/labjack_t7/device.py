@@ -45,7 +45,8 @@ class T7Device(LineDevice[T7SettingsT, LabJackT7]):
     """A device on a LabJack T7.
 
     Several may share one instrument, and share the connection to it then (`drivers.modbus_tcp`); they are
-    set up one after the other. A connection that breaks ends for all of them: each has to connect again.
+    set up one after the other. A connection that breaks ends for all of them, and the next request of each goes over
+    another one, if the instrument has not restarted since (`LabJackT7`). A request without a reply is repeated once.
     `connect` raises `DeviceConnectionError` also if the words or bytes of a value arrive in swapped order.
     """
 
@@ -55,3 +56,17 @@ class T7Device(LineDevice[T7SettingsT, LabJackT7]):
 
     def _identify(self) -> Identity:
         return self._line.identify()
+
+    def _renew_line(self) -> None:
+        # One that another device has just opened stays.
+        self._line.renew()
+
+    def reconnect(self) -> None:
+        """Go on over another connection if the present one was lost; errors are those of `Device.reconnect`."""
+        with self._line.in_haste():
+            super().reconnect()
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected, as their answers were lost."""
+        return self._line.repeats

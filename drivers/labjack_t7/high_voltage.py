@@ -148,9 +148,13 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
             self._switch_on()
         elif self._clock.now() - self._looked >= _STATUS_AGE:
             self.glance()
-        self._setpoint = float(value)
         self._send(value)
+        self._setpoint = float(value)
         return self._sent
+
+    def glance(self) -> dict[str, float]:
+        """Measure voltage and current by one conversion of each input, and look that no other program took over."""
+        return self._values(*self._check(self._line.read_packet(self._packet)))
 
     def can_play(self, sensor: Device, period: float) -> bool:
         """Return whether `play` takes a sensor and a period: one on the same connection, and whole µs of a wait."""

@@ -16,6 +16,7 @@ from typing import TypeVar
 from pydantic import Field
 
 from bench.clock import Clock
+from bench.devices import Finding
 from bench.errors import DeviceError
 from drivers.device import LineActuator
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
@@ -125,7 +126,8 @@ class DigitalOutput:
     @property
     def is_on(self) -> bool:
         """Whether the level of the line is the one that is on, as the instrument reports now."""
-        return self._level(self._instrument.read_span(_STATE)[0])
+        ((state,),) = self._instrument.read_spans((_STATE,))
+        return self._level(state)
 
     def switch(self, on: bool) -> None:
         """Make the line an output with the level for on or off.
@@ -210,6 +212,14 @@ class DigitalOutput:
         lines = present.lines & ~self._bit
         self._change(present, replace(present, dio_enabled=int(bool(lines)), inhibit=~lines & _ALL_LINES))
 
+    @property
+    def guarded_for(self) -> int | None:
+        """Silence of all hosts, s, after which the watchdog switches the line off; None if it does not."""
+        present = self._watchdog()
+        off = 0 if self._active_high else self._bit
+        switches_off = present.lines & present.direction & self._bit and present.state & self._bit == off
+        return present.seconds if switches_off else None
+
     def _others(self, watchdog: _Watchdog) -> bool:
         """Return whether something else than this line is under the watchdog."""
         if watchdog.lines & ~self._bit:
@@ -261,16 +271,35 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
         super().__init__(name, settings, clock, line)
         self._output = DigitalOutput(name, line, settings.line, active_high=settings.active_high)
 
-    def _renew_line(self) -> None:
-        super()._renew_line()
-        self._output = DigitalOutput(
-            self.name, self._line, self._settings.line, active_high=self._settings.active_high
-        )
+    @property
+    def watchdog(self) -> float:
+        """Silence of all hosts, s, after which the instrument switches the line off, at the latest."""
+        return float(self._settings.watchdog)
+
+    def safe(self) -> None:
+        """Bring the device into its safe state, over a connection of its own if the one in use is gone.
+
+        Raises `DeviceError` if the safe state could not be confirmed, after everything was tried: within 3 s.
+        """
+        with self._line.in_haste(unchecked=True):
+            self._make_safe()
 
     def close(self) -> None:
         """Release the connection; a line that is on is left to the watchdog."""
         # An instrument that cannot be reached any more keeps its watchdog, as it should.
-        with suppress(DeviceError):
+        with suppress(DeviceError), self._line.in_haste():
             if not self._output.is_on:
                 self._output.unguard()
         super().close()
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Read the watchdog of the instrument back.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        found, wanted = self._output.guarded_for, self._settings.watchdog
+        if found is not None and found <= wanted:
+            return (Finding("watchdog read back", f"{found} s in the instrument, switches {self._output} off"),)
+        text = "does not switch it off" if found is None else f"{found} s"
+        advice = f"end what else uses the instrument: {wanted} s was written on connecting"
+        return (Finding("watchdog read back", f"{self._output}: {text}", advice),)

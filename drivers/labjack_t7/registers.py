@@ -2,7 +2,7 @@
 
 Sources: `ljm_constants.json` (repository labjack/ljm_constants) for the register map; LabJack, Direct Modbus TCP,
 Protocol Details, for the byte order and for function 76; the error table of the same repository for the details of
-refusals.
+refusals; LabJack, Letter of Volatility of the T7, for USER_RAM, which each restart clears.
 
 Assumptions: the instrument reads back the settings that were written. WAIT_US_BLOCKING, which programs use beside
 TDAC# but the versions of the map at hand do not have, is a UINT32 at 61590 and takes up to 100 000 µs.
@@ -11,17 +11,21 @@ TDAC# but the versions of the map at hand do not have, is a UINT32 at 61590 and 
 from __future__ import annotations
 
 import math
+import secrets
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.devices import Identity
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.modbus import (
     FEEDBACK,
+    ModbusClient,
     RefusedError,
     exception_text,
     read_frame,
@@ -35,6 +39,8 @@ from drivers.modbus_tcp import Connection, share
 Kind = Literal["F32", "U32", "U16"]
 Access = Literal["R", "W", "RW"]
 Floats = NDArray[np.float64]
+
+Answer = TypeVar("Answer")
 
 _FORMS = {"F32": "f", "U32": "I", "U16": "H"}
 
@@ -96,9 +102,19 @@ class Span(NamedTuple):
             values=values,
         )
 
+    def ask(self, client: ModbusClient) -> tuple[float, ...]:
+        """Return the values, as a client gets them by a request of their own.
+
+        Raises what the request does, and `OSError` if the answer announces another number of bytes than it has.
+        """
+        reply = client.request(self.request, self.size)
+        if reply[1] != self.size - 2:
+            raise OSError(f"the answer announces {reply[1]} bytes where {self.size - 2} were asked for")
+        return self.reply.unpack(reply)
+
 
 class Packet(NamedTuple):
-    """Spans to be read in one packet of function 76 again and again, in their order."""
+    """Spans to be read in one packet of function 76 again and again, in their order, and the owner number."""
 
     name: str
     """Names their registers."""
@@ -107,15 +123,16 @@ class Packet(NamedTuple):
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
-    """Form of the reply: its function and the values of all spans."""
+    """Form of the reply: its function, the values of all spans, and the owner number."""
 
     @classmethod
     def of(cls, spans: Sequence[Span]) -> Packet:
         """Return the packet of spans."""
-        reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in spans))
+        read = (*spans, _OWNER_SPAN)
+        reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in read))
         return cls(
             name=", ".join(f"reading register {span.address}" for span in spans),
-            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in spans),
+            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in read),
             size=reply.size,
             reply=reply,
         )
@@ -163,6 +180,7 @@ AIN_RANGE = Register("AIN#_RANGE", 40000, "F32", "RW")
 AIN_NEGATIVE_CH = Register("AIN#_NEGATIVE_CH", 41000, "U16", "RW")
 AIN_RESOLUTION_INDEX = Register("AIN#_RESOLUTION_INDEX", 41500, "U16", "RW")
 AIN_SETTLING_US = Register("AIN#_SETTLING_US", 42000, "F32", "RW")
+USER_RAM = Register("USER_RAM#_U32", 46100, "U32", "RW")
 LAST_ERR_DETAIL = Register("LAST_ERR_DETAIL", 55000, "U16", "R")
 TEST = Register("TEST", 55100, "U32", "R")
 TEST_FLOAT32 = Register("TEST_FLOAT32", 55124, "F32", "R")
@@ -185,6 +203,13 @@ WATCHDOG_DAC_ENABLE = (
 _FRAME_HEAD = 4  # bytes of a frame of function 76 before its values
 _MOST_FRAMES = 1040 - 8  # bytes of all frames of a packet
 
+_OWNER = USER_RAM.of(39)  # the last one, as scripts of the instrument take the first ones
+_OWNER_SPAN = Span.of(_OWNER)
+_HASTE = 0.5  # s, longest wait for a connection or a reply where time is short
+
+_owners: dict[str, int] = {}
+"""The owner number of this process in each instrument, by address."""
+
 _TEST_WORDS = [0x0011, 0x2233]
 _TEST_FLOAT = -9999.0
 _PRODUCT = 7.0
@@ -200,11 +225,21 @@ _DETAILS = {
 }
 
 
+def _ask_echo(target: Target, request: bytes, client: ModbusClient) -> None:
+    if client.request(request, len(target.echo)) != target.echo:
+        raise OSError("the answer is none to the request")
+
+
 class LabJackT7:
     """The connection to a LabJack T7 over Modbus TCP.
 
-    Methods raise `DeviceError` if the instrument refuses, and `DeviceConnectionError` if it does not answer; the
-    connection is closed then.
+    Methods raise `DeviceError` if the instrument refuses, and `DeviceConnectionError` if it does not answer. A
+    connection without an answer ends, for all its devices, as a late reply must not be taken for that to the next
+    request; the request is repeated once over another, and so is the next one.
+
+    `claim` leaves an owner number in the RAM of the instrument. It is gone after a restart, and another one is there
+    when another program has taken the instrument. Each new connection is checked for it before anything is sent,
+    and each request of function 76 carries the check along.
 
     Parameters
     ----------
@@ -222,32 +257,148 @@ class LabJackT7:
     def __init__(self, name: str, port: str, timeout: float) -> None:
         self._name = name
         self._address = port
-        try:
-            self._connection = self._share(timeout)
-        except OSError as error:
-            reason = f" ({error})" if str(error) else ""
-            raise DeviceConnectionError(
-                name,
-                f"cannot connect to {port}{reason}; check the address, the cable and that the instrument has power",
-            ) from None
+        self._timeout = timeout
+        self._owner = 0
+        self._serial_number = 0
+        self._in_haste = self._unchecked = self._gave_up = False
+        self.repeats = 0
+        """Number of requests that were repeated over another connection."""
+        self._connection = self._share()
         self._client = self._connection.client
         self._lock = self._connection.lock
         self._connected = True
 
-    def _share(self, timeout: float) -> Connection:
-        connection = share(self._address, timeout)
-        if connection.is_new:
+    def _share(self) -> Connection:
+        """Return the connection of the process, or a new one if that does not answer."""
+        timeout = min(self._timeout, _HASTE) if self._in_haste else self._timeout
+        while True:
+            try:
+                connection = share(self._address, timeout)
+            except OSError as error:
+                reason = f" ({error})" if str(error) else ""
+                raise DeviceConnectionError(
+                    self._name,
+                    f"cannot connect to {self._address}{reason}; check the address, the cable and "
+                    "that the instrument has power",
+                ) from None
+            is_new = connection.is_new
+            try:
+                with connection.lock:
+                    if self._in_haste:
+                        connection.client.wait_for(timeout)
+                    if self._owner and not self._unchecked:
+                        self._check_instrument(connection.client)
+                    elif not is_new:
+                        # The instrument may have restarted since the other devices last used it.
+                        connection.client.read(TEST.address, 1)
+            except RefusedError:
+                pass  # another instrument, as `identify` will say
+            except OSError as error:
+                connection.close()
+                connection.end()
+                if is_new:
+                    raise self._silence(error) from error
+                self.repeats += 1
+                continue
+            except BaseException:
+                connection.close()
+                raise
             return connection
-        # The instrument may have restarted since the other devices last used it.
+
+    def _check_instrument(self, client: ModbusClient) -> None:
+        """Raise `DeviceError` if this is another instrument, or it has restarted since `claim`."""
+        found = int.from_bytes(client.read(SERIAL_NUMBER.address, 2), "big")
+        if found != self._serial_number:
+            raise DeviceError(
+                self._name,
+                f"is another instrument now: the T7 at {self._address} has serial number {found}; it was "
+                f"{self._serial_number}",
+            )
+        self._check_owner(int.from_bytes(client.read(_OWNER.address, 2), "big"))
+
+    def claim(self) -> None:
+        """Leave the owner number of this process in the instrument, by which a restart and another program are seen.
+
+        The devices of a process share it.
+        """
+        with self._lock:
+            known = _owners.get(self._address)
+            if self.read_integer(_OWNER) != known:
+                known = _owners[self._address] = 1 + secrets.randbelow(0xFFFFFFFF)
+                self.write(_OWNER, known)
+            self._serial_number = self.read_integer(SERIAL_NUMBER)
+            assert known is not None
+            self._owner = known
+
+    def reopen(self) -> None:
+        """Use the connection that other devices have opened, or open one, if the present one has ended.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If no connection can be made, nothing answers, or the device has closed it.
+        DeviceRestartedError
+            If the instrument has restarted since `claim`.
+        DeviceError
+            If it is another instrument, or another program has taken it.
+        """
+        if not self._connected:
+            raise self._closed()
+        if not self._connection.ended:
+            return
+        self._connection.close()
+        connection = self._share()
+        self._connection, self._client, self._lock = connection, connection.client, connection.lock
+
+    def renew(self) -> None:
+        """Check the instrument, over another connection if the present one does not answer; raises as `reopen`."""
         try:
-            with connection.lock:
-                connection.client.read(TEST.address, 1)
+            with self._lock:
+                if self._owner and not self._connection.ended:
+                    self._check_instrument(self._client)
         except RefusedError:
             pass  # another instrument, as `identify` will say
         except OSError:
-            connection.end()
-            return share(self._address, timeout)
-        return connection
+            self._connection.end()
+        self.reopen()
+
+    def _check_owner(self, found: int) -> None:
+        if found == self._owner:
+            return
+        if found in (0, _owners.get(self._address)):
+            raise DeviceRestartedError(
+                self._name,
+                "the LabJack T7 has restarted, and its inputs and lines are not set up any more; find out why, then "
+                "connect again",
+            )
+        raise DeviceError(
+            self._name,
+            f"another program has taken the LabJack T7 at {self._address}; end it, then connect again",
+        )
+
+    @contextmanager
+    def in_haste(self, *, unchecked: bool = False) -> Iterator[None]:
+        """Wait 0.5 s at most for a connection or a reply.
+
+        Parameters
+        ----------
+        unchecked : bool
+            Whether requests go to an instrument that has restarted as well; a connection opened for them ends here.
+        """
+        before = self._connection
+        self._in_haste, self._unchecked = True, unchecked
+        try:
+            with before.lock:
+                before.client.wait_for(min(before.timeout, _HASTE))
+            yield
+        finally:
+            self._in_haste = self._unchecked = self._gave_up = False
+            now = self._connection
+            if unchecked and now is not before:
+                now.end()
+            for connection in (before, now):
+                if not connection.ended:
+                    connection.wait_for_reply(max(self._timeout, connection.timeout))
 
     def close(self) -> None:
         """Release the connection; it is closed with its last user."""
@@ -262,43 +413,55 @@ class LabJackT7:
     def read_span(self, span: Span) -> tuple[float, ...]:
         """Get the values of neighbouring registers of one type."""
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
         try:
             with self._lock:
                 reply = self._client.request(span.request, span.size)
             if reply[1] != span.size - 2:
                 raise OSError(f"the answer announces {reply[1]} bytes where {span.size - 2} were asked for")
         except (RefusedError, OSError) as error:
-            raise self._failure(error, f"reading register {span.address}") from error
+            return self._again(error, f"reading register {span.address}", span.ask)
         return span.reply.unpack(reply)
 
     def read_packet(self, packet: Packet) -> tuple[float, ...]:
-        """Get the values of several spans in one request, one behind the other."""
+        """Get the values of several spans in one request, one behind the other; raises what `read_spans` does."""
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
         try:
             with self._lock:
                 reply = self._client.request(packet.request, packet.size)
         except (RefusedError, OSError) as error:
-            raise self._failure(error, packet.name) from error
-        return packet.reply.unpack(reply)
+            reply = self._again(error, packet.name, lambda client: client.request(packet.request, packet.size))
+        *values, owner = packet.reply.unpack(reply)
+        if owner != self._owner and self._owner and not self._unchecked:
+            self._check_owner(owner)
+        return tuple(values)
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
-        """Get the values of several spans in one request; what is to be written at addresses goes first in it."""
+        """Get the values of several spans in one request; what is to be written at addresses goes first in it.
+
+        Raises `DeviceRestartedError` or `DeviceError` also if the owner number is not that of `claim` any more.
+        """
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
+        checks = self._owner != 0 and not self._unchecked
+        if checks:
+            spans = (*spans, _OWNER_SPAN)
         frames = b"".join((*(write_frame(*write) for write in writes), *(span.frame for span in spans)))
+        size = sum(span.values.size for span in spans)
         try:
             with self._lock:
-                reply = self._client.feedback(frames, sum(span.values.size for span in spans))
+                reply = self._client.feedback(frames, size)
         except (RefusedError, OSError) as error:
             doing = [f"writing register {address}" for address, _ in writes]
-            doing += [f"reading register {span.address}" for span in spans]
-            raise self._failure(error, ", ".join(doing)) from error
+            doing += [f"reading register {span.address}" for span in spans if span is not _OWNER_SPAN]
+            reply = self._again(error, ", ".join(doing), lambda client: client.feedback(frames, size))
         values, position = [], 0
         for span in spans:
             values.append(list(span.values.unpack_from(reply, position)))
             position += span.values.size
+        if checks:
+            self._check_owner(int(values.pop()[0]))
         return values
 
     def shares_connection(self, other: LabJackT7) -> bool:
@@ -326,7 +489,7 @@ class LabJackT7:
             What was read, one row for each value.
         """
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
         reads = b"".join(span.frame for span in spans)
         size = len(reads)
         pause = write_frame(WAIT_US_BLOCKING.address, self.encode(WAIT_US_BLOCKING, wait))
@@ -339,6 +502,7 @@ class LabJackT7:
             with self._lock:
                 reply = self._client.feedback(packet.tobytes()[: -len(pause)], row * len(values))
         except (RefusedError, OSError) as error:
+            # Not again: part of the block may have been played.
             raise self._failure(error, f"playing {len(values)} values on register {register.address}") from error
         return np.frombuffer(reply, ">f4").astype(np.float64).reshape(len(values), -1)
 
@@ -372,24 +536,25 @@ class LabJackT7:
     def write_span(self, address: int, data: bytes) -> None:
         """Set neighbouring registers from an address on."""
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
         try:
             with self._lock:
                 self._client.write(address, data)
         except (RefusedError, OSError) as error:
-            raise self._failure(error, f"writing register {address}") from error
+            self._again(error, f"writing register {address}", lambda client: client.write(address, data))
 
     def send(self, target: Target, value: float) -> None:
         """Set a register."""
         if self._connection.ended or not self._connected:
-            raise self._closed()
+            self.reopen()
+        request = target.head + target.encode(value)
         try:
             with self._lock:
-                reply = self._client.request(target.head + target.encode(value), len(target.echo))
+                reply = self._client.request(request, len(target.echo))
             if reply != target.echo:
                 raise OSError(f"the answer {reply.hex(' ')} is none to the request {target.head.hex(' ')} …")
         except (RefusedError, OSError) as error:
-            raise self._failure(error, f"writing register {target.address}") from error
+            self._again(error, f"writing register {target.address}", partial(_ask_echo, target, request))
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type and read them back, in one request.
@@ -436,17 +601,39 @@ class LabJackT7:
         (firmware,) = self.read(FIRMWARE_VERSION)
         return Identity("LabJack", "T7", str(self.read_integer(SERIAL_NUMBER)), f"{firmware:.4f}")
 
+    def _again(self, error: RefusedError | OSError, doing: str, ask: Callable[[ModbusClient], Answer]) -> Answer:
+        """Return what a request that failed brings over another connection; raise what a refusal means."""
+        failure = self._failure(error, doing)
+        if isinstance(error, RefusedError) or self._gave_up:
+            raise failure from error
+        # In haste, two silences are enough.
+        self._gave_up = self._in_haste
+        try:
+            self.reopen()
+        except DeviceConnectionError:
+            raise failure from error
+        self.repeats += 1
+        try:
+            with self._lock:
+                return ask(self._client)
+        except RefusedError as refusal:
+            raise self._refusal(refusal, doing) from refusal
+        except OSError:
+            self._connection.end()
+            raise failure from error
+
     def _failure(self, error: RefusedError | OSError, doing: str) -> DeviceError:
         """Return the error for a request that failed; without an answer, end the connection."""
         if isinstance(error, RefusedError):
             return self._refusal(error, doing)
-        # A late reply must not be taken for that to the next request, and an instrument that restarted has
-        # lost its settings: the connection ends here.
         self._connection.end()
+        return self._silence(error)
+
+    def _silence(self, error: OSError) -> DeviceConnectionError:
         return DeviceConnectionError(
             self._name,
-            f"no reply from {self._address} within {self._connection.timeout:g} s, or the connection broke; "
-            f"check cable and power, then connect again ({error})",
+            f"no reply from {self._address} within {self._timeout:g} s, or the connection broke; check cable and "
+            f"power ({error})",
         )
 
     def _refusal(self, refusal: RefusedError, doing: str) -> DeviceError:
@@ -465,7 +652,7 @@ class LabJackT7:
     def _closed(self) -> DeviceConnectionError:
         return DeviceConnectionError(
             self._name,
-            f"the connection to {self._address} is closed; connect again, so that the instrument is set up again",
+            f"the connection to {self._address} was closed by its device; connect again",
         )
 
     def _wrong(self, what: str) -> DeviceConnectionError:

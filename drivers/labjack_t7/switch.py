@@ -20,6 +20,7 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
     Settings: ClassVar[type[T7LineSettings]] = T7LineSettings
 
     def _start(self) -> None:
+        self._line.claim()
         self._output.switch(False)
         self._output.guard(self._settings.watchdog)
 
@@ -34,8 +35,8 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
             If the instrument refuses, or if the line does not read back so.
         """
         self.check(value)
-        self._setpoint = float(value)
         self._output.switch(value == 1.0)
+        self._setpoint = float(value)
         return Status.completed(self.name, self._clock)
 
     def measure(self) -> dict[str, float]:

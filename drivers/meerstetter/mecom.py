@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import struct
 from binascii import crc_hqx
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import serial
@@ -18,6 +19,8 @@ from bench.errors import DeviceError
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
 
 _MOST_STALE_ANSWERS = 8
+_HASTE = 0.2  # s, longest wait for an answer where time is short
+_HASTY_RESENDS = 1
 _ACKNOWLEDGE_LENGTH = 12  # !, address, sequence, CRC, carriage return
 _ERROR_LENGTH = 15  # the same and + with two digits
 _LONGEST_NONSENSE = 256  # characters without an end; the longest answer has 52, and two may have lost their end
@@ -70,12 +73,19 @@ class TECLine:
     A request that brings no answer, or a damaged one, is sent again with its own sequence number, twice at
     most (5117C). The device may carry it out again, so an order that must not be repeated is sent once. An answer
     with another sequence number is a late one to an earlier request, and is skipped.
+
+    Attributes
+    ----------
+    repeats : int
+        Number of requests that were sent again.
     """
 
     def __init__(self, device: str, settings: TECLineSettings) -> None:
         self._device = device
         self._settings = settings
         self._sequence = 0
+        self._most_resends = RESENDS
+        self.repeats = 0
         self._received = bytearray()
         self._silence = f"no answer within {settings.timeout:g} s"
         self._port = open_port(device, settings)
@@ -83,6 +93,27 @@ class TECLine:
     def close(self) -> None:
         """Release the line."""
         self._port.close()
+
+    def follow(self, line: TECLine) -> None:
+        """Go on counting where another line to the device has ended, as an answer to it may still come."""
+        self._sequence, self.repeats = line._sequence, line.repeats
+
+    @contextmanager
+    def in_haste(self) -> Iterator[None]:
+        """Wait 0.2 s at most for an answer, and send a request twice at most."""
+        patience = self._port.timeout
+        self._most_resends = _HASTY_RESENDS
+        try:
+            self._wait_for(min(patience, _HASTE))
+            yield
+        finally:
+            self._most_resends = RESENDS
+            self._wait_for(patience)
+
+    def _wait_for(self, patience: float) -> None:
+        # pyserial sets an open port up anew, and a lost one says that it is lost at the next request.
+        with suppress(serial.SerialException, OSError):
+            self._port.timeout = self._port.write_timeout = patience
 
     def ask(self, request: str, digits: int) -> str:
         """Send a query; return the `digits` characters of its answer.
@@ -106,8 +137,10 @@ class TECLine:
         body = b"#" + head + request.encode("ascii")
         crc = b"%04X" % crc_hqx(body, 0)
         frame = body + crc + b"\r"
+        resends = min(resends, self._most_resends)
         try:
-            for _ in range(1 + resends):
+            for attempt in range(1 + resends):
+                self.repeats += attempt > 0
                 self._port.write(frame)
                 problem, content = self._answer(b"!" + head, crc, digits)
                 if problem == "":

@@ -12,6 +12,7 @@ the PID set-up are left as the bench builder set them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum
 from functools import partial
@@ -20,8 +21,8 @@ from typing import ClassVar
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.devices import Finding, Identity, Limits, Status
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
@@ -39,9 +40,14 @@ from drivers.meerstetter.mecom import (
 
 _START_TIMEOUT = 5.0
 _RESET_DELAY = 0.3  # the device restarts 0.2 s after the command
+_LOOKS, _LOOK_INTERVAL = (
+    10,
+    0.02,
+)  # how often, and every how many s, the output is looked for after it was switched on
+_BLOCK = 5  # parameters read at once, as many as a measurement has
 _OUT_OF_RANGE = 7
 
-_OFF, _LIVE_ENABLE = 0, 2  # values of the output stage enable
+_OFF, _STATIC_ON, _LIVE_ENABLE = 0, 1, 2  # values of the output stage enable
 _LIVE_INPUT, _CONTROLLER_INPUT = 1, 2  # values of the output stage input selection
 _STABLE = 2  # value of "temperature is stable"
 
@@ -72,6 +78,8 @@ _OBJECT_TEMPERATURE = Parameter(1000, "object temperature", real=True)
 _SINK_TEMPERATURE = Parameter(1001, "sink temperature", real=True)
 _CURRENT = Parameter(1020, "output current", real=True)
 _VOLTAGE = Parameter(1021, "output voltage", real=True)
+_SUPPLY_VOLTAGE = Parameter(1060, "driver input voltage", real=True, of_channel=False)
+_BASE_TEMPERATURE = Parameter(1063, "base plate temperature", real=True, of_channel=False)
 _STABILITY = Parameter(1200, "temperature is stable")
 _INPUT = Parameter(2000, "output stage input selection")
 _ENABLE = Parameter(2010, "output stage enable")
@@ -80,8 +88,11 @@ _VOLTAGE_LIMIT = Parameter(2031, "voltage limitation", real=True)
 _WATCHDOG = Parameter(2060, "communication watchdog", real=True, of_channel=False)
 _TARGET = Parameter(3000, "target object temperature", real=True)
 _POLARITY = Parameter(3034, "positive current heats")
+_LOWEST_OBJECT = Parameter(4010, "lower error threshold of the object temperature", real=True)
+_HIGHEST_OBJECT = Parameter(4011, "upper error threshold of the object temperature", real=True)
 _STABLE_WINDOW = Parameter(4040, "temperature window of stability", real=True)
 _STABLE_TIME = Parameter(4041, "minimum time in the window of stability", real=True)
+_HIGHEST_SINK = Parameter(5011, "upper error threshold of the sink temperature", real=True)
 _RESTART_DELAY = Parameter(6310, "delay till restart", real=True, of_channel=False)
 _LIVE_ENABLED = Parameter(50000, "live enable")
 _LIVE_CURRENT = Parameter(50001, "live current", real=True)
@@ -145,6 +156,16 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     A measurement is one request for all its values and the status (`?VX`), so that they are of one instant. A device
     whose firmware does not know it is asked for one value after the other; `connect` finds out which.
 
+    The limits are in the RAM of the device, and a restart loses them. It brings "saving to flash off" back, which is
+    read before the output is switched on, and where a status is not the expected one. So a restart is found by the
+    status in the next measurement, as the output is off after it, and before the output goes on. A device whose
+    output would come back by itself (output stage enable "static on") is refused. No restart fits between the
+    requests that switch on without one of them staying unanswered: after one that did, all settings are read back
+    before the last step and after it.
+
+    An output that another program has switched is an error at the next measurement. A set-point or a limit that it
+    has changed is found by `reconnect` only, as each parameter more would lengthen each measurement.
+
     The device reports current and voltage by its own sign; whether a positive current heats is parameter
     3034, which the driver reads once and takes into account, as the role counts heating as positive. That
     it applies to the live current in the same way is an assumption.
@@ -156,6 +177,11 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         super().__init__(name, settings, clock, line)
         self._mode = settings.mode
         self._polarity = 1
+        self._on = False
+        """Whether the driver has switched the output on."""
+        self._restarted = False
+        self._configured: dict[Parameter, float] = {}
+        """What the parameters are that `connect` has written, and a change of the mode."""
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._reads_blocks = False
         self._names = tuple(signal.name for signal in self.signals)
@@ -178,7 +204,8 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             return
         self.safe()
         self._write(_LIVE_CURRENT, 0.0)
-        self._write(_INPUT, _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT)
+        self._configured[_INPUT] = _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT
+        self._write(_INPUT, self._configured[_INPUT])
         self._mode = mode
         self._setpoint = math.nan
 
@@ -195,18 +222,34 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         The status completes when the device reports the temperature stable; at once in current mode.
         """
         self.check(value)
-        state = self._check()
+        if self._on:
+            self._check_output(self._read(_STATUS))
+        else:
+            self._check_restart()
+        repeats = self._line.repeats
         if self._mode is TECMode.TEMPERATURE:
             self._write(_LIVE_TARGET, value)
         else:
             self._write(_LIVE_CURRENT, self._polarity * value)
         self._setpoint = value
-        if state is not _State.RUN:
-            self._switch_on()
+        if not self._on:
+            self._switch_on(repeats)
+        elif self._line.repeats != repeats:
+            self._check_output(self._read(_STATUS))
         if self._mode is TECMode.CURRENT:
             return Status.completed(self.name, self._clock)
         timeout = self._settings.stable_timeout
         return Status(self.name, self._clock, lambda: self._arrived(value), timeout=timeout)
+
+    @property
+    def watchdog(self) -> float | None:
+        """Silence of the host, s, after which the device switches its output off; None if it never does."""
+        return self._settings.watchdog or None
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were sent again since the device was connected."""
+        return self._line.repeats
 
     @property
     def output_enabled(self) -> bool:
@@ -217,7 +260,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         """Measure object and sink temperature (°C), current (A, positive heats) and voltage (V)."""
         # The status comes last: an error that comes up while the values are read invalidates them, too.
         measured, sink, current, voltage, status = self._read_block(self._measured)
-        self._judge(status)
+        self._check_output(status)
         values = (measured, sink, self._polarity * current, self._polarity * voltage)
         if not all(map(math.isfinite, values)):
             raise DeviceError(self.name, "reports a value that is not a number; check the sensors")
@@ -238,17 +281,36 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         Live enable and output stage enable are both switched off; if either fails, or the device still
         reports a running output, the emergency stop (`ES`, error 11 on the device) follows.
         """
-        failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
-        if failures or not self._is_off():
-            try:
-                self._line.order("ES")
-            except (DeviceError, RefusedError) as error:
-                failures.append(DeviceError(self.name, f"emergency stop: {error}"))
-            if not self._is_off():
-                raise self._unconfirmed("output", failures)
-        # The output is off, so whether the watchdog could be disarmed does not matter for safety.
-        with suppress(DeviceError):
-            self._write(_WATCHDOG, 0.0)
+        with self._line.in_haste():
+            failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
+            if failures or not self._is_off():
+                refused = attempt(self._stop_at_once)
+                failures += refused
+                # A line that is dead would not answer either whether the output is off.
+                dead = any(isinstance(failure, DeviceConnectionError) for failure in refused)
+                if dead or not self._is_off():
+                    unconfirmed = self._unconfirmed("output", failures)
+                    if dead:
+                        # Another line is tried then.
+                        raise DeviceConnectionError(self.name, str(unconfirmed).removeprefix(f"{self.name}: "))
+                    raise unconfirmed
+            self._on = False
+            # The output is off, so whether the watchdog could be disarmed does not matter for safety. A device that
+            # has restarted would write it to its flash.
+            if not self._restarted:
+                with suppress(DeviceError):
+                    self._write(_WATCHDOG, 0.0)
+
+    def _stop_at_once(self) -> None:
+        try:
+            self._line.order("ES")
+        except RefusedError as error:
+            raise DeviceError(self.name, f"emergency stop: {error}") from None
+
+    def _renew_line(self) -> None:
+        before = self._line
+        super()._renew_line()
+        self._line.follow(before)
 
     def reset(self) -> None:
         """Restart the device and configure it again: clears an error whose cause is gone. The output is off.
@@ -298,12 +360,19 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
             self._reads_blocks = False
         else:
             self._reads_blocks = True
-        if math.isnan(self._read_block(block)[0]):
+        sink, enable = self._read_block(Block(self._settings.channel, _SINK_TEMPERATURE, _ENABLE))
+        if math.isnan(sink):
             channel = self._settings.channel
             raise DeviceError(
                 self.name,
                 f"channel {channel} reports no sink temperature: the {self._identity.model} has no such channel, or "
                 "its sink sensor is missing; check `channel` and the sensor",
+            )
+        if enable == _STATIC_ON:
+            raise DeviceError(
+                self.name,
+                f"its output stage enable (parameter {_ENABLE.number}) is static on, with which a restart may bring "
+                "the output back without its limits; save it as static off with the maker's service software",
             )
 
     def _configure(self) -> None:
@@ -320,18 +389,25 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         ):
             self._check_allowed(key, parameter, value)
         self._polarity = 1 if self._read(_POLARITY) else -1
+        # No automatic restart after an error: what tripped stays off until the operator has looked.
+        self._configured = {
+            _SAVING_OFF: 1,
+            _INPUT: _CONTROLLER_INPUT if self._mode is TECMode.TEMPERATURE else _LIVE_INPUT,
+            _CURRENT_LIMIT: settings.current_limit,
+            _VOLTAGE_LIMIT: settings.voltage_limit,
+            _STABLE_WINDOW: settings.stable_window,
+            _STABLE_TIME: settings.stable_time,
+            _RESTART_DELAY: 0.0,
+        }
         self._write(_SAVING_OFF, 1)
         self._write(_LIVE_ENABLED, _OFF)
         self._write(_ENABLE, _OFF)
         self._write(_LIVE_CURRENT, 0.0)
-        self._write(_INPUT, _CONTROLLER_INPUT if self._mode is TECMode.TEMPERATURE else _LIVE_INPUT)
-        self._write(_CURRENT_LIMIT, settings.current_limit)
-        self._write(_VOLTAGE_LIMIT, settings.voltage_limit)
-        self._write(_STABLE_WINDOW, settings.stable_window)
-        self._write(_STABLE_TIME, settings.stable_time)
-        # No automatic restart after an error: what tripped stays off until the operator has looked.
-        self._write(_RESTART_DELAY, 0.0)
+        for parameter, value in self._configured.items():
+            if parameter is not _SAVING_OFF:
+                self._write(parameter, value)
         self._write(_WATCHDOG, 0.0)
+        self._on = self._restarted = False
         self._setpoint = math.nan
 
     def _check_allowed(self, key: str, parameter: Parameter, value: float) -> None:
@@ -342,19 +418,84 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 f"{lowest:g} to {highest:g}"
             )
 
-    def _switch_on(self) -> None:
-        if self._mode is TECMode.TEMPERATURE:
-            self._write(_LIVE_TARGET_SELECTED, 1)
-        else:
-            self._write(_LIVE_VOLTAGE, self._settings.voltage_limit)
-        self._write(_WATCHDOG, self._settings.watchdog)
-        self._write(_ENABLE, _LIVE_ENABLE)
-        self._write(_LIVE_ENABLED, 1)
-        self._check()
+    def _switch_on(self, repeats: int) -> None:
+        """Switch the output on; `repeats` is the number before the first request that belongs to it."""
+        for parameter, value in self._output_settings().items():
+            # The set-point has been sent already.
+            if parameter not in (_LIVE_TARGET, _LIVE_CURRENT):
+                self._write(parameter, value)
+        # A device that restarts from here on is not enabled by the last step alone.
+        if self._line.repeats != repeats:
+            self._check_settings(self._configured | self._output_settings())
+        try:
+            self._write(_LIVE_ENABLED, 1)
+            self._on = True
+            for _ in range(_LOOKS):
+                if self._check() is _State.RUN:
+                    break
+                self._clock.sleep(_LOOK_INTERVAL)
+            else:
+                self._check_output(self._read(_STATUS))
+            if self._line.repeats != repeats:
+                self._check_unchanged()
+        except BaseException:
+            attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
+            raise
+
+    def _output_settings(self) -> dict[Parameter, float]:
+        """Return what the parameters are while the output is on, beside those that are configured."""
+        settings: dict[Parameter, float] = (
+            {_LIVE_TARGET: self._setpoint, _LIVE_TARGET_SELECTED: 1}
+            if self._mode is TECMode.TEMPERATURE
+            else {_LIVE_CURRENT: self._polarity * self._setpoint, _LIVE_VOLTAGE: self._settings.voltage_limit}
+        )
+        return settings | {_WATCHDOG: self._settings.watchdog, _ENABLE: _LIVE_ENABLE}
+
+    def _check_unchanged(self) -> None:
+        """Raise `DeviceError` unless the device is as the driver left it: not restarted, without an error."""
+        self._check_settings(self._configured | (self._output_settings() if self._on else {}))
+        self._check_output(self._read(_STATUS))
+
+    def _check_settings(self, expected: Mapping[Parameter, float]) -> None:
+        """Raise `DeviceError` if a parameter differs."""
+        parameters = list(expected)
+        for first in range(0, len(parameters), _BLOCK):
+            block = Block(self._settings.channel, *parameters[first : first + _BLOCK])
+            for parameter, found in zip(block.parameters, self._read_block(block), strict=True):
+                if found != (single(expected[parameter]) if parameter.real else expected[parameter]):
+                    self._check_restart()
+                    raise DeviceError(
+                        self.name,
+                        f"its {parameter.title} (parameter {parameter.number}) is {found:g} where "
+                        f"{expected[parameter]:g} was written; end the program that changed it, then connect again",
+                    )
+
+    def _check_restart(self) -> None:
+        """Raise `DeviceRestartedError` if the device saves to its flash again, as it does after each restart."""
+        self._restarted = self._restarted or not self._read(_SAVING_OFF)
+        if self._restarted:
+            raise DeviceRestartedError(
+                self.name,
+                f"the {self._identity.model} has restarted, and its limits and settings are lost; find out why its "
+                "power failed, then connect again",
+            )
+
+    def _check_output(self, status: float) -> None:
+        """Raise what is wrong with a device status, also if the output is on that was off, or off that was on."""
+        running = self._judge(status) is _State.RUN
+        if running is self._on:
+            return
+        self._check_restart()
+        raise DeviceError(
+            self.name,
+            f"its output is {'on' if running else 'off'} although it was switched {'on' if self._on else 'off'}; end "
+            "the program that has switched it, and bring the device into its safe state",
+        )
 
     def _arrived(self, target: float) -> bool:
         if self._read(_STABILITY) != _STABLE:
             if self._check() is not _State.RUN:
+                self._check_restart()
                 raise DeviceError(self.name, f"the output was switched off before it reached {target:g} °C")
             return False
         # The device may still report the previous target as stable; three windows leave room for noise.
@@ -398,7 +539,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return DeviceError(
             self.name,
             f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
-            "then switch the device off and on to clear the error",
+            f"then clear it by `bench recover RIG {self.name}`, or switch the device off and on",
         )
 
     def _read(self, parameter: Parameter) -> float:
@@ -439,3 +580,27 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 self.name,
                 f"refused {value:g} as its {parameter.title} (parameter {parameter.number}): {error}{allowed}",
             ) from None
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare limits with the settings, and temperature limits with the device's error thresholds.
+
+        Raises DeviceError if the device does not answer.
+        """
+        settings = self._settings
+        findings = []
+        for key, parameter, wanted, unit in (
+            ("current_limit", _CURRENT_LIMIT, settings.current_limit, "A"),
+            ("voltage_limit", _VOLTAGE_LIMIT, settings.voltage_limit, "V"),
+        ):
+            found = self._read(parameter)
+            advice = "" if found == single(wanted) else f"another program changed it from {wanted:g} {unit}; end that"
+            findings.append(Finding(key, f"{found:g} {unit} in the device", advice))
+        lowest, highest = self._read(_LOWEST_OBJECT), self._read(_HIGHEST_OBJECT)
+        low, high = settings.temperature_limits
+        advice = ""
+        if self._mode is TECMode.TEMPERATURE and not lowest <= low <= high <= highest:
+            advice = f"set temperature_limits, {low:g} to {high:g} °C, within the thresholds of errors 137 and 138"
+        text = f"{lowest:g} to {highest:g} °C of the object, up to {self._read(_HIGHEST_SINK):g} °C of the sink"
+        findings.append(Finding("error thresholds", text, advice))
+        text = f"{self._read(_SUPPLY_VOLTAGE):.3g} V, base plate {self._read(_BASE_TEMPERATURE):.3g} °C"
+        return (*findings, Finding("power supply", text))

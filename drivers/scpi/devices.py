@@ -6,6 +6,7 @@ Sources: IEEE 488.2-1992, SCPI-99; the messages themselves are those of the rig 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import partial
 from typing import ClassVar, Self
 
@@ -22,14 +23,16 @@ from bench.command_table import (
     written_number,
 )
 from bench.devices import Identity, Limits, Signal, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import GeneralActuator, GeneralSensor, VoltageSupply
 from drivers.device import LineDevice, attempt
-from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, signals_of
+from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
 from drivers.scpi.line import LineTable, TextLine
+from drivers.serial_line import RESENDS
 
 _UNKNOWN = Identity("unknown", "unknown", "unknown", "unknown")
 _DONE = template("1")
+_MESSAGE_TIME = 0.1  # s that a message takes on a slow line
 
 
 class SensorSettings(LineTable):
@@ -47,10 +50,31 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
     """
 
     Settings: ClassVar[type[LineTable]] = SensorSettings
+    _earlier_repeats = 0
 
     def __init__(self, name: str, settings: LineTable, clock: Clock, line: TextLine) -> None:
         GeneralSensor.__init__(self, name, clock, _UNKNOWN, signals_of(settings.signals))
         self._settings, self._line = settings, line
+
+    @property
+    def repeats(self) -> int:
+        """Number of questions that were repeated since the device was connected, as their answers were lost."""
+        return self._earlier_repeats + self._line.repeats
+
+    def _renew_line(self) -> None:
+        repeats = self.repeats
+        super()._renew_line()
+        self._earlier_repeats = repeats
+
+    def close(self) -> None:
+        """Release the line; an output that is on stays on."""
+        super().close()
+        self._line.lost = False
+
+    def _begin(self) -> None:
+        """Open the line again if it was lost."""
+        if self._line.lost:
+            self.reconnect()
 
     @classmethod
     def _open_line(cls, name: str, settings: LineTable, clock: Clock) -> TextLine:
@@ -60,7 +84,9 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
         settings = self._settings
         if not settings.identity_query:
             return Identity("unknown", "text instrument", settings.port, "unknown")
-        answer, _ = self._line.ask(settings.identity_query, template(ANY_TEXT))
+        # An attempt to reconnect is one question, as others wait for it.
+        resends = RESENDS if self._identity is _UNKNOWN else 0
+        answer, _ = self._line.ask(settings.identity_query, template(ANY_TEXT), resends)
         if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
                 self.name,
@@ -79,13 +105,18 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
 
     def measure_quantities(self) -> dict[str, float]:
         """Measure every quantity, and read the queue of errors."""
+        self._begin()
         values = self._ask_quantities()
         self._line.raise_errors("measuring")
         return values
 
     def glance(self) -> dict[str, float]:
         """Measure every signal, without a look at the queue of errors; values by signal name."""
+        self._begin()
         return {f"{self.name}_{name}": value for name, value in self._ask_quantities().items()}
+
+    def _check_unchanged(self) -> None:
+        self._ask_quantities()
 
     def _ask_quantities(self) -> dict[str, float]:
         tables = self._settings.signals
@@ -101,10 +132,12 @@ class SCPISensor(LineDevice[LineTable, TextLine], GeneralSensor):
 class SCPIActuator(SCPISensor, GeneralActuator):
     """A text instrument that takes a set-point, and measures its signals.
 
-    `set` sends the set-point, reads it back, switches the output on if it is off, and reads the queue of errors. A
-    reading finds an output that is off or a set-point that has changed without the bench: a protection or a restart.
-    `safe` sends the messages of `output.off` and asks for the state; an instrument without such a question has to
-    answer at least, and to report no error. There is no watchdog: what was set stays when the bench dies.
+    `set` checks that the output is as it was left, sends the set-point, reads it back, and reads the queue of
+    errors. It switches an output on that is off, after the messages of `setup` once more. A reading finds an output
+    that is off or a set-point that has changed without the bench: a protection, or a restart if both are lost, after
+    which nothing is set. `safe` sends the messages of `output.off` and asks for the state, over a line of its own if
+    the one in use does not answer; an instrument without such a question has to answer at least, and to report no
+    error. There is no watchdog: what was set stays when the bench dies.
     """
 
     Settings: ClassVar[type[LineTable]] = ActuatorSettings
@@ -125,6 +158,26 @@ class SCPIActuator(SCPISensor, GeneralActuator):
         self._table, self._output = table, settings.output
         self._command = template(table.command)
         self._on = False
+        self._left = math.nan
+        self._restart: DeviceRestartedError | None = None
+
+    @property
+    def safe_within(self) -> float:
+        """Longest time of `safe` on a line that works, s: its messages and one question."""
+        settings = self._settings
+        return settings.timeout + (len(self._output.off) + 2) * (settings.delay + _MESSAGE_TIME)
+
+    def _begin(self) -> None:
+        if self._restart is not None:
+            raise self._restart
+        super()._begin()
+
+    def _check_unchanged(self) -> None:
+        if self._restart is not None:
+            raise self._restart
+        self._check_output()
+        if not math.isnan(self._left):
+            self._check_setpoint(self._left)
 
     def _start(self) -> None:
         super()._start()
@@ -140,36 +193,67 @@ class SCPIActuator(SCPISensor, GeneralActuator):
 
     def send(self, value: float) -> Status:
         """Send a set-point that is within the limits, and switch the output on if it is off."""
-        table = self._table
+        self._begin()
+        table, was_on = self._table, self._on
+        self._check_output()
+        if not was_on:
+            self._check_left()
+            for message in self._settings.setup:
+                self._line.tell(message)
         number = value / table.scale
+        self._left = math.nan
         self._line.tell(self._command.fill({self._command.names[0]: number}))
         if self._settings.completion_query:
             self._line.ask(self._settings.completion_query, _DONE)
         self._check_setpoint(value)
-        if not self._on:
+        self._left = value
+        if not was_on:
             for message in self._output.on:
                 self._line.tell(message)
         self._line.raise_errors(f"set-point {value:g} {table.unit}")
         self._on = True
-        self._check_output()
+        if not was_on:
+            self._check_output()
         return arrival_of(self.name, self._clock, table, value, self._ask_quantities)
 
     def switch_off(self) -> None:
-        """Send the messages that reach the safe state, and have the instrument confirm it."""
+        """Send the messages that reach the safe state, and have the instrument confirm it.
+
+        A line that does not answer, or did not before, is opened again, and everything is tried once more.
+        """
         self._on = False
-        failures = attempt(*(partial(self._line.tell, message) for message in self._output.off))
-        confirm = self._confirm_off if self._output.query else partial(self._line.raise_errors, "switching off")
-        failures += attempt(confirm)
-        if not self._output.query and self._settings.identity_query:
-            failures += attempt(partial(self._line.ask, self._settings.identity_query, template(ANY_TEXT)))
+        failures = self._try_off()
+        if any(isinstance(failure, DeviceConnectionError) for failure in failures):
+            with suppress(DeviceError):
+                self._renew_line()
+                failures = self._try_off(fresh=True)
         if failures:
             raise DeviceError(
                 self.name,
                 f"does not confirm that its output is off ({failures[-1]}); switch it off by hand",
             )
 
+    def _try_off(self, *, fresh: bool = False) -> list[DeviceError]:
+        """Try everything that switches off; return what failed."""
+        if any(self._command.match(message) for message in self._output.off):
+            self._left = math.nan
+        failures = attempt(*(partial(self._line.tell, message) for message in self._output.off))
+        if failures:
+            return failures
+        # What comes first on a fresh line may be an answer from before; on one out of step it certainly may.
+        in_step = self._line.in_step and (not fresh or self._line.find_identity())
+        if not in_step:
+            return [DeviceConnectionError(self.name, f"does not answer at {self._settings.port}")]
+        return attempt(self._confirm_off if self._output.query else self._confirm_heard)
+
+    def _confirm_heard(self) -> None:
+        self._line.raise_errors("switching off")
+        if self._settings.identity_query:
+            self._line.ask(self._settings.identity_query, template(ANY_TEXT), 0)
+
     def measure_quantities(self) -> dict[str, float]:
         """Measure every quantity, check output and set-point, and read the queue of errors."""
+        self._begin()
         values = self._ask_quantities()
         if self._on and not math.isnan(self._setpoint):
             self._check_output()
@@ -180,8 +264,7 @@ class SCPIActuator(SCPISensor, GeneralActuator):
     def glance(self) -> dict[str, float]:
         """Measure every signal and check the output; values by signal name."""
         values = super().glance()
-        if self._on:
-            self._check_output()
+        self._check_output()
         return values
 
     def _ask_number(self, query: str, form: Template) -> float:
@@ -193,25 +276,53 @@ class SCPIActuator(SCPISensor, GeneralActuator):
         table = self._table
         if not table.query:
             return
-        written = written_number(self._command, value / table.scale) * table.scale
+        written = self._written(value)
         found = self._ask_number(table.query, template(table.reply))
         wrong = abs(found - written) > table.tolerance
         check_read_back(self.name, table, written, found, "; ".join(self._line.errors()) if wrong else "")
 
     def _check_output(self) -> None:
-        """Raise `DeviceError` if the output is off without the bench."""
-        output = self._output
-        if output.query and not self._reads_on():
+        """Raise `DeviceError` if an output that was switched on is off without the bench.
+
+        One that has lost its set-point as well has restarted: `DeviceRestartedError`, now and at each later call. Of
+        an output that cannot be asked for, only the set-point is looked at.
+        """
+        if not self._on:
+            return
+        if not self._output.query:
+            self._check_left()
+        elif not self._reads_on():
             reported = "; ".join(self._line.errors())
-            raise DeviceError(
+            problem = output_lost(self.name, setpoint_lost=self._has_lost_setpoint(), reported=reported)
+            if isinstance(problem, DeviceRestartedError):
+                self._restart = problem
+            raise problem
+
+    def _check_left(self) -> None:
+        """Raise `DeviceRestartedError`, now and at each later call, if the set-point is not what was left."""
+        if self._has_lost_setpoint():
+            self._restart = DeviceRestartedError(
                 self.name,
-                "its output is off although it was switched on: a protection, a restart, or another program"
-                f"{f' ({reported})' if reported else ''}",
+                f"does not have the set-point {self._left:g} {self._table.unit} any more: it has restarted, or was "
+                "set by another program or by hand; connect again",
             )
+            raise self._restart
+
+    def _has_lost_setpoint(self) -> bool:
+        """Return whether the instrument has another set-point than was sent, as far as that can be asked."""
+        table = self._table
+        if not table.query or math.isnan(self._left):
+            return False
+        found = self._ask_number(table.query, template(table.reply))
+        return not abs(found - self._written(self._left)) <= table.tolerance * (1.0 + 1e-9)
+
+    def _written(self, value: float) -> float:
+        """Return a set-point as its message says it."""
+        return written_number(self._command, value / self._table.scale) * self._table.scale
 
     def _reads_on(self) -> bool:
         output = self._output
-        answer, _ = self._line.ask(output.query, template(ANY_TEXT))
+        answer, _ = self._line.ask(output.query, template(ANY_TEXT), RESENDS if self._on else 0)
         if _is(answer, output.is_off):
             return False
         if _is(answer, output.is_on):

@@ -30,6 +30,13 @@ class TextLine:
 
     Questions are sent three times at most, other messages once.
 
+    Attributes
+    ----------
+    lost : bool
+        Whether the line itself failed, so that it has to be opened again.
+    repeats : int
+        Number of questions that were repeated.
+
     Raises
     ------
     DeviceConnectionError
@@ -42,6 +49,9 @@ class TextLine:
         self._clock = clock
         self._free_at = clock.now()
         self._in_step = True
+        self.lost = False
+        self.repeats = 0
+        self._end, self._encoding, self._delay = settings.write_terminator, settings.encoding, settings.delay
         self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
 
     def close(self) -> None:
@@ -51,16 +61,19 @@ class TextLine:
     def tell(self, message: str) -> None:
         """Send a message that has no answer."""
         self._clock.sleep_until(self._free_at)
-        text = f"{message}{self._settings.write_terminator}"
         try:
-            self._transport.write(text.encode(self._settings.encoding))
+            self._transport.write(f"{message}{self._end}".encode(self._encoding))
+        except DeviceConnectionError:
+            self.lost = True
+            raise
         except UnicodeEncodeError as error:
             raise DeviceError(
                 self._device, f"{message!r} cannot be written in {self._settings.encoding}: {error}"
             ) from None
-        self._free_at = self._clock.now() + self._settings.delay
+        if self._delay:
+            self._free_at = self._clock.now() + self._delay
 
-    def ask(self, question: str, form: Template) -> tuple[str, dict[str, float]]:
+    def ask(self, question: str, form: Template, resends: int = RESENDS) -> tuple[str, dict[str, float]]:
         """Return the answer to a question, and the numbers in it by name.
 
         Raises
@@ -71,7 +84,8 @@ class TextLine:
             If the last answer is not of that form, or says that the number is infinite or none.
         """
         answer: str | None = None
-        for _ in range(1 + RESENDS):
+        for attempt in range(1 + resends):
+            self.repeats += attempt > 0
             if not self._in_step and not self._catch_up():
                 continue
             answer = self._exchange(question)
@@ -83,7 +97,7 @@ class TextLine:
             raise DeviceConnectionError(
                 self._device,
                 f"no answer to {question!r} within {self._settings.timeout:g} s at {self._settings.port}, after "
-                f"{1 + RESENDS} requests; check power, cable, address, speed and terminators",
+                f"{1 + resends} request{'s' if resends else ''}; check power, cable, address, speed and terminators",
             )
         raise DeviceError(
             self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; is it out of its range?"
@@ -121,13 +135,26 @@ class TextLine:
         return self._receive()
 
     def _receive(self) -> str | None:
-        answer = self._transport.read()
-        return None if answer is None else answer.decode(self._settings.encoding, "backslashreplace").strip()
+        try:
+            answer = self._transport.read()
+        except DeviceConnectionError:
+            self.lost = True
+            raise
+        return None if answer is None else answer.decode(self._encoding, "backslashreplace").strip()
+
+    @property
+    def in_step(self) -> bool:
+        """Whether no answer to an earlier question can come any more."""
+        return self._in_step
 
     def _catch_up(self) -> bool:
         """Return whether the line is in step again, so that no late answer can come any more."""
         if not any(self._receive() is None for _ in range(_MOST_STRAY)):
             raise DeviceConnectionError(self._device, f"the line {self._settings.port} does not fall silent")
+        return self.find_identity()
+
+    def find_identity(self) -> bool:
+        """Ask for the identity where it is known, and pass over what comes before it; return whether it came."""
         form = template(self._settings.identity)
         # An identity that is not known cannot be told from a late answer.
         if self._settings.identity_query and form.text != ANY_TEXT:

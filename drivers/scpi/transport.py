@@ -102,14 +102,14 @@ class SerialTransport:
         try:
             self._port.write(message)
         except OSError as error:  # pyserial's errors among them
-            raise lost_line(self._device, self._settings, error, ", then connect again") from None
+            raise lost_line(self._device, self._settings, error) from None
 
     def read(self) -> bytes | None:
         """Return the next answer without its terminator, or None when none has come within the time-out."""
         try:
             answer: bytes = self._port.read_until(self._terminator, LONGEST_ANSWER)
         except OSError as error:
-            raise lost_line(self._device, self._settings, error, ", then connect again") from None
+            raise lost_line(self._device, self._settings, error) from None
         return answer.removesuffix(self._terminator) if answer.endswith(self._terminator) else None
 
     def discard(self) -> None:
@@ -117,7 +117,7 @@ class SerialTransport:
         try:
             self._port.reset_input_buffer()
         except OSError as error:
-            raise lost_line(self._device, self._settings, error, ", then connect again") from None
+            raise lost_line(self._device, self._settings, error) from None
 
     def close(self) -> None:
         """Release the line."""
@@ -171,7 +171,7 @@ class VisaTransport:
         try:
             self._resource.write_raw(message)
         except self._errors as error:
-            raise lost_line(self._device, self._settings, error, ", then connect again") from None
+            raise lost_line(self._device, self._settings, error) from None
 
     def read(self) -> bytes | None:
         """Return the next answer without its terminator, or None when none has come within the time-out."""
@@ -180,7 +180,7 @@ class VisaTransport:
         except self._errors as error:
             if getattr(error, "error_code", None) == self._timed_out:
                 return None
-            raise lost_line(self._device, self._settings, error, ", then connect again") from None
+            raise lost_line(self._device, self._settings, error) from None
         return answer.removesuffix(self._terminator)
 
     def discard(self) -> None:

@@ -26,7 +26,9 @@ Assumptions, where these say nothing:
   or a value that is not allowed gives exception 3.
 - The device identity reads as 1410 and the device status as the decimal number that the command IS returns.
 - A power cycle brings back what was saved of filter and motion detection (WP) and of zero tracking (CS), and forgets
-  zero and tare.
+  zero and tare. The instrument is silent for 0.4 s after it, the time that the manual gives for the command SR.
+- A request that only reads the set-up makes no conversion, unless something was written before: a look at the set-up
+  leaves the noise of a record as it was.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ import numpy as np
 from bench.devices import Identity
 from bench.errors import DeviceError
 from bench.roles import LoadCell
-from sim_devices.instruments.emulated import EmulatedDevice
+from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
@@ -61,6 +63,9 @@ SET_TARE = 0x08
 RESET_MAXIMUM = 0x10
 TRIGGER_HOLD = 0x20
 
+START_TIME = 0.4
+"""Silence after the instrument is switched on, s (Technical Manual, command SR)."""
+
 DEVICE_ID = 1410
 ADC_BITS = 24
 _FULL_SCALE = 2 ** (ADC_BITS - 1)
@@ -75,6 +80,7 @@ _LEAST_LAGS = 1e-6  # and less than which nothing changes
 _COARSE = 0.05  # s between two looks for the motion detection
 _STILL_POLL = 0.05
 _STILL_TIMEOUT = 10.0
+_SET_UP_REGISTERS = frozenset((0x2106, 0x2110))
 _COMMANDS = RESET_ZERO | SET_ZERO | RESET_TARE | SET_TARE | RESET_MAXIMUM | TRIGGER_HOLD
 _SAVE_CALIBRATION = 0x0002
 _SAVE_SET_UP = 0x0004
@@ -128,7 +134,7 @@ class _SetUp:
     motion_time: int = 1000  # ms
 
 
-class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
+class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     """A DAD 141.1 with its load cell: the role, called directly, and a bank of Modbus registers for the wire.
 
     Every access brings the world up to date first and holds its lock. The filter sees the force as often as
@@ -217,7 +223,9 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
         self._span = _SATURATION * max(self._highest, -self._lowest) / self._scale
         self._peak = 0
         self._set_map_up(self._register_map())
+        self._written = True
         self.power_cycle()
+        self._starts_at = -math.inf
         world.add(self)
 
     # The power supply.
@@ -233,6 +241,22 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
             self._tare_set = False
             self._settle()
             self._peak = self._gross
+            self._starts_at = self.world.time + START_TIME
+
+    @property
+    def answering(self) -> bool:
+        """Whether the instrument answers requests at the clock's present time."""
+        return self.plugged_in and self.world.clock.now() >= self._starts_at
+
+    def freeze(self) -> None:
+        """Let the converter stand still, and with it everything that is read."""
+        with self.world.at_present():
+            self.frozen = True
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        with self.world.at_present():
+            self.frozen = False
 
     # The conversion.
 
@@ -365,11 +389,27 @@ class EmulatedDAD141(EmulatedDevice, RegisterInstrument, LoadCell):
 
     # The registers.
 
+    def read_registers(self, address: int, count: int) -> list[int]:
+        """Return `count` registers from `address` on, of one instant; errors are those of the base class."""
+        if address in _SET_UP_REGISTERS and not self._written:
+            reads = self._known_reads.get((address, count)) or self._reads(address, count)
+            with self.world.lock:
+                return list(
+                    reads.words.unpack_from(reads.values.pack(*[read() for read in reads.read]), reads.skipped)
+                )
+        return super().read_registers(address, count)
+
+    def write_registers(self, address: int, values: list[int]) -> None:
+        """Write registers from `address` on, in whole values; errors are those of the base class."""
+        super().write_registers(address, values)
+        self._written = True
+
     def _begin(self) -> None:
         self.world.lock.acquire()
         try:
             self.world.advance()
             self._convert()
+            self._written = False
         except BaseException:
             self.world.lock.release()
             raise

@@ -3,7 +3,7 @@
 The register map is that of `ljm_constants.json` (repository labjack/ljm_constants), the behaviour that of the
 LabJack T-series datasheet: 14.1.7 (average, minimum and maximum), 14.3.0 (T7 analog inputs), 15.0 (analog
 outputs), A-3-1 (noise and resolution), the datasheet of the LJTick-DAC, and the descriptions of the watchdog
-registers in the map.
+registers in the map; LabJack's letter of volatility for USER_RAM, which is a plain memory here, as no script runs.
 
 Assumptions, where these say nothing:
 
@@ -90,6 +90,7 @@ _LONGEST_WAIT = 100_000  # µs
 _LONGEST_SETTLING = 50_000.0
 _LONGEST_STREAM_SETTLING = 4_400.0
 _TDACS = 23
+_USER_RAM = 40
 _DIOS = 23
 _DAC_TOP = 5.0
 _TDAC_TOP = 10.0
@@ -216,6 +217,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.firmware = firmware
         self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._normals = normals(rng)
+        self._held: dict[int, float] | None = None
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
@@ -237,6 +239,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._dio_direction = 0
         self._dio_inhibit = 0
         self._last_error = 0
+        self._user_ram = [0.0] * _USER_RAM
         self._expired_at = None
         self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
 
@@ -252,6 +255,14 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for follow in self._restart_followers:
                 follow()
             self._lead()
+
+    def freeze(self) -> None:
+        """Let each input stand at its next reading."""
+        self._held = {}
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._held = None
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -435,13 +446,19 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             return settings.burst
 
     def _convert(self, channel: int, scale: _Scale | None = None) -> float:
+        held = self._held
+        if held is not None and channel in held:
+            return held[channel]
         settings = self._inputs[channel]
         volts = self._sources[channel]()
         if settings.negative != SINGLE_ENDED:
             volts -= self._sources[settings.negative]()
         noise, step, lowest, highest = scale or settings.scale
         volts = round((volts + noise * next(self._normals)) / step) * step
-        return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        volts = volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        if held is not None:
+            held[channel] = volts
+        return volts
 
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default
@@ -558,6 +575,9 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 "AIN#_RESOLUTION_INDEX", 41500, "U16", lambda n: inputs[n].resolution, self._set_index, CHANNELS
             ),
             Register("AIN#_SETTLING_US", 42000, "F32", lambda n: inputs[n].settling, self._set_settling, CHANNELS),
+            Register(
+                "USER_RAM#_U32", 46100, "U32", self._user_ram.__getitem__, self._user_ram.__setitem__, _USER_RAM
+            ),
             Register("LAST_ERR_DETAIL", 55000, "U16", lambda: self._last_error),
             Register("TEST", 55100, "U32", lambda: 0x00112233),
             Register("TEST_FLOAT32", 55124, "F32", lambda: -9999.0),

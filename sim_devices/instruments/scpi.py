@@ -27,6 +27,7 @@ LONGEST_MESSAGE = 4096
 """Characters after which a message without an end is dropped."""
 
 _LONGEST_QUEUE = 20
+_MOST_HEARD = 64
 
 Action = Callable[[], str | None]
 """Carries a message out, and returns the answer, or None if it has none."""
@@ -84,8 +85,11 @@ class EmulatedTextInstrument(EmulatedInstrument):
         self.table = table
         self._meters = meters
         self._drive = drive
+        self._frozen: dict[str, float] | None = None
         self.errors: deque[str] = deque()
         self._actions = self._all_actions()
+        # The same, by messages as they were sent: a host sends the same few again and again.
+        self._heard: dict[str, Action] = {}
         self._identity = Identity("emulated", "text instrument", name, "emulated")
         self.power_cycle()
 
@@ -129,8 +133,10 @@ class EmulatedTextInstrument(EmulatedInstrument):
 
     def obey(self, line: str) -> str | None:
         """Carry out the messages of one line; return their answers, or None if there is none."""
-        messages = [line] if self._action(line) is not None else line.split(";")
-        answers = [self._obey_one(message) for message in messages if message.strip()]
+        act = self._action(line)
+        if act is not None:
+            return act() or None
+        answers = [self._obey_one(message) for message in line.split(";") if message.strip()]
         return ";".join(answer for answer in answers if answer is not None) or None
 
     def _obey_one(self, message: str) -> str | None:
@@ -142,8 +148,13 @@ class EmulatedTextInstrument(EmulatedInstrument):
 
     def _action(self, message: str) -> Action | None:
         """Return what a message makes the instrument do, or None if it is unknown."""
+        known = self._heard.get(message)
+        if known is not None:
+            return known
         normal = _normal(message)
         known = self._actions.get(normal)
+        if known is not None and len(self._heard) < _MOST_HEARD:
+            self._heard[message] = known
         if known is None and isinstance(self.table, ActuatorTable):
             # Of many spaces, a pattern tries every division.
             numbers = template(self.table.setpoint.command).match(normal)
@@ -224,15 +235,30 @@ class EmulatedTextInstrument(EmulatedInstrument):
         if self._drive is not None:
             self._drive(self.output)
 
+    def freeze(self) -> None:
+        """Let each signal stand at its next reading; the output is obeyed as ever."""
+        self._frozen = {}
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._frozen = None
+
     def _reading(self, name: str) -> float:
+        if self._frozen is None:
+            return self._measured(name)
+        if name not in self._frozen:
+            self._frozen[name] = self._measured(name)
+        return self._frozen[name]
+
+    def _measured(self, name: str) -> float:
         meter = self._meters[name]
         return _rounded(meter.read() + self._draw(meter.noise), meter.resolution)
 
     def _answer_signals(self, names: list[str]) -> str:
         tables = self.table.signals
-        reply = template(tables[names[0]].reply)
         values = {name: self._reading(name) / tables[name].scale for name in names}
-        return reply.fill({**values, VALUE: values[names[0]]})
+        values[VALUE] = values[names[0]]
+        return template(tables[names[0]].reply).fill(values)
 
     def _answer_error(self) -> str:
         if self.errors:

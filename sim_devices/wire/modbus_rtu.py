@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from sim_devices.instruments.emulated import LineFaults
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import RegisterBank, answer
 
@@ -75,12 +76,14 @@ class ModbusRtuServer(WireServer):
     """
 
     protocol = "Modbus RTU"
+    has_addresses = True
 
     def __init__(self, bank: RegisterBank, address: int = 1) -> None:
         if not 1 <= address <= 247:
             raise ValueError(f"address: allowed are 1 to 247, got {address}")
         self._bank = bank
         self._address = address
+        self._line = bank if isinstance(bank, LineFaults) else None
         self._received = bytearray()
 
     @property
@@ -88,8 +91,16 @@ class ModbusRtuServer(WireServer):
         """Address of the instrument on its line."""
         return self._address
 
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return a reply of the next address."""
+        body = bytes((answer[0] % 247 + 1,)) + answer[1:-2]
+        return body + crc16(body)
+
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the line, in pieces of any size; return the replies to whole requests."""
+        if self._line is not None and not self._line.answering:
+            self._received.clear()
+            return b""
         if not self._received and self._is_request(data):
             # The usual case: a client that sends one request and waits.
             return self._serve(data)
@@ -134,7 +145,10 @@ class ModbusRtuServer(WireServer):
         if address not in (self._address, BROADCAST):
             return b""
         reply = bytes([address]) + answer(self._bank, frame[1:-2])
-        return b"" if address == BROADCAST else reply + crc16(reply)
+        if address == BROADCAST:
+            return b""
+        sealed = reply + crc16(reply)
+        return sealed if self._line is None else self._line.transmit(sealed)
 
 
 def _length(received: bytes | memoryview) -> int | None:

@@ -23,6 +23,12 @@ class TextServer(WireServer):
         """Take bytes from the host, in pieces of any size; return what the instrument sends."""
         instrument = self._instrument
         with instrument.world.lock:
+            if not self._received and data.find(self._end_of_message) == len(data) - len(self._end_of_message) >= 0:
+                # The usual case: a host that sends one message and waits.
+                if not instrument.answering:
+                    return b""
+                instrument.attend()
+                return self._serve(data[: -len(self._end_of_message)])
             *messages, rest = (self._received + data).split(self._end_of_message)
             if not instrument.answering:
                 self._received = b""

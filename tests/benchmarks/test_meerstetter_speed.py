@@ -1,4 +1,7 @@
-"""CPU time of a reading in process: a TEC by one request and by five, and a load cell. Prints, asserts a ratio."""
+"""CPU time of a reading in process: a TEC by one request and by five, a load cell, a text instrument.
+
+Prints, asserts a ratio.
+"""
 
 import time
 from collections.abc import Callable
@@ -9,12 +12,15 @@ import pytest
 from bench.clock import VirtualClock
 from drivers.flintec_dad141 import FlintecDAD141
 from drivers.meerstetter import MeerstetterTEC
+from drivers.scpi import SCPISensor
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.wire import WireServer
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
+from sim_devices.wire.text import TextServer
 from sim_devices.world import World
 
 pytestmark = pytest.mark.benchmark
@@ -79,6 +85,20 @@ def of_load_cell() -> float:
         protocol_emulated.unregister("speed-load")
 
 
+def of_meter() -> float:
+    clock = VirtualClock()
+    signals = {"current": {"query": "MEAS:CURR?", "unit": "A"}}
+    settings = SCPISensor.Settings(port="emulated://speed-meter", identity="EXAMPLE,{any}", signals=signals)
+    meter = EmulatedTextInstrument(
+        "meter", World(Block(), clock), settings, {"current": Meter(lambda: 0.1)}, np.random.default_rng(1)
+    )
+    protocol_emulated.register("speed-meter", TextServer(meter), clock)
+    try:
+        return cpu_time(SCPISensor.connect("meter", settings, clock).glance)
+    finally:
+        protocol_emulated.unregister("speed-meter")
+
+
 class OldFirmware(WireServer):
     """A device that does not know `?VX`: it takes the request for one that makes no sense."""
 
@@ -95,9 +115,10 @@ def test_readings_in_process(capsys):
         ("TEC, one request", of_tec(MeComServer)),
         ("TEC, five requests", of_tec(OldFirmware)),
         ("load cell, one request", of_load_cell()),
+        ("text instrument, one query", of_meter()),
     ]
     with capsys.disabled():
         print("\nCPU time of a reading on an emulated line")
         for name, microseconds in rows:
-            print(f"  {name:24s} {microseconds:6.1f} µs")
+            print(f"  {name:26s} {microseconds:6.1f} µs")
     assert rows[1][1] > 2.0 * rows[0][1]

@@ -1,16 +1,19 @@
 """What every load cell promises, run against the emulated device and the driver on its wire."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from emulated_bench import Bench, Given, OnABench, check_reproducible, serial_port
+from emulated_bench import Bench, Given, OnABench, check_reproducible, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
+from bench.contracts.faults import LineLostContract, RestartedInstrumentContract
 from bench.contracts.roles import LoadCellContract
 from bench.errors import DeviceError
 from drivers.flintec_dad141 import FlintecDAD141
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141, reading_interval
+from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
 from sim_devices.world import World
 
@@ -18,8 +21,11 @@ NOISE = 5e-4 * math.sqrt(4 / 17)  # of one reading at filter setting 3, N
 STEP = 1e-3  # of the display, N
 
 
+@dataclass(kw_only=True)
 class CellBench(Bench):
     """A load cell and the specimen whose force the test sets."""
+
+    port: str = ""
 
     def put(self, force):
         """Load the cell and let its filter settle."""
@@ -27,7 +33,7 @@ class CellBench(Bench):
         self.clock.sleep(2.0)
 
 
-def connected(kind, stack, seed=1, **options):
+def connected(kind, stack, seed=1, settings=None, **options):
     specimen, clock = Given(), VirtualClock()
     instrument = EmulatedDAD141(
         "load",
@@ -37,14 +43,14 @@ def connected(kind, stack, seed=1, **options):
         zero_tracking=0,
         **options,
     )
-    cell = instrument
+    cell, port = instrument, ""
     if kind == "driver":
         port, _ = serial_port(stack, ModbusRtuServer(instrument), clock)
         calibration = {key: options[key] for key in ("newtons_per_unit", "zero_newtons") if key in options}
-        settings = FlintecDAD141.Settings(port=port, force_limits=(-70.0, 70.0), **calibration)
-        cell = FlintecDAD141.connect("load", settings, clock)
+        given = FlintecDAD141.Settings(port=port, force_limits=(-70.0, 70.0), **calibration, **(settings or {}))
+        cell = FlintecDAD141.connect("load", given, clock)
     stack.callback(cell.close)
-    return CellBench(clock=clock, device=cell, instrument=instrument, plant=specimen)
+    return CellBench(clock=clock, device=cell, instrument=instrument, plant=specimen, port=port)
 
 
 class TestContract(OnABench, LoadCellContract):
@@ -59,6 +65,68 @@ class TestContract(OnABench, LoadCellContract):
 
     @pytest.fixture
     def resolution(self):
+        return 2e-3
+
+
+@over_the_wire
+class TestAfterARestart(OnABench, RestartedInstrumentContract):
+    @pytest.fixture(params=["untared", "tared"])
+    def device(self, stack, kind, request):
+        self.bench = connected(kind, stack, settings={"filter": 6})
+        self.bench.put(10.0)
+        if request.param == "tared":
+            self.bench.device.tare()
+        return self.bench.device
+
+    @pytest.fixture(params=[0.0, 0.1, 0.5, 3600.0])
+    def restart(self, request):
+        def power_cycle():
+            self.bench.instrument.power_cycle()
+            self.bench.clock.sleep(request.param)
+
+        return power_cycle
+
+
+@over_the_wire
+class TestLineLost(OnABench, LineLostContract):
+    @pytest.fixture
+    def bench(self, stack, kind):
+        bench = connected(kind, stack, settings={"filter": 6})
+        bench.put(10.0)
+        return bench
+
+    @pytest.fixture(params=["unplugged", "silent"])
+    def cut(self, bench, request):
+        if request.param == "silent":
+            return bench.instrument.unplug
+        return lambda: unregister(bench.port)
+
+    @pytest.fixture
+    def mend(self, bench):
+        def mend():
+            bench.instrument.plug_in()
+            unregister(bench.port)
+            register(bench.port.removeprefix("emulated://"), ModbusRtuServer(bench.instrument), bench.clock)
+
+        return mend
+
+    @pytest.fixture
+    def restart(self, bench):
+        return bench.instrument.power_cycle
+
+    @pytest.fixture
+    def exchange(self, bench):
+        def exchange():
+            bench.instrument.serial_number += 1
+
+        return exchange
+
+    @pytest.fixture
+    def truth(self, bench):
+        return lambda: {"load_force": bench.plant.value}
+
+    @pytest.fixture
+    def tolerance(self):
         return 2e-3
 
 

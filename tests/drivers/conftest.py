@@ -1,13 +1,18 @@
 """What the tests of several drivers share: the class `Script` of a module at its `PORT`, and a TCP port."""
 
 import socket
+import sys
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
 from bench.clock import VirtualClock
 from sim_devices.protocol_emulated import register, unregister
+
+# The line with faults, which the tests of several drivers share.
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture

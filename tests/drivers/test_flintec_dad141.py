@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock, WallClock
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.flintec_dad141 import FlintecDAD141
 from drivers.pymodbus_client import SerialClient
 from sim_devices import protocol_emulated
@@ -165,21 +165,28 @@ def test_every_setting_is_described():
 
 
 READ = bytes.fromhex("01 03 35 00 00 05 8A 05")
+READ_INPUT = sealed("01 04 35 00 00 05")
+LOOK_AT_FILTER = (sealed("01 03 21 06 00 02"), sealed("01 04 21 06 00 02"))
 
 
 def test_byte_vectors(bench):
     cell = bench.cell()
     bench.put(0.5)
+    cell.glance()
     bench.tap.sent.clear()
     cell.tare()
-    assert bench.tap.sent == [READ, bytes.fromhex("01 06 20 61 00 08 D2 12"), READ]
+    assert bench.tap.sent == [READ_INPUT, bytes.fromhex("01 06 20 61 00 08 D2 12"), READ]
     bench.put(12.0)
+    cell.glance()
     bench.tap.sent.clear()
     replies = []
     bench.tap.alter = lambda reply: replies.append(reply) or reply
-    assert cell.glance() == {"load_force": 11.5}
-    assert bench.tap.sent == [READ]
-    assert replies == [bytes.fromhex("01 03 0A 41 40 00 00 41 38 00 00 00 30 E8 A4")]
+    assert [cell.glance() for _ in range(2)] == [{"load_force": 11.5}] * 2
+    assert bench.tap.sent == [READ_INPUT, READ]
+    assert replies == [
+        sealed("01 04 0A 41 40 00 00 41 38 00 00 00 30"),
+        bytes.fromhex("01 03 0A 41 40 00 00 41 38 00 00 00 30 E8 A4"),
+    ]
 
 
 def test_connecting_sets_filter_and_tare_and_saves_nothing(bench):
@@ -208,7 +215,36 @@ def test_one_request_a_reading(bench):
     cell = bench.cell(samples=7)
     bench.tap.sent.clear()
     cell.measure()
-    assert bench.tap.sent == [READ] * 7
+    assert bench.tap.sent == [READ_INPUT, READ] * 3 + [READ_INPUT]
+
+
+def test_after_a_pause_the_filter_is_looked_at_once_and_costs_a_measurement_no_time(bench):
+    cell = bench.cell(samples=3)
+    for pause, looks in ((0.29, 0), (0.31, 1), (2.0, 1)):
+        bench.clock.sleep(pause)
+        bench.tap.sent.clear()
+        begin = bench.clock.now()
+        cell.measure()
+        assert sum(frame in LOOK_AT_FILTER for frame in bench.tap.sent) == looks
+        assert len(bench.tap.sent) == 3 + looks
+        assert bench.clock.now() - begin == pytest.approx(0.25 + 23 * 10 / 115200)
+
+
+def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
+    records = []
+    for looks in (0, 5):
+        bench = Bench(noise=0.1)
+        record = []
+        for _ in range(10):
+            bench.clock.sleep(0.1)
+            record += bench.instrument.read_registers(0x3500, 5)
+            for _ in range(looks):
+                bench.clock.sleep(0.01)
+                assert bench.instrument.read_registers(0x2106, 2) == [0, 3]
+            bench.clock.sleep(0.05 - 0.01 * looks)
+        records.append(record)
+        protocol_emulated.unregister("load")
+    assert records[0] == records[1]
 
 
 @pytest.mark.parametrize(
@@ -273,6 +309,9 @@ def test_a_line_that_is_pulled_out(bench, pseudo_terminal):
         cell = FlintecDAD141.connect("load", Settings(port=path, timeout=10.0, force_limits=WIDE), WallClock())
     with pytest.raises(DeviceConnectionError, match=r"^load: lost the line .*check the cable"):
         cell.glance()
+    with pytest.raises(DeviceConnectionError, match=f"^load: cannot open {path}"):
+        cell.glance()
+    cell.close()
     with pytest.raises(DeviceConnectionError, match="closed"):
         cell.glance()
 
@@ -386,7 +425,7 @@ def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
     try:
         with pytest.raises(DeviceError, match=rf"zero tracking is on \(ZT = {tracking}\).*CE, ZT 0 and CS"):
             bench.cell()
-        assert all(frame[1] == 3 for frame in bench.tap.sent)
+        assert all(frame[1] in (3, 4) for frame in bench.tap.sent)
         bench.instrument.write_registers(0x2204, [0, 17])
         bench.instrument.write_registers(0x2122, [0, 0])
         bench.instrument.write_registers(0x2066, [0x0002])
@@ -411,10 +450,10 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
 def test_another_address_is_silent(bench):
     begin = bench.clock.now()
     with pytest.raises(
-        DeviceConnectionError, match=r"no good reply within 0\.2 s at emulated://load, address 2, after 2"
+        DeviceConnectionError, match=r"no good reply within 0\.2 s at emulated://load, address 2, after 3"
     ):
         bench.cell(address=2)
-    assert bench.clock.now() - begin == pytest.approx(0.6, abs=0.01)  # two requests, and a pause for late replies
+    assert bench.clock.now() - begin == pytest.approx(0.7, abs=0.01)  # three requests, and two short silences
 
 
 # Bad lines
@@ -436,27 +475,43 @@ def test_a_scheme_that_does_not_exist():
         FlintecDAD141.connect("load", Settings(port="nowhere://load", force_limits=WIDE), VirtualClock())
 
 
-def test_an_instrument_that_falls_silent(bench, caplog, capfd):
+def test_an_instrument_that_falls_silent_and_comes_back(bench, caplog, capfd):
     cell = bench.cell()
+    bench.put(3.0)
     with caplog.at_level(logging.INFO):
         bench.tap.alter = lambda _: b""
-        with pytest.raises(DeviceConnectionError, match=r"no good reply.*check power, cable"):
-            cell.measure()
-        bench.tap.alter = lambda reply: reply
-        # It may have been switched off and lost its filter: what it says now is not to be trusted.
         for take in (cell.measure, cell.glance, cell.tare, cell.clear_tare):
-            with pytest.raises(DeviceConnectionError, match="closed; connect again"):
+            with pytest.raises(DeviceConnectionError, match=r"no good reply.*check power, cable"):
                 take()
+        bench.tap.alter = lambda reply: reply
+        assert cell.measure() == {"load_force": 3.0}
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
-    assert bench.cell().glance() == {"load_force": 0.0}
 
 
-def test_an_emulated_line_that_is_unplugged(bench):
+def test_a_silence_in_which_the_instrument_restarted_is_found(bench):
+    cell = bench.cell(filter=6)
+    bench.tap.alter = lambda _: b""
+    with pytest.raises(DeviceConnectionError):
+        cell.glance()
+    bench.instrument.power_cycle()
+    bench.tap.alter = lambda reply: reply
+    for take in (cell.glance, cell.measure, cell.tare, cell.clear_tare, cell.glance):
+        with pytest.raises(DeviceRestartedError, match=r"^load: the instrument was switched off.*\(FL\) is 3, not 6"):
+            take()
+    cell.safe()
+
+
+def test_an_emulated_line_that_is_unplugged_and_plugged_in_again(bench):
     cell = bench.cell()
+    bench.put(3.0)
     protocol_emulated.unregister("load")
     with pytest.raises(DeviceConnectionError, match=r"lost the line emulated://load \(.*unplugged\)"):
         cell.glance()
+    with pytest.raises(DeviceConnectionError, match="cannot open emulated://load"):
+        cell.glance()
+    protocol_emulated.register("load", bench.tap, bench.clock)
+    assert cell.glance() == {"load_force": 3.0}
 
 
 def test_closed_is_closed(bench):
@@ -638,6 +693,31 @@ def test_a_tare_of_somebody_else_is_noticed(bench):
         cell.measure()
     cell.tare()
     assert cell.glance()["load_force"] == pytest.approx(0.0)
+
+
+def test_another_tare_of_somebody_else_is_noticed(bench):
+    cell = bench.cell()
+    bench.put(5.0)
+    cell.tare()
+    bench.put(7.0)
+    assert cell.glance() == {"load_force": 2.0}
+    bench.instrument.tare()
+    for take in (cell.measure, cell.glance):
+        with pytest.raises(DeviceError, match="has another tare than the bench set, 7 not 5"):
+            take()
+    cell.tare()
+    bench.put(8.5)
+    assert cell.glance()["load_force"] == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("weight", [1e-3, 0.123, 59.999, -59.999])
+def test_a_tare_is_the_same_whatever_the_digits_of_the_weights(bench, weight):
+    cell = bench.cell()
+    bench.put(weight)
+    cell.tare()
+    for step in range(200):
+        bench.put(-50.0 + 0.517 * step)
+        cell.glance()
 
 
 @pytest.mark.parametrize(("action", "message"), [("tare", "took no tare"), ("clear_tare", "keeps its tare")])

@@ -6,13 +6,14 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
 from drivers.labjack_t7 import T7HighVoltageSupply, T7PositionSensor, T7Switch, T7Thermistor
 from drivers.labjack_t7.lines import DigitalOutput
 from drivers.labjack_t7.registers import (
@@ -26,9 +27,11 @@ from drivers.labjack_t7.registers import (
     LabJackT7,
 )
 from sim_devices.instruments.labjack_t7 import EmulatedT7
+from sim_devices.protocol_emulated import register, unregister
 from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.modbus import DEVICE_FAILURE, RegisterError
+from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
 Settings = T7PositionSensor.Settings
@@ -37,6 +40,7 @@ ThermistorSettings = T7Thermistor.Settings
 SupplySettings = T7HighVoltageSupply.Settings
 
 ALL_LINES = 0x7FFFFF
+OWNER = ("read", 46178, 2)
 RATIOMETRIC = {"readout": "ratiometric", "channels": (2, 3), "position_limits": (0.0, 0.035)}
 
 
@@ -363,9 +367,9 @@ def test_byte_vectors_of_a_ratiometric_sensor():
     volts = "4020 0000 40a0 0000"  # 2.5 and 5 V
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", f"0001 0000 000b 01 03 08 {volts}"),  # AIN2, AIN3
-        (  # AIN2_EF_READ_A, B and C, of two inputs each
-            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
-            f"0002 0000 001a 01 4c {volts} 4024 0000 40a4 0000 401c 0000 409c 0000",
+        (  # AIN2_EF_READ_A, B and C, of two inputs each, and USER_RAM39_U32
+            "0002 0000 0012 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04 00 b462 02",
+            f"0002 0000 001e 01 4c {volts} 4024 0000 40a4 0000 401c 0000 409c 0000 0000 0000",
         ),
     )
     with Scripted(*exchanges) as server:
@@ -378,47 +382,58 @@ def test_byte_vectors_of_a_ratiometric_sensor():
     assert len(server.received) == len(exchanges)
 
 
-def test_byte_vectors_of_a_switch():
+def test_byte_vectors_of_a_switch(monkeypatch):
+    monkeypatch.setattr("secrets.randbelow", lambda _: 0x12345677)
     exchanges = (
         ("0001 0000 0006 01 03 d73c 0002", "0001 0000 0007 01 03 04 0011 2233"),  # TEST
         ("0002 0000 0006 01 03 d754 0002", "0002 0000 0007 01 03 04 c61c 3c00"),  # TEST_FLOAT32
         ("0003 0000 0006 01 03 ea60 0002", "0003 0000 0007 01 03 04 40e0 0000"),  # PRODUCT_ID 7
         ("0004 0000 0006 01 03 ea64 0002", "0004 0000 0007 01 03 04 3f80 0000"),  # FIRMWARE 1
         ("0005 0000 0006 01 03 ea7c 0002", "0005 0000 0007 01 03 04 1c03 dcb9"),  # SERIAL
+        ("0006 0000 0006 01 03 b462 0002", "0006 0000 0007 01 03 04 0000 0000"),  # USER_RAM39_U32
+        ("0007 0000 000b 01 10 b462 0002 04 1234 5678", "0007 0000 0006 01 10 b462 0002"),
+        ("0008 0000 0006 01 03 ea7c 0002", "0008 0000 0007 01 03 04 1c03 dcb9"),  # SERIAL
         # DIO5 low, then DIO_DIRECTION and DIO_STATE
         (
-            "0006 0000 0010 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02",
-            "0006 0000 000a 01 4c 0000 0020 007f ffdf",
+            "0009 0000 0014 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02 00 b462 02",
+            "0009 0000 000e 01 4c 0000 0020 007f ffdf 1234 5678",
         ),
         (  # WATCHDOG_ENABLE, _TIMEOUT_S, _STRICT_ENABLE, _DIO_ENABLE, _STATE, _DIRECTION, _INHIBIT
-            "0007 0000 001e 01 4c 00 f0a0 02 00 f0a4 02 00 f0aa 02 00 f0be 02 00 f0c0 02 00 f0c2 02 00 f0c4 02",
-            "0007 0000 001e 01 4c" + 14 * " 0000",
+            "000a 0000 0022 01 4c 00 f0a0 02 00 f0a4 02 00 f0aa 02 00 f0be 02 00 f0c0 02 00 f0c2 02 00 f0c4 02"
+            " 00 b462 02",
+            "000a 0000 0022 01 4c" + 14 * " 0000" + " 1234 5678",
         ),
         # Only what differs; it is off, so that it need not be switched off.
         (
-            "0008 0000 000e 01 4c 01 f0a4 02 0000 0003 00 f0a4 02",
-            "0008 0000 0006 01 4c 0000 0003",
+            "000b 0000 0012 01 4c 01 f0a4 02 0000 0003 00 f0a4 02 00 b462 02",
+            "000b 0000 000a 01 4c 0000 0003 1234 5678",
         ),  # WATCHDOG_TIMEOUT_S
         (
-            "0009 0000 000e 01 4c 01 f0be 02 0000 0001 00 f0be 02",
-            "0009 0000 0006 01 4c 0000 0001",
+            "000c 0000 0012 01 4c 01 f0be 02 0000 0001 00 f0be 02 00 b462 02",
+            "000c 0000 000a 01 4c 0000 0001 1234 5678",
         ),  # WATCHDOG_DIO_ENABLE
         (
-            "000a 0000 000e 01 4c 01 f0c2 02 0000 0020 00 f0c2 02",
-            "000a 0000 0006 01 4c 0000 0020",
+            "000d 0000 0012 01 4c 01 f0c2 02 0000 0020 00 f0c2 02 00 b462 02",
+            "000d 0000 000a 01 4c 0000 0020 1234 5678",
         ),  # WATCHDOG_DIO_DIRECTION
         (
-            "000b 0000 000e 01 4c 01 f0c4 02 007f ffdf 00 f0c4 02",
-            "000b 0000 0006 01 4c 007f ffdf",
+            "000e 0000 0012 01 4c 01 f0c4 02 007f ffdf 00 f0c4 02 00 b462 02",
+            "000e 0000 000a 01 4c 007f ffdf 1234 5678",
         ),  # _DIO_INHIBIT
-        ("000c 0000 000e 01 4c 01 f0a0 02 0000 0001 00 f0a0 02", "000c 0000 0006 01 4c 0000 0001"),  # WATCHDOG_ENABLE
+        (
+            "000f 0000 0012 01 4c 01 f0a0 02 0000 0001 00 f0a0 02 00 b462 02",
+            "000f 0000 000a 01 4c 0000 0001 1234 5678",
+        ),  # WATCHDOG_ENABLE
         # DIO5 high
         (
-            "000d 0000 0010 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02",
-            "000d 0000 000a 01 4c 0000 0020 007f ffff",
+            "0010 0000 0014 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02 00 b462 02",
+            "0010 0000 000e 01 4c 0000 0020 007f ffff 1234 5678",
         ),
-        ("000e 0000 0006 01 03 0af0 0002", "000e 0000 0007 01 03 04 007f ffff"),  # glance
-        ("000f 0000 0006 01 03 0af0 0002", "000f 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+        ("0011 0000 000a 01 4c 00 0af0 02 00 b462 02", "0011 0000 000a 01 4c 007f ffff 1234 5678"),  # glance
+        (
+            "0012 0000 000a 01 4c 00 0af0 02 00 b462 02",
+            "0012 0000 000a 01 4c 007f ffff 1234 5678",
+        ),  # close: on, so nothing changes
     )
     with Scripted(*exchanges) as server:
         settings = SwitchSettings(port=server.address, line=5, watchdog=3)
@@ -432,9 +447,9 @@ def test_byte_vectors_of_a_switch():
 def test_byte_vectors_of_a_thermistor():
     exchanges = (
         ("0001 0000 0006 01 03 0004 0004", "0001 0000 000b 01 03 08 3fa0 0000 4020 0000"),  # AIN2 1.25 V, AIN3 2.5 V
-        (  # AIN2_EF_READ_A, B and C, of two inputs each
-            "0002 0000 000e 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04",
-            "0002 0000 001a 01 4c 3fa0 0000 4020 0000 3fb0 0000 4024 0000 3f90 0000 401c 0000",
+        (  # AIN2_EF_READ_A, B and C, of two inputs each, and USER_RAM39_U32
+            "0002 0000 0012 01 4c 00 1b5c 04 00 1c88 04 00 1db4 04 00 b462 02",
+            "0002 0000 001e 01 4c 3fa0 0000 4020 0000 3fb0 0000 4024 0000 3f90 0000 401c 0000 0000 0000",
         ),
     )
     with Scripted(*exchanges) as server:
@@ -459,7 +474,7 @@ def test_byte_vectors_of_a_high_voltage_supply():
         ("0003 0000 0006 01 03 0000 0006", f"0003 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
         ("0004 0000 000b 01 10 7530 0002 04 3f80 0000", "0004 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
         ("0005 0000 000b 01 10 7530 0002 04 bf80 0000", "0005 0000 0006 01 10 7530 0002"),  # TDAC0 -1 V
-        ("0006 0000 0006 01 03 0000 0006", f"0006 0000 000f 01 03 0c {on}"),  # glance
+        ("0006 0000 000a 01 4c 00 0000 06 00 b462 02", f"0006 0000 0012 01 4c {on} 0000 0000"),  # glance
         ("0007 0000 000b 01 10 7530 0002 04 0000 0000", "0007 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
         # DIO5 low
         (
@@ -467,7 +482,7 @@ def test_byte_vectors_of_a_high_voltage_supply():
             "0008 0000 000a 01 4c 0000 0020 007f ffdf",
         ),
         ("0009 0000 0006 01 03 0000 0006", f"0009 0000 000f 01 03 0c {off}"),
-        ("000a 0000 0006 01 03 0af0 0002", "000a 0000 0007 01 03 04 007f ffff"),  # close: on, so nothing changes
+        ("000a 0000 0006 01 4c 00 0af0 02", "000a 0000 0006 01 4c 007f ffff"),  # close: on, so nothing changes
     )
     with Scripted(*exchanges) as server:
         settings = SupplySettings(port=server.address, line=5)
@@ -649,16 +664,85 @@ def test_a_silent_host_costs_one_timeout():
             T7PositionSensor.connect("psd", Settings(port=f"127.0.0.1:{port}", timeout=0.1), VirtualClock())
 
 
-def test_a_connection_that_breaks_stays_broken(bench):
-    sensor = bench.sensor()
+@pytest.mark.parametrize("restarted", [False, True])
+def test_the_next_request_goes_over_another_connection(bench, restarted):
+    bench.wire()
+    devices = supply, psd, fan = bench.supply(), bench.sensor(channels=(3,)), bench.switch(line=6)
+    supply.set(12.0)
+    fan.set(1.0)
     bench.server.close()
-    with pytest.raises(DeviceConnectionError, match="connection broke"):
-        sensor.measure()
-    # A T7 that came back would have lost its settings: readings from it must not be taken for good ones.
+    for device in devices:
+        with pytest.raises(DeviceConnectionError, match=f"^{device.name}: .*(connection broke|cannot connect)"):
+            device.measure()
+    if restarted:
+        bench.t7.power_cycle()
     with ModbusTcpServer(bench.t7, port=bench.server.port):
-        for take in (sensor.measure, sensor.glance):
-            with pytest.raises(DeviceConnectionError, match="connect again"):
-                take()
+        for device in devices:
+            for _ in range(2):
+                if restarted:
+                    for call in (device.measure, device.glance, device.reconnect):
+                        with pytest.raises(DeviceRestartedError, match=f"^{device.name}: .* has restarted"):
+                            call()
+                else:
+                    device.reconnect()
+                    device.measure()
+                    device.glance()
+        if restarted:
+            for value, actuator in ((11.0, supply), (1.0, fan)):
+                with pytest.raises(DeviceRestartedError):
+                    actuator.set(value)
+                actuator.safe()
+                # What made it safe does not make it usable.
+                for call in (actuator.measure, actuator.glance, partial(actuator.set, value)):
+                    with pytest.raises(DeviceRestartedError):
+                        call()
+            assert bench.t7.tdac_volts(0) == 0.0
+            assert not bench.t7.dio_level(5)
+            assert not bench.t7.dio_level(6)
+        else:
+            assert supply.measure()["hv_voltage"] == pytest.approx(12.0, abs=0.1)
+            assert supply.setpoint == 12.0
+            assert fan.measure() == {"fan_state": 1.0}
+            assert supply.can_play(psd, 1e-3)
+        for device in devices:
+            device.close()
+
+
+def test_a_lost_connection_is_masked_and_counted(bench):
+    bench.wire()
+    lost = ModbusTcpInstrument(bench.t7)
+    address = register("t7-lost", lost, bench.clock)
+    supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=address, line=5), bench.clock)
+    psd = T7PositionSensor.connect("psd", Settings(port=address, channels=(3,)), bench.clock)
+    calls = psd.measure, psd.glance, supply.measure, supply.glance, lambda: supply.set(10.0), lambda: supply.set(5.0)
+    for count, call in enumerate(calls, 1):
+        lost.end_connections()
+        call()
+        assert psd.repeats + supply.repeats == count
+    assert bench.t7.tdac_volts(0) == pytest.approx(5.0 / 20.0, abs=1e-3)
+    unregister(address)
+
+
+def test_another_program_that_takes_the_instrument_is_told(bench):
+    bench.wire()
+    supply, psd, fan = bench.supply(), bench.sensor(channels=(3,)), bench.switch(line=6)
+    bench.t7.write_value(46178, 4711)
+    for call in (supply.glance, supply.measure, psd.measure, fan.glance, fan.measure, lambda: fan.set(1.0)):
+        with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
+            call()
+    supply.safe()
+    fan.safe()
+
+
+def test_another_instrument_at_the_address_is_refused(bench):
+    psd = bench.sensor()
+    bench.server.close()
+    other = EmulatedT7(bench.world, {}, rng=np.random.default_rng(3), serial_number=470054321)
+    with (
+        ModbusTcpServer(other, port=bench.server.port),
+        pytest.raises(DeviceError, match=r"psd: is another instrument now: .* 470054321; it was 470012345"),
+    ):
+        psd.glance()
 
 
 def test_closed_is_closed(bench):
@@ -822,7 +906,7 @@ def test_requests_of_a_sensor_of_two_channels(bench, kind, volts, settings):
         assert recorded.requests == [("read", 4, 4)]
         recorded.requests.clear()
         sensor.measure()
-        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4)]
+        assert recorded.requests == [("read", 7004, 4), ("read", 7304, 4), ("read", 7604, 4), OWNER]
         sensor.close()
 
 
@@ -914,18 +998,18 @@ def test_requests_of_a_high_voltage_supply(bench):
             return list(recorded.requests)
 
         send, look = ("write", 30000, 2), ("read", 0, 6)
-        enable = [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2)]
+        enable = [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2), OWNER]
         assert asked(lambda: supply.set(10.0)) == [send, *enable, look, send]
         assert asked(lambda: supply.set(11.0)) == [send]
-        assert asked(supply.glance) == [look]
-        assert asked(supply.measure) == [("read", 7000, 6), ("read", 7300, 6), ("read", 7600, 6)]
+        assert asked(supply.glance) == [look, OWNER]
+        assert asked(supply.measure) == [("read", 7000, 6), ("read", 7300, 6), ("read", 7600, 6), OWNER]
         bench.clock.sleep(0.099)
         assert asked(lambda: supply.set(12.0)) == [send]
         bench.clock.sleep(0.001)
-        assert asked(lambda: supply.set(13.0)) == [look, send]
+        assert asked(lambda: supply.set(13.0)) == [look, OWNER, send]
         assert asked(lambda: supply.set(0.1)) == [send]
         bench.clock.sleep(0.05)
-        assert asked(supply.safe) == [send, *enable, look]
+        assert asked(supply.safe) == [send, *enable[:-1], look]
         supply.close()
 
 
@@ -938,7 +1022,7 @@ def test_a_loop_that_looks_sends_in_one_request(bench):
             bench.clock.sleep(0.01)
             supply.glance()
             supply.set(0.1 * step)
-        assert len(recorded.requests) == 400
+        assert len([entry for entry in recorded.requests if entry != OWNER]) == 400
         supply.close()
 
 
@@ -1188,13 +1272,13 @@ def test_requests_of_a_switch(bench):
         switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
         recorded.requests.clear()
         switch.glance()
-        assert recorded.requests == [("read", 2800, 2)]
+        assert recorded.requests == [("read", 2800, 2), OWNER]
         recorded.requests.clear()
         switch.measure()
-        assert recorded.requests == [("read", 2850, 2), ("read", 2800, 2)]
+        assert recorded.requests == [("read", 2850, 2), ("read", 2800, 2), OWNER]
         recorded.requests.clear()
         switch.set(1.0)
-        assert recorded.requests == [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2)]
+        assert recorded.requests == [("write", 2005, 1), ("read", 2850, 2), ("read", 2800, 2), OWNER]
         switch.close()
 
 
@@ -1232,7 +1316,7 @@ def test_a_watchdog_that_is_set_up_already_is_not_written(bench):
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
         switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
-        assert [address for kind, address, _ in recorded.requests if kind == "write"] == [2005]
+        assert [address for kind, address, _ in recorded.requests if kind == "write"] == [OWNER[1], 2005]
         switch.close()
 
 
@@ -1272,9 +1356,9 @@ def test_after_a_power_cycle_every_device_has_to_connect_again(bench):
     bench.t7.power_cycle()
     assert bench.t7.dio_level(5)  # an input that is pulled high: what it enables needs a pull-down
     assert not bench.t7.dio_level(5, pulled_down=True)
-    with pytest.raises(DeviceConnectionError, match=r"fan: .*connect again"):
+    with pytest.raises(DeviceRestartedError, match=r"fan: .*connect again"):
         switch.measure()
-    with pytest.raises(DeviceConnectionError, match=r"psd: the connection to .* is closed; connect again, so that"):
+    with pytest.raises(DeviceRestartedError, match=r"psd: .*connect again"):
         sensor.measure()
     assert bench.sensor().measure()
     assert bench.switch().measure() == {"fan_state": 0.0}

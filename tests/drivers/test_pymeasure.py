@@ -9,6 +9,7 @@ import pytest
 from bench.clock import VirtualClock
 from bench.command_table import ActuatorTable
 from bench.contracts.devices import ActuatorContract
+from bench.contracts.faults import ActuatorLineLostContract, RestartedActuatorContract
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 from bench.rig_file import load_rig
 from drivers.pymeasure import Adapter, InstrumentLine, SensorAdapter, parse_action
@@ -42,14 +43,15 @@ def on_protocol(instrument, kind=Adapter, table=TABLE):
 
 def test_what_is_sent_is_what_pymeasure_expects():
     exchange = [
+        ("OUTPut 0", None),
         (":SOUR:CURR 1.5", None),
         (":SOUR:VOLT 12.5", None),
         (":SOUR:VOLT?", "12.500"),
         ("OUTPut 1", None),
         ("OUTPut?", "1"),
+        ("OUTPut?", "1"),
         (":SOUR:VOLT 3", None),
         (":SOUR:VOLT?", "3.000"),
-        ("OUTPut?", "1"),
         (":MEAS:VOLT?", "3.001"),
         (":MEAS:CURR?", "0.25"),
         ("OUTPut?", "1"),
@@ -86,7 +88,7 @@ def test_what_is_no_number_is_an_error(exchange, text):
 
 
 def test_a_set_point_that_is_not_taken_is_an_error():
-    exchange = [(":SOUR:CURR 1.5", None), (":SOUR:VOLT 12", None), (":SOUR:VOLT?", "5")]
+    exchange = [("OUTPut 0", None), (":SOUR:CURR 1.5", None), (":SOUR:VOLT 12", None), (":SOUR:VOLT?", "5")]
     with (
         expected_protocol(Keithley2260B, exchange) as instrument,
         pytest.raises(DeviceError, match="reads its set-point back as 5 V, not 12 V"),
@@ -195,6 +197,93 @@ class TestContractOverTCP(ActuatorContract):
     @pytest.fixture
     def identity(self):
         return "EXAMPLE 2260B, serial number emulated, firmware unknown"
+
+
+class TestRestart(RestartedActuatorContract):
+    @pytest.fixture
+    def device(self, supply):
+        return supply
+
+    @pytest.fixture
+    def set_points(self):
+        return 7.5, 22.5
+
+    @pytest.fixture
+    def restart(self, instrument):
+        return instrument.power_cycle
+
+    @pytest.fixture
+    def output(self, instrument):
+        return lambda: instrument.output
+
+    def test_a_restart_at_rest_is_found_before_the_output_goes_on(self, in_use, restart, instrument, monkeypatch):
+        """The safe state has set 0 V as a restart does, so none is seen; but the limits are written first."""
+        in_use.safe()
+        restart()
+        sent, obey = [], instrument.obey
+        monkeypatch.setattr(instrument, "obey", lambda line: sent.append(line) or obey(line))
+        in_use.set(6.0)
+        assert sent.index(":SOUR:CURR 1.5") < sent.index(":SOUR:VOLT 6") < sent.index("OUTPut 1")
+
+
+class TestLineLost(ActuatorLineLostContract):
+    @pytest.fixture
+    def device(self, supply):
+        return supply
+
+    @pytest.fixture
+    def set_points(self):
+        return 7.5, 22.5
+
+    @pytest.fixture
+    def restart(self, instrument):
+        return instrument.power_cycle
+
+    @pytest.fixture
+    def output(self, instrument):
+        return lambda: instrument.output
+
+    @pytest.fixture
+    def cut(self, supply, monkeypatch):
+        def cut():
+            supply._line.instrument.adapter.connection.close()
+            monkeypatch.setattr("drivers.pymeasure.instrument_class", unreachable)
+
+        def unreachable(reference):
+            raise OSError("the cable is out")
+
+        return cut
+
+    @pytest.fixture
+    def mend(self, monkeypatch):
+        return monkeypatch.undo
+
+    @pytest.fixture
+    def exchange(self, instrument):
+        def exchange():
+            instrument._actions["*IDN?"] = lambda: "EXAMPLE,2260B,another"
+            instrument._heard.clear()
+
+        return exchange
+
+    @pytest.fixture
+    def truth(self, instrument):
+        return lambda: {"supply_voltage": instrument.output, "supply_current": 0.1 * instrument.output}
+
+    @pytest.fixture
+    def tolerance(self):
+        return 1e-6
+
+
+def test_the_safe_state_is_reached_over_a_fresh_line(supply, instrument):
+    for found_before in (False, True):
+        supply.set(5.0)
+        supply._line.instrument.adapter.connection.close()
+        if found_before:
+            with pytest.raises(DeviceConnectionError):
+                supply.measure()
+        supply.safe()
+        assert instrument.output == 0.0
 
 
 def test_an_output_that_goes_off_is_found(supply, instrument):

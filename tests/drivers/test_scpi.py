@@ -73,6 +73,7 @@ class Laboratory:
 
         server.receive = record
         self.answer = lambda data, usual: usual(data)
+        self.server = server
         protocol_emulated.register("scpi-test", server, self.clock)
         stack.callback(protocol_emulated.unregister, "scpi-test")
 
@@ -124,12 +125,12 @@ def test_a_set_point_is_read_back_before_the_output_goes_on(lab):
     device = lab.connect()
     device.set(12.3456).wait()
     assert lab.requests == [
-        "VOLT 12.346", "*OPC?", "VOLT?", "CURR 1.0", "OUTP ON", "SYST:ERR?", "OUTP?",
+        "VOLT:PROT 31", "VOLT 12.346", "*OPC?", "VOLT?", "CURR 1.0", "OUTP ON", "SYST:ERR?", "OUTP?",
     ]  # fmt: skip
     assert lab.delivered[-1] == 12.346
     lab.requests.clear()
     device.set(3.0)
-    assert "OUTP ON" not in lab.requests
+    assert lab.requests == ["OUTP?", "VOLT 3.000", "*OPC?", "VOLT?", "SYST:ERR?"]
     assert device.measure() == {"supply_voltage": 3.0, "supply_current": pytest.approx(0.25)}
 
 
@@ -182,7 +183,11 @@ def test_what_happens_without_the_bench_is_found_by_the_next_reading(lab, cause)
         lab.instrument.switch(False)
     else:
         lab.instrument.obey("VOLT 6")
-    expected = "back as 6 V, not 5 V" if cause == "front panel" else "its output is off although it was switched on"
+    expected = {
+        "power_cycle": "its output is off and its set-point is lost: it has restarted",
+        "protection": "its output is off although it was switched on",
+        "front panel": "back as 6 V, not 5 V",
+    }[cause]
     with pytest.raises(DeviceError, match=expected):
         device.measure()
 

@@ -130,6 +130,30 @@ def test_its_devices_keep_their_contracts(python, device, least):
     assert "failed" not in shown
 
 
+RESTART = """
+import bench
+from bench.errors import DeviceRestartedError
+with bench.open_rig("magnetostrictive-rod") as rig:
+    coil, source = rig.devices["coil"], rig.laboratory.coil
+    coil.set(1.5).wait()
+    coil.reconnect()
+    assert abs(coil.measure()["coil_current"] - 1.5) < 0.01
+    source._off()
+    for call in (coil.glance, lambda: coil.set(1.0), coil.reconnect):
+        try:
+            call()
+        except DeviceRestartedError as error:
+            print(error)
+        assert not source.on
+    coil.safe()
+"""
+
+
+def test_a_restart_of_its_source_is_found_and_nothing_is_set_after_it(python):
+    said = "coil: has restarted: its output is off without the bench; connect again\n"
+    assert python("-c", RESTART) == 3 * said
+
+
 WRONG = {
     '[roles.response]\nsignal = "stain"': ("roles.response.signal = 'stain': there is no such signal", "strain"),
     '[roles.drive]\nunit = "mA"': ("roles.drive.unit = 'mA': coil_current is in A",),

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
-
 from pydantic import Field
 
 from bench.clock import Clock
 from bench.devices import Identity, Limits, Signal, Status
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import GeneralActuator, GeneralSensor
+from drivers.device import LineDevice
 from drivers.serial_line import SerialSettings, lost_line, open_port
 
 _MAKER = "Example"
+_UNKNOWN = Identity(_MAKER, "unknown", "unknown", "unknown")
 
 
 class AsciiSettings(SerialSettings):
@@ -54,7 +54,10 @@ class AsciiLine:
 
     def numbers(self, question: str, count: int) -> list[float]:
         """Return the first `count` words of an answer as numbers; errors as `ask`."""
-        words = self.ask(question)
+        return self.to_numbers(question, self.ask(question), count)
+
+    def to_numbers(self, question: str, words: list[str], count: int) -> list[float]:
+        """Return the first `count` words of an answer as numbers; raise `DeviceError` if they are none."""
         try:
             return [float(words[i]) for i in range(count)]
         except (IndexError, ValueError):
@@ -72,29 +75,27 @@ class AsciiLine:
         self._port.close()
 
 
-class _Connected:
-    """What both drivers share: they open their line, check which instrument answers, and close it again."""
+class _OnALine(LineDevice[AsciiSettings, AsciiLine]):
+    """What both drivers share: how their line is opened, and which instrument is there."""
 
     KIND: str
-    _line: AsciiLine
 
     @classmethod
-    def connect(cls, name: str, settings: Any, clock: Clock) -> Self:  # noqa: ANN401 - each has its own
-        """Open the line and check the instrument; nothing moves."""
-        line = AsciiLine(name, settings)
-        try:
-            return cls(name, settings, clock, line, line.identify(cls.KIND))  # type: ignore[call-arg]
-        except BaseException:
-            line.close()
-            raise
+    def _open_line(cls, name: str, settings: AsciiSettings, clock: Clock) -> AsciiLine:  # noqa: ARG003
+        return AsciiLine(name, settings)
 
-    def close(self) -> None:
-        """Release the line; the instrument keeps its state."""
-        self._line.close()
+    def _identify(self) -> Identity:
+        return self._line.identify(self.KIND)
+
+    def _start(self) -> None:
+        """Do nothing: neither instrument has a set-up."""
 
 
-class CoilSource(_Connected, GeneralActuator):
-    """A source of the coil's current, A. `set` completes when the current has arrived; safe is the output off."""
+class CoilSource(_OnALine, GeneralActuator):
+    """A source of the coil's current, A. `set` completes when the current has arrived; safe is the output off.
+
+    Each reading says whether the output is on, so that a restart is found by the next one.
+    """
 
     KIND = "coil-source"
 
@@ -104,19 +105,27 @@ class CoilSource(_Connected, GeneralActuator):
         current_limit: float = Field(gt=0, le=5, description="greatest current of either direction, A")
         tolerance: float = Field(default=2e-3, gt=0, description="distance at which the current has arrived, A")
 
-    def __init__(self, name: str, settings: Settings, clock: Clock, line: AsciiLine, identity: Identity) -> None:
+    def __init__(self, name: str, settings: Settings, clock: Clock, line: AsciiLine) -> None:
         limits = Limits(-settings.current_limit, settings.current_limit, "A")
         current = Signal("current", "A", "coil current", 4)
-        super().__init__(name, clock, identity, [current], limits, description="current set-point")
-        self._line, self._tolerance = line, settings.tolerance
+        GeneralActuator.__init__(self, name, clock, _UNKNOWN, [current], limits, description="current set-point")
+        self._settings, self._line, self._tolerance = settings, line, settings.tolerance
+        self._on = self._restarted = False
 
     def measure_quantities(self) -> dict[str, float]:
-        """Measure the current."""
-        return {"current": self._line.numbers("I?", 1)[0]}
+        """Measure the current, and check that the output is as it was left."""
+        words = ["OFF"] if self._restarted else self._line.ask("I?")
+        if self._on and words[-1:] == ["OFF"]:
+            self._restarted = True
+        if self._restarted:
+            raise DeviceRestartedError(self.name, "has restarted: its output is off without the bench; connect again")
+        return {"current": self._line.to_numbers("I?", words, 1)[0]}
 
     def send(self, value: float) -> Status:
         """Have the source regulate the current to `value`, A."""
+        self.measure_quantities()
         self._line.ask(f"SET {value:.3f}")
+        self._on = True
         return Status(
             self.name,
             self._clock,
@@ -125,22 +134,27 @@ class CoilSource(_Connected, GeneralActuator):
         )
 
     def switch_off(self) -> None:
-        """Switch the output off, and have the source confirm it."""
-        self._line.ask("OFF")
+        """Switch the output off, over a fresh line if the one in use is gone, and have the source confirm it."""
+        self._on = False
+        try:
+            self._line.ask("OFF")
+        except DeviceConnectionError:
+            self._renew_line()
+            self._line.ask("OFF")
         if self._line.ask("I?")[-1:] != ["OFF"]:
             raise DeviceError(self.name, "does not confirm that its output is off; disconnect the coil")
 
 
-class StrainBridge(_Connected, GeneralSensor):
+class StrainBridge(_OnALine, GeneralSensor):
     """An amplifier for two strain gauges: the voltages `a` and `b` of their bridges, V."""
 
     KIND = "strain-bridge"
     Settings = AsciiSettings
 
-    def __init__(self, name: str, _: AsciiSettings, clock: Clock, line: AsciiLine, identity: Identity) -> None:
+    def __init__(self, name: str, settings: AsciiSettings, clock: Clock, line: AsciiLine) -> None:
         voltages = [Signal(f"voltage_{side}", "V", f"bridge voltage, gauge {side}", 6) for side in "ab"]
-        super().__init__(name, clock, identity, voltages)
-        self._line = line
+        GeneralSensor.__init__(self, name, clock, _UNKNOWN, voltages)
+        self._settings, self._line = settings, line
 
     def measure_quantities(self) -> dict[str, float]:
         """Measure both bridges."""

@@ -1,0 +1,74 @@
+"""A line that loses, damages, doubles and delays what an instrument answers."""
+
+import math
+
+from sim_devices.wire import WireServer
+
+KINDS = ("drop", "corrupt", "double", "delay")
+
+
+class FaultyLine(WireServer):
+    """Passes requests on, and spoils a share of the answers, each in one of several ways.
+
+    Parameters
+    ----------
+    kinds : sequence of str
+        Ways among `KINDS`.
+    share : float
+        Share of the answers that are spoilt, 0 to 1.
+    latest : float
+        Longest delay of an answer, s.
+    overtaking : bool
+        Whether an answer may come before one that was given earlier.
+    """
+
+    def __init__(self, server, clock, rng, *, kinds=KINDS, share=0.5, latest=0.5, overtaking=False):
+        self.server = server
+        self.clock = clock
+        self.rng = rng
+        self.kinds = kinds
+        self.share = share
+        self.latest = latest
+        self.overtaking = overtaking
+        self.spoilt = 0
+        self._due = []
+
+    def receive(self, data):
+        answer = self.server.receive(data)
+        now = self.clock.now()
+        if not answer:
+            return b""
+        delay = 0.0
+        if self.rng.random() < self.share:
+            self.spoilt += 1
+            kind = self.rng.choice(self.kinds)
+            if kind == "drop":
+                answer = b""
+            elif kind == "corrupt":
+                place = int(self.rng.integers(len(answer)))
+                answer = (
+                    answer[:place] + bytes([answer[place] ^ 1 << int(self.rng.integers(8))]) + answer[place + 1 :]
+                )
+            elif kind == "double":
+                self._put(now + self.rng.random() * self.latest, answer)
+            else:
+                delay = self.rng.random() * self.latest
+        if not self._due and not delay:
+            return answer
+        self._put(now + delay, answer)
+        return self.unsolicited()
+
+    def _put(self, instant, answer):
+        if self._due and not self.overtaking:
+            instant = max(instant, self._due[-1][0])
+        self._due.append((instant, answer))
+        self._due.sort(key=lambda each: each[0])
+
+    def unsolicited(self):
+        sent = b""
+        while self._due and self._due[0][0] <= self.clock.now():
+            sent += self._due.pop(0)[1]
+        return sent
+
+    def next_unsolicited(self):
+        return self._due[0][0] if self._due else math.inf
