@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from itertools import accumulate
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -77,6 +77,16 @@ _INTERNAL_VOLTAGE = 118  # 0.1 V
 _FIVE_VOLTS = 5000  # mV
 _TEMPERATURES = (32, 30)  # °C: processor, power stage
 _LONGEST_HEARTBEAT_BACKLOG = 4
+
+
+_Report = tuple[
+    list[tuple[Callable[..., Any], int]],
+    struct.Struct,
+    Callable[[list[int]], list[int]],
+    list[tuple[int, int, int]],
+]
+"""What frames carry: each reading with its subindex, the form of all data, which of the readings these are in their
+order, and identifier, beginning and end of each frame."""
 
 
 class HeatingLoad(Protocol):
@@ -153,6 +163,8 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         self._counters = [0] * CHANNELS
         self._variables = [0] * VARIABLES
         self._forms: dict[Objects, struct.Struct] = {}
+        self._reported: Sequence[tuple[int, Objects]] = ()
+        self._report: _Report
         self._pdos = ProcessDataObjects(node, send_rates, world.clock.now())
         self._held = False
         self._trips = Fault(0)
@@ -306,24 +318,28 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         objects = self._pdos.received(identifier)
         if not objects:
             return
-        forms = [FORMATS[DICTIONARY[key].kind] for key in objects]
-        if self._state is not NodeState.OPERATIONAL or len(data) < sum(form.size for form in forms):
+        form = self._form(objects)
+        if self._state is not NodeState.OPERATIONAL or len(data) < form.size:
             return
-        for (index, sub), form in zip(objects, forms, strict=True):
-            with suppress(RequestRefusedError):
-                self.write_object(index, form.unpack(data[: form.size])[0], sub)
-            data = data[form.size :]
+        for (index, sub), value in zip(objects, form.unpack_from(data), strict=True):
+            try:
+                self.write_object(index, value, sub)
+            except RequestRefusedError:
+                continue
 
     def process_data(self, *, synchronous: bool) -> list[tuple[int, bytes]]:
         """Take identifier and data of the TPDOs that a SYNC asks for, or that are due by their send rates."""
         pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
         if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
             return []
+        if pdos is not self._reported:
+            self._reported, self._report = pdos, self._report_of(pdos)
+        sources, form, places, parts = self._report
         with self.world.lock:
-            self.world.advance()
-            # Each object is measured once, however many of the frames carry it.
-            values: dict[tuple[int, int], int] = {}
-            return [(identifier, self._encoded(objects, values)) for identifier, objects in pdos]
+            self.world.advance_locked()
+            values = [read(sub) for read, sub in sources]
+        data = form.pack(*places(values))
+        return [(identifier, data[begin:end]) for identifier, begin, end in parts]
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -336,16 +352,29 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         self._quiet_until = instant - 1e-6
         return instant
 
-    def _encoded(self, objects: Objects, values: dict[tuple[int, int], int]) -> bytes:
-        """Return objects as a frame carries them; those that are missing in `values` are measured."""
+    def _form(self, objects: Objects) -> struct.Struct:
+        """Return how a frame carries some objects."""
         form = self._forms.get(objects)
         if form is None:
             codes = (FORMATS[DICTIONARY[key].kind].format[1:] for key in objects)
             form = self._forms[objects] = struct.Struct("<" + "".join(codes))
-        for key in objects:
-            if key not in values:
-                values[key] = self._readings[key[0]](key[1])
-        return form.pack(*[values[key] for key in objects])
+        return form
+
+    def _report_of(self, pdos: Sequence[tuple[int, Objects]]) -> _Report:
+        """Return what frames carry; each object is measured once, however many of them carry it."""
+        carried = tuple(key for _, objects in pdos for key in objects)
+        keys = [*dict.fromkeys(carried)]
+        places = [keys.index(key) for key in carried]
+        ends = [*accumulate(self._form(objects).size for _, objects in pdos)]
+        parts = [
+            (identifier, begin, end)
+            for (identifier, _), begin, end in zip(pdos, [0, *ends], ends, strict=False)
+        ]
+        sources = [(self._readings[index], sub) for index, sub in keys]
+        return sources, self._form(carried), lambda values: [values[place] for place in places], parts
+
+    def _readings_changed(self) -> None:
+        self._reported = ()
 
     # Faults.
 
@@ -511,7 +540,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         return faults
 
     def _channel_flags(self) -> ChannelFlag:
-        return self._channel_trips | (ChannelFlag.AMPS_LIMIT if self._limiting else ChannelFlag(0))
+        return self._channel_trips | ChannelFlag.AMPS_LIMIT if self._limiting else self._channel_trips
 
     def _apply(self) -> None:
         """Bring the output to what command, watchdog, limits and faults make of it."""

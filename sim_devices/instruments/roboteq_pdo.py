@@ -99,6 +99,7 @@ class ProcessDataObjects:
         self._transmit = [_pdo(True, number, self._node, 0x2106, 0x180) for number in range(PDOS)]
         self._receive = [_pdo(False, number, self._node, 0x2005, 0x200) for number in range(PDOS)]
         self._scheduled = []
+        self._changed()
         for pdo, interval in zip(self._transmit, self._intervals, strict=True):
             if interval:
                 pdo.interval, pdo.due = interval, now + interval
@@ -116,6 +117,7 @@ class ProcessDataObjects:
 
         Raises `RequestRefusedError` if the value makes no sense, or the PDO must be destroyed first.
         """
+        self._changed()
         pdo, mapping = self._at(index)
         if mapping:
             if pdo.exists or (sub and pdo.count):
@@ -150,8 +152,10 @@ class ProcessDataObjects:
             (pdo.due for pdo in self._scheduled if pdo.exists and pdo.kind >= _FIRST_BY_TIME), default=math.inf
         )
 
-    def take_synchronous(self) -> list[tuple[int, Objects]]:
+    def take_synchronous(self) -> tuple[tuple[int, Objects], ...]:
         """Count a SYNC; return identifier and objects of each TPDO that it asks for."""
+        if self._asked_always is not None:
+            return self._asked_always
         asked = []
         for pdo in self._transmit:
             if pdo.kind <= _LAST_SYNCHRONOUS and pdo.exists:
@@ -159,14 +163,24 @@ class ProcessDataObjects:
                 if pdo.syncs >= pdo.kind:
                     pdo.syncs = 0
                     asked.append((pdo.identifier, pdo.objects))
-        return asked
+        answer = tuple(asked)
+        if all(pdo.kind <= 1 or pdo.kind > _LAST_SYNCHRONOUS for pdo in self._transmit):
+            self._asked_always = answer
+        return answer
 
     def received(self, identifier: int) -> Objects:
         """Return the objects that a frame with an identifier writes, none if it is no RPDO."""
-        for pdo in self._receive:
-            if pdo.exists and pdo.identifier == identifier:
-                return pdo.objects
-        return ()
+        known = self._received.get(identifier)
+        if known is None:
+            existing = (pdo for pdo in self._receive if pdo.exists)
+            known = next((pdo.objects for pdo in existing if pdo.identifier == identifier), ())
+            self._received[identifier] = known
+        return known
+
+    def _changed(self) -> None:
+        """Forget what is kept of the configuration."""
+        self._asked_always: tuple[tuple[int, Objects], ...] | None = None
+        self._received: dict[int, Objects] = {}
 
     def _at(self, index: int) -> tuple[_Pdo, bool]:
         """Return the PDO that an object configures, and whether the object is its mapping."""

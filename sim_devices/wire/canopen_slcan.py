@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from binascii import hexlify
 from functools import lru_cache
 
 from sim_devices.instruments.emulated import RequestRefusedError
@@ -162,7 +163,7 @@ class CanopenSlcanServer(WireServer):
             if len(data) == 8 and device.state is not NodeState.STOPPED:
                 answer = self._node.answer(data)
                 if answer:
-                    return device.transmit(b"%s%s\r" % (self._answer_head, answer.hex().upper().encode("ascii")))
+                    return device.transmit(b"%s%s\r" % (self._answer_head, hexlify(answer).upper()))
         elif identifier == _SYNC:
             return b"".join(_line(*frame) for frame in device.process_data(synchronous=True))
         elif identifier != _NMT:
@@ -296,4 +297,10 @@ def _frame(line: bytes) -> tuple[int, bytes | None] | None:
 
 
 def _line(identifier: int, data: bytes) -> bytes:
-    return b"t%03X%d%s\r" % (identifier, len(data), data.hex().upper().encode("ascii"))
+    return b"%s%s\r" % (_head(identifier, len(data)), hexlify(data).upper())
+
+
+@lru_cache(maxsize=256)
+def _head(identifier: int, size: int) -> bytes:
+    """Return the beginning of a line."""
+    return b"t%03X%d" % (identifier, size)

@@ -82,19 +82,22 @@ def _crc_of_byte(index: int) -> int:
 
 _CRC_OF_BYTE = [_crc_of_byte(index) for index in range(256)]
 
-_CRC_OF_WORD = tuple(
-    _CRC_OF_BYTE[first >> 8] ^ (first << 8 & 0xFF00) ^ second for first in _CRC_OF_BYTE for second in _CRC_OF_BYTE
-)
-"""CRC of two bytes, by both of them: half the steps of a table of bytes."""
+_BEGINNING = 17  # bytes of a packet that seldom change from one to the next
 
 
 def crc16(data: bytes) -> int:
     """Return the CRC of a packet: polynomial 0x8005, initial value 0, highest bit first."""
-    # With the initial value 0, zeros in front change nothing.
-    words = data if len(data) % 2 == 0 else b"\0" + data
-    crc = 0
-    for word in struct.unpack(f">{len(words) // 2}H", words):
-        crc = _CRC_OF_WORD[crc ^ word]
+    return _crc_from(_crc_of_beginning(data[:_BEGINNING]), data[_BEGINNING:])
+
+
+@lru_cache(maxsize=256)
+def _crc_of_beginning(data: bytes) -> int:
+    return _crc_from(0, data)
+
+
+def _crc_from(crc: int, data: bytes) -> int:
+    for byte in data:
+        crc = (crc << 8 & 0xFF00) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
     return crc
 
 
