@@ -86,7 +86,7 @@ class CanopenSlcanServer(WireServer):
             *lines, rest = received.split(b"\r")
             sent = self._sent_by_itself()
             for line in lines:
-                sent += _REFUSED if self._overrun or len(line) > LONGEST_LINE else self._obey(line)
+                sent += self._obey(line) if not self._overrun and len(line) <= LONGEST_LINE else _REFUSED
                 self._overrun = False
             # A line that is too long is refused up to its end.
             self._overrun = self._overrun or len(rest) > LONGEST_LINE
@@ -131,8 +131,9 @@ class CanopenSlcanServer(WireServer):
                 return _REFUSED
             identifier, data = frame
             sent = b"z\r" if kind in b"tr" else b"Z\r"
-            if data is not None and self._device.plugged_in and self._on_the_bus():
-                sent += self._answer(identifier, data)
+            device = self._device
+            if data is not None and device.plugged_in and self._bitrate == device.bitrate:
+                return sent + self._answer(identifier, data)
             return sent
         if line == b"":
             return _OK

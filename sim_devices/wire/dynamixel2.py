@@ -32,6 +32,7 @@ LONGEST_FRAME = 1024
 
 BROADCAST = 254
 
+_READ = struct.Struct("<HH")  # address and length
 _HEADER = b"\xff\xff\xfd\x00"
 _HEAD = 7  # header, id and length
 _LOWEST_LENGTH = 3  # instruction and CRC
@@ -204,6 +205,11 @@ class Dynamixel2Server(WireServer):
         if instruction == Instruction.STATUS:
             return b""
         # Every instruction packet feeds the bus watchdogs of all (e-Manual, Bus Watchdog).
+        if len(self._servos) == 1 and number == self._servos[0].bus_id:
+            # As a rule, the one servo is asked by its own id.
+            (servo,) = self._servos
+            heard = servo.hear()
+            return self._serve_one(servo, instruction, parameters) if heard and instruction not in _FOR_ALL else b""
         present = {servo.bus_id: servo for servo in self._servos if servo.hear()}
         if instruction in _FOR_ALL:
             if number != BROADCAST:
@@ -247,12 +253,12 @@ class Dynamixel2Server(WireServer):
 def _act(servo: EmulatedMX28, instruction: int, parameters: bytes, *, to_all: bool) -> bytes:
     """Have one servo carry an instruction out; return the parameters of its answer."""
     match instruction:
+        case Instruction.READ:
+            _expect(parameters, 4)
+            return servo.read_bytes(*_READ.unpack(parameters))
         case Instruction.PING:
             _expect(parameters, 0)
             return struct.pack("<HB", servo.model_number, servo.firmware)
-        case Instruction.READ:
-            _expect(parameters, 4)
-            return servo.read_bytes(*struct.unpack("<HH", parameters))
         case Instruction.WRITE | Instruction.REG_WRITE:
             if len(parameters) < 3:
                 raise RequestRefusedError(ErrorNumber.DATA_LENGTH)
