@@ -54,7 +54,7 @@ from sim_devices.instruments.roboteq_objects import (
     Fault,
     NodeState,
 )
-from sim_devices.instruments.roboteq_pdo import Objects, ProcessDataObjects, is_configuration
+from sim_devices.instruments.roboteq_pdo import Objects, ProcessDataObjects
 from sim_devices.world import World
 
 DEVICE_TYPE = 0x000F0191
@@ -72,6 +72,7 @@ LOWEST_BATTERY_VOLTAGE = 5.0
 HIGHEST_BATTERY_VOLTAGE = 60.0
 """Battery voltage above which the device reports over-voltage, V."""
 
+_FIRST_COMMAND = 0x2000
 _FULL = 1000  # command and power of a duty cycle of 1
 _INTERNAL_VOLTAGE = 118  # 0.1 V
 _FIVE_VOLTS = 5000  # mV
@@ -177,7 +178,8 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         self._heartbeat_milliseconds = 100
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = False
-        self._quiet_until = -math.inf
+        self.quiet_until = -math.inf
+        """When it next says something by itself, s; minus infinity if that is not known."""
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
         self._readings: dict[int, Callable[..., Any]] = {
@@ -255,21 +257,22 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self.world.advance()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
-            self._quiet_until = -math.inf
+            if index >= _FIRST_COMMAND:
+                self._command(index, sub, value)
+                return
+            self.quiet_until = -math.inf
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
                 self._heartbeat_milliseconds = value
                 self._heartbeat_since = self.world.time
-            elif is_configuration(index):
-                self._pdos.write(index, sub, value)
             else:
-                self._command(index, sub, value)
+                self._pdos.write(index, sub, value)
 
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
         with self.world.at_present():
-            self._quiet_until = -math.inf
+            self.quiet_until = -math.inf
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -278,11 +281,6 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
                 self._state = NodeState.PRE_OPERATIONAL
             elif command in (129, 130):
                 self._restart(power=command == 129)
-
-    @property
-    def quiet(self) -> bool:
-        """Whether it has nothing to say by itself at the clock's present time."""
-        return self._clock.now() < self._quiet_until
 
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
@@ -349,7 +347,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """Return when it next says something by itself, s; until then it is quiet, unless it is disturbed."""
         instant = min(self.next_heartbeat(), self.next_process_data())
         # A sum of periods may be short of the instant by its rounding.
-        self._quiet_until = instant - 1e-6
+        self.quiet_until = instant - 1e-6
         return instant
 
     def _form(self, objects: Objects) -> struct.Struct:
@@ -414,7 +412,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         with self.world.at_present():
             self.heartbeats()
             self.plugged_in = True
-            self._quiet_until = -math.inf
+            self.quiet_until = -math.inf
 
     def _corrupted(self, answer: bytes) -> bytes:
         """Cut the adapter's line in its middle."""
@@ -526,7 +524,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self._watchdog_due = math.inf
             self._apply()
         self._pdos.reset(self.world.time)
-        self._quiet_until = -math.inf
+        self.quiet_until = -math.inf
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = True
         self._heartbeat_since = self.world.time

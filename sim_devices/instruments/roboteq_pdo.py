@@ -189,11 +189,6 @@ class ProcessDataObjects:
         return pdos[number], base in (TRANSMIT_MAPPING, RECEIVE_MAPPING)
 
 
-def is_configuration(index: int) -> bool:
-    """Return whether an object of the dictionary configures a PDO."""
-    return index & ~0xFF in (TRANSMIT_PARAMETERS, TRANSMIT_MAPPING, RECEIVE_PARAMETERS, RECEIVE_MAPPING)
-
-
 def _pdo(transmitted: bool, number: int, node: int, index: int, identifier: int) -> _Pdo:
     first = 2 * number + (1 if transmitted else 9)
     mapped = [index << 16 | variable << 8 | 32 for variable in (first, first + 1)]

@@ -62,6 +62,7 @@ class CanopenSlcanServer(WireServer):
         self._device = device
         self._node = SdoServer(device)
         self._answer_head = _line(_SDO_ANSWER + device.node, bytes(8))[:5]
+        self._now = device.world.clock.now
         self._received = b""
         self._overrun = False
         self._bitrate = 0
@@ -95,9 +96,10 @@ class CanopenSlcanServer(WireServer):
 
     def unsolicited(self) -> bytes:
         """Return heartbeats, boot-up message and TPDOs since the last call, which pass while the channel is open."""
-        if self._device.quiet:
+        device = self._device
+        if self._now() < device.quiet_until:
             return b""
-        with self._device.world.lock:
+        with device.world.lock:
             return self._sent_by_itself()
 
     def next_unsolicited(self) -> float:
@@ -110,7 +112,7 @@ class CanopenSlcanServer(WireServer):
 
     def _sent_by_itself(self) -> bytes:
         device = self._device
-        if device.quiet:
+        if self._now() < device.quiet_until:
             return b""
         states = device.heartbeats()
         frames = device.process_data(synchronous=False)
