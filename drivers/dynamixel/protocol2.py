@@ -234,7 +234,9 @@ def _crc_of_byte(index: int) -> int:
 
 
 _CRC_OF_BYTE = tuple(_crc_of_byte(index) for index in range(256))
-_BEGINNING = 17  # bytes that seldom change from one answer to the next: head, error, and what comes first in a reading
+_BEGINNING = (
+    17  # bytes that seldom change from one answer to the next: head, error, and what comes first in a reading
+)
 
 
 def crc(data: bytes) -> int:

@@ -33,7 +33,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from itertools import accumulate
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -80,14 +80,17 @@ _TEMPERATURES = (32, 30)  # °C: processor, power stage
 _LONGEST_HEARTBEAT_BACKLOG = 4
 
 
-_Report = tuple[
-    list[tuple[Callable[..., Any], int]],
-    struct.Struct,
-    Callable[[list[int]], list[int]],
-    list[tuple[int, int, int]],
-]
-"""What frames carry: each reading with its subindex, the form of all data, which of the readings these are in their
-order, and identifier, beginning and end of each frame."""
+class _Report(NamedTuple):
+    """What the frames that follow a SYNC carry."""
+
+    sources: list[tuple[Callable[..., Any], int]]
+    """Each reading, with its subindex."""
+    places: list[int]
+    """Which of the readings the frames carry, in their order."""
+    form: struct.Struct
+    """Form of the data of all frames."""
+    frames: list[tuple[int, int, int]]
+    """Identifier of each frame, and beginning and end of its data."""
 
 
 class HeatingLoad(Protocol):
@@ -332,12 +335,12 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             return []
         if pdos is not self._reported:
             self._reported, self._report = pdos, self._report_of(pdos)
-        sources, form, places, parts = self._report
+        report = self._report
         with self.world.lock:
             self.world.advance_locked()
-            values = [read(sub) for read, sub in sources]
-        data = form.pack(*places(values))
-        return [(identifier, data[begin:end]) for identifier, begin, end in parts]
+            values = [read(sub) for read, sub in report.sources]
+        data = report.form.pack(*[values[place] for place in report.places])
+        return [(identifier, data[begin:end]) for identifier, begin, end in report.frames]
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -362,14 +365,13 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """Return what frames carry; each object is measured once, however many of them carry it."""
         carried = tuple(key for _, objects in pdos for key in objects)
         keys = [*dict.fromkeys(carried)]
-        places = [keys.index(key) for key in carried]
         ends = [*accumulate(self._form(objects).size for _, objects in pdos)]
-        parts = [
-            (identifier, begin, end)
-            for (identifier, _), begin, end in zip(pdos, [0, *ends], ends, strict=False)
-        ]
-        sources = [(self._readings[index], sub) for index, sub in keys]
-        return sources, self._form(carried), lambda values: [values[place] for place in places], parts
+        return _Report(
+            [(self._readings[index], sub) for index, sub in keys],
+            [keys.index(key) for key in carried],
+            self._form(carried),
+            [(identifier, begin, end) for (identifier, _), begin, end in zip(pdos, [0, *ends], ends, strict=False)],
+        )
 
     def _readings_changed(self) -> None:
         self._reported = ()

@@ -21,7 +21,6 @@ from sim_devices.instruments.roboteq_objects import (
     MOST_MAPPED,
     PDOS,
     RECEIVE_MAPPING,
-    RECEIVE_PARAMETERS,
     TRANSMIT_MAPPING,
     TRANSMIT_PARAMETERS,
     AbortCode,
@@ -92,6 +91,8 @@ class ProcessDataObjects:
     def __init__(self, node: int, send_rates: Sequence[int], now: float) -> None:
         self._node = node
         self._intervals = [1e-3 * milliseconds for milliseconds in send_rates]
+        self._asked_always: tuple[tuple[int, Objects], ...] | None = None
+        self._received: dict[int, Objects] = {}
         self.reset(now)
 
     def reset(self, now: float) -> None:
@@ -179,8 +180,8 @@ class ProcessDataObjects:
 
     def _changed(self) -> None:
         """Forget what is kept of the configuration."""
-        self._asked_always: tuple[tuple[int, Objects], ...] | None = None
-        self._received: dict[int, Objects] = {}
+        self._asked_always = None
+        self._received.clear()
 
     def _at(self, index: int) -> tuple[_Pdo, bool]:
         """Return the PDO that an object configures, and whether the object is its mapping."""

@@ -184,6 +184,8 @@ class SdoServer:
         self._device = device
         self._numbers: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
         """Index, subindex, form, and beginning of the answer, by the first four bytes of a query for a number."""
+        self._writes: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
+        """Index, subindex, form, and answer, by the first four bytes of a download in one piece."""
         self._multiplexer = bytes(3)
         self._text: bytes | None = None
         self._incoming: bytes | None = None
@@ -193,6 +195,16 @@ class SdoServer:
         """Return the eight bytes that answer eight bytes; none answer an abort."""
         command = request[0]
         specifier = command >> 5
+        known = self._writes.get(request[:4])
+        if known is not None:
+            self._text = self._incoming = None
+            self._multiplexer = request[1:4]
+            index, sub, written, answer = known
+            try:
+                self._device.write_object(index, written.unpack_from(request, 4)[0], sub)
+            except RequestRefusedError as error:
+                return self._abort(error)
+            return answer
         if specifier not in (0, 3):
             # What was under way has ended.
             self._text = self._incoming = None
@@ -210,8 +222,12 @@ class SdoServer:
                 return self._upload_segment(command)
             raise RequestRefusedError(AbortCode.COMMAND)
         except RequestRefusedError as error:
-            self._text = self._incoming = None
-            return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
+            return self._abort(error)
+
+    def _abort(self, error: RequestRefusedError) -> bytes:
+        """End what is under way; return the answer that says so."""
+        self._text = self._incoming = None
+        return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
 
     def _object(self) -> tuple[int, int]:
         multiplexer = self._multiplexer
@@ -233,6 +249,9 @@ class SdoServer:
             if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
                 raise RequestRefusedError(AbortCode.LENGTH)
             self._write(data[:size])
+            answer = b"\x60" + self._multiplexer + bytes(4)
+            self._writes[bytes((command,)) + self._multiplexer] = index, sub, FORMATS[row.kind], answer
+            return answer
         return b"\x60" + self._multiplexer + bytes(4)
 
     def _download_segment(self, command: int, data: bytes) -> bytes:
