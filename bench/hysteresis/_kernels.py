@@ -403,8 +403,8 @@ def swept_areas(axis: Axis, start: Start, entries: Entries) -> int:
     Without room for any entry they are only counted.
     """
     left, height, u = start
-    # For a literal 0 numba would compile once more.
-    end = _triangle(axis, axis[0][0], u, 2.0, entries, np.int64(0))
+    # Not 0: for a literal numba would compile once more.
+    end = _triangle(axis, axis[0][0], u, 2.0, entries, int(0.0))
     for p in range(left.size):
         right = left[p + 1] if p + 1 < left.size else u
         end = _rectangle(axis, left[p], right, u, height[p], 2.0, entries, end)
@@ -425,7 +425,7 @@ def swept_differences(inputs: Floats, axis: Axis, start: Start, starts: Integers
         left[p] = left0[p]
         height[p] = height0[p]
     low, high = axis[0][0], axis[0][-1]
-    end = np.int64(0)
+    end = int(0.0)
     for t in range(inputs.size):
         starts[t] = end
         u = min(max(inputs[t], low), high)

@@ -125,7 +125,8 @@ def look_around(temperature: float, stress: float, parts: Parts) -> None:
 def quiet_stress(temperature: float, quiet: Floats) -> float:
     """How far the stress may be from the middle of the quiet surroundings at a temperature, MPa; 0 if not at all."""
     kelvin = quiet[KELVIN] - abs(temperature - quiet[MIDDLE_TEMPERATURE])
-    return max(min(quiet[MEGAPASCAL], kelvin * quiet[LEAST_SLOPE]), 0.0)
+    megapascal: float = max(min(quiet[MEGAPASCAL], kelvin * quiet[LEAST_SLOPE]), 0.0)
+    return megapascal
 
 
 @njit(cache=True)
