@@ -21,6 +21,9 @@ _LONGEST = 1 << 24
 
 Message = dict[str, Any]
 
+STILL_AT_IT: Message = {"n": 0}
+"""What the guardian says each second until it replies: a stopped one is told from one that waits for a line."""
+
 
 class ChannelError(Exception):
     """The other side is gone, or what it sends is no message."""

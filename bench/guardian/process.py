@@ -28,7 +28,7 @@ from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
 from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianError
 from bench.guardian.black_box import BlackBox
-from bench.guardian.channel import Channel, ChannelError, Message, to_message
+from bench.guardian.channel import STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
 from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
@@ -53,6 +53,9 @@ _TRIES = 3
 
 _NOTHING = Result("", None, None, was_away=False)
 """The result of a request that concerns no device."""
+
+_SAY_SO = 1.0
+"""Time after which the bench is told that its request is still being carried out, s."""
 
 _LONGEST_WAIT = 0.5
 """Longest time between two turns of the loop, s."""
@@ -108,6 +111,7 @@ class Guardian:
         self._latest: dict[str, dict[str, float]] = {}
         self._concerned = {name: self._signals_of(name) for name in self._looked_at}
         self._request: Message | None = None
+        self._said_at = 0.0
         self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
         self._bench_is_there = True
         self._writes_stacks = False
@@ -175,6 +179,7 @@ class Guardian:
         self._core.advance(now)
         if self._request is not None:
             self._seen_at = dict.fromkeys(self._seen_at, now)
+            self._say_so(now)
         for name, seen in self._seen_at.items():
             if now - seen > _BLIND + self._longest_away(name):
                 self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
@@ -223,7 +228,7 @@ class Guardian:
         if self._request is not None and do != "end":
             self._lose_bench("it asks before it was answered")
             return
-        self._request = message
+        self._request, self._said_at = message, self._wall.now()
         if do == "end":
             self._core.end()
             return
@@ -232,6 +237,15 @@ class Guardian:
             _REQUESTS[str(do)](self, message)
         except Exception as error:
             self._refuse(message, error)
+
+    def _say_so(self, now: float) -> None:
+        """Tell the bench each second that its request is still being carried out."""
+        if now - self._said_at >= _SAY_SO:
+            self._said_at = now
+            try:
+                self._channel.send(STILL_AT_IT)
+            except ChannelError as error:
+                self._lose_bench(str(error))
 
     def _reply(self, request: Message, result: Any = None) -> None:  # noqa: ANN401 - anything that JSON can hold
         self._answer(request, result=result)

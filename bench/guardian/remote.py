@@ -34,6 +34,9 @@ _OPENING = 120.0
 _ANSWER = 15.0
 """Longest wait for a reply beyond the time for which a line may be away, s."""
 
+_SILENCE = 8.0
+"""Longest silence of the guardian while it carries a request out, s; it says each second that it is still at it."""
+
 _END = 5.0
 """Longest wait for the safe state of all devices, s."""
 
@@ -301,7 +304,8 @@ class RemoteStation(Station):
         if self._lost is not None:
             raise self._lost
         self._number += 1
-        waited = Stopwatch()
+        waited, silent = Stopwatch(), Stopwatch()
+        silence = within or _SILENCE
         within = within or self._answer_within
         try:
             self._channel.send({"n": self._number, "do": do, **content})
@@ -310,9 +314,12 @@ class RemoteStation(Station):
                     for reply in self._channel.receive():
                         if reply.get("n") == self._number:
                             return self._taken(reply)
-                elif waited.seconds() > within:
+                    silent = Stopwatch()
+                elif silent.seconds() > silence:
+                    raise ChannelError(f"it has said nothing for {silence:g} s")
+                if waited.seconds() > within:
                     raise ChannelError(f"it has not answered for {within:g} s")
-                elif do != "end" and self.clock.interrupted() and waited.seconds() > _ABORT:
+                if do != "end" and self.clock.interrupted() and waited.seconds() > _ABORT:
                     raise AbortError(f"ended while the guardian had not answered for {waited.seconds():.0f} s")
         except ChannelError as error:
             # What it answers from now on is not asked for any more.

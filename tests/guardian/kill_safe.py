@@ -36,7 +36,7 @@ DEATH, PROMISE, PATIENCE = 0.2, 5.0, 4.0
 RESCUE = 6.0
 """Time within which another process makes every device safe, s: it starts, and opens the lines."""
 
-SILENCE = 25.0
+SILENCE = 8.0
 """Time after which the bench gives up a guardian that does not answer, s."""
 
 TICK = 2.0
