@@ -27,7 +27,7 @@ from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
 from bench.errors import BenchError, ConfigurationError, GuardianError
 from bench.guardian.black_box import BlackBox
-from bench.guardian.channel import Channel, ChannelError, Message, to_message
+from bench.guardian.channel import LONGEST_ANSWER, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
 from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
@@ -97,6 +97,7 @@ class Guardian:
         self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
         self._looking = False
         self._request: Message | None = None
+        self._requested = 0.0
         self._last_seen = self._wall.now()
         self._bench_is_there = True
         self._writes_stacks = False
@@ -164,6 +165,8 @@ class Guardian:
         self._core.advance(now)
         if self._request is not None:
             self._last_seen = now
+            if (taken := now - self._requested) > LONGEST_ANSWER + self._rig.file.safety.reconnect:
+                self._core.trip(GuardianError(f"a request was not carried out within {taken:.0f} s"))
         elif self._watched and now - self._last_seen > _BLIND + self._blind_allowance():
             self._core.trip(GuardianError(f"the interlocks could not be looked at for {now - self._last_seen:.1f} s"))
         if self._core.over:
@@ -203,7 +206,7 @@ class Guardian:
         if self._request is not None and do != "end":
             self._lose_bench("it asks before it was answered")
             return
-        self._request = message
+        self._request, self._requested = message, self._wall.now()
         if do == "end":
             self._core.end()
             return
@@ -226,11 +229,11 @@ class Guardian:
         if request is not self._request:
             return
         self._request = None
-        self._core.reply(self._wall.now())
-        news, self._news = self._news, []
-        cause = self._core.cause
-        pause, self._core.pause = self._core.pause, ""
         try:
+            self._core.reply(self._wall.now())
+            news, self._news = self._news, []
+            cause = self._core.cause
+            pause, self._core.pause = self._core.pause, ""
             self._channel.send(
                 {
                     "n": request.get("n"),
@@ -241,8 +244,9 @@ class Guardian:
                     **content,
                 }
             )
-        except ChannelError as error:
-            self._lose_bench(str(error))
+        # One that gets no answer promises nothing either.
+        except Exception as error:
+            self._lose_bench(f"it could not be answered: {error}")
 
     # Requests
 

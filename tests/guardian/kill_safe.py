@@ -73,7 +73,7 @@ TRIALS = {
     "SIGSTOP": Trial("hold", signal.SIGSTOP, PROMISE),
     "endless loop": Trial("spin", None, PATIENCE),
     "endless loop, SIGTERM": Trial("spin", signal.SIGTERM, 3.0),
-    "interpreter kept": Trial("keep_interpreter", None, PATIENCE),
+    "interpreter kept": Trial("keep-interpreter", None, PATIENCE),
     "stalled reader": Trial("talk", signal.SIGTERM, 3.0, stalled=True),
 }
 
@@ -96,6 +96,8 @@ def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Foun
     """Carry a trial out, and leave the laboratory as it was."""
     command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{trial.protocol}", "--rig", rig.name]
     command += ["--attach", str(rig.endpoints_file), "--out", str(folder), "--override", "safety.patience=3"]
+    # Not all rigs have a watchdog and an interlock for each output that heats.
+    command += ["--override", "safety.unattended=false"]
     command += ["--set", f"setpoints={json.dumps(SETPOINTS[rig.name])}"]
     with ExitStack() as stack:
         if trial.stalled:
@@ -111,7 +113,8 @@ def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Foun
         if trial.stalled:
             os.close(writing)
         stack.callback(_end, process)
-        on = _await_on(rig.control, process, len(SETPOINTS[rig.name]), folder)
+        _await_on(rig.control, process, len(SETPOINTS[rig.name]), folder)
+        guardians = find_guardians(process.pid)
         if trial.sent is None:
             _await_note(folder, "computing")
             start = time.monotonic()
@@ -129,18 +132,17 @@ def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Foun
             problem = f"after {seconds:.2f} s, {trial.within:g} s are allowed"
         if trial.sent is signal.SIGSTOP:
             process.send_signal(signal.SIGCONT)
-            if process.wait(60) != 7:
+            if process.wait(120) != 7:
                 problem = problem or f"exit code {process.returncode} after SIGCONT"
             if outputs(rig.control):
                 problem = "switched on again after SIGCONT"
-        elif trial.sent not in (None, signal.SIGKILL) and process.wait(60) != 130:
+        elif trial.sent not in (None, signal.SIGKILL) and process.wait(120) != 130:
             problem = problem or f"exit code {process.returncode}"
-        del on
-    _await_free(rig.control)
+    _await_gone(guardians)
     return Found(seconds, problem)
 
 
-def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: int, folder: Path) -> dict[str, float]:
+def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: int, folder: Path) -> None:
     since = time.monotonic()
     while len(found := outputs(control)) < count:
         if process.poll() is not None or time.monotonic() - since > 120:
@@ -148,7 +150,6 @@ def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: i
             raise AssertionError(f"the outputs did not all go on: {found}, exit code {process.poll()}: {said}")
         time.sleep(0.01)
     _await_note(folder, "everything is on")
-    return found
 
 
 def _await_note(folder: Path, text: str) -> None:
@@ -168,21 +169,23 @@ def _await_note(folder: Path, text: str) -> None:
     raise AssertionError(f"{text!r} was never recorded")
 
 
-def _await_free(control: ControlClient) -> None:
-    """Wait until the guardian has left the lines."""
-    del control
-    since = time.monotonic()
-    while time.monotonic() - since < 30 and _guardians():
-        time.sleep(0.02)
-
-
-def _guardians() -> list[int]:
+def find_guardians(bench: int) -> list[int]:
+    """Return the guardians that a bench has started."""
     found = []
     for entry in Path("/proc").iterdir():
         with suppress(OSError):
             if entry.name.isdigit() and b"bench.guardian" in (entry / "cmdline").read_bytes():
-                found.append(int(entry.name))
+                # After the name in brackets: state and parent.
+                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == bench:
+                    found.append(int(entry.name))
     return found
+
+
+def _await_gone(processes: list[int]) -> None:
+    """Wait until guardians have left the lines."""
+    since = time.monotonic()
+    while time.monotonic() - since < 30 and any(Path(f"/proc/{number}").exists() for number in processes):
+        time.sleep(0.02)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
