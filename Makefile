@@ -10,7 +10,7 @@ MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types tests all-tests benchmark busy clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types tests all-tests benchmark busy kill-safe clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -54,6 +54,10 @@ benchmark: $(SETUP)
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)
 	$(BIN)/python tests/bench/test_busy_machine.py --runs 50 --busy 16
+
+# Benches that are killed, stopped and hung, and the time until every output is off in its instrument.
+kill-safe: $(SETUP)
+	$(BIN)/python tests/guardian/kill_safe.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -18,7 +18,7 @@ from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
@@ -172,7 +172,7 @@ class HybridLaboratory(EmulatedLaboratory):
             "deflection": TrueValue(plant.deflection, "m"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.tec_voltage, "V"),
-            "tec_output": TrueValue(self.tec.output_enabled, is_output=True),
+            "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
             "piezo_voltage": TrueValue(plant.piezo_voltage, "V"),
             "amplifier_command": TrueValue(self.t7.tdac_volts(0), "V", is_output=True),
             "amplifier_enable": TrueValue(self.t7.dio_level(ENABLE_LINE, pulled_down=True), is_output=True),

@@ -10,7 +10,7 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
@@ -93,7 +93,7 @@ class VO2Laboratory(EmulatedLaboratory):
             "tip_deflection": TrueValue(plant.tip_deflection, "m"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.voltage, "V"),
-            "tec_output": TrueValue(self.tec.output_enabled, is_output=True),
+            "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
         }
 
     def _displace(self, metres: float) -> None:

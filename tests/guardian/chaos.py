@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from bench.attachment import ControlClient, attach, read_endpoints
-from bench.errors import BenchError
+from bench.errors import BenchError, LimitError
 from bench.guardian import __main__ as program
 from bench.guardian import process, remote
 from bench.guardian.black_box import BlackBox
@@ -154,6 +154,8 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
                 station.promise(LEASE, "chaos")
                 station.promise(1.1 * LEASE, "chaos")
             station.check({"tec": [40.0]})
+            with suppress(LimitError):
+                station.check({"tec": [400.0]})
             # A look of the guardian's own.
             time.sleep(0.3)
             # Something has to be done after the failure, so that the bench may go on.

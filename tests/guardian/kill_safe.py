@@ -171,14 +171,24 @@ def _await_note(folder: Path, text: str) -> None:
 
 def find_guardians(bench: int) -> list[int]:
     """Return the guardians that a bench has started."""
+    return [number for number in _processes(b"bench.guardian") if _parent(number) == bench]
+
+
+def _processes(word: bytes) -> list[int]:
     found = []
     for entry in Path("/proc").iterdir():
         with suppress(OSError):
-            if entry.name.isdigit() and b"bench.guardian" in (entry / "cmdline").read_bytes():
-                # After the name in brackets: state and parent.
-                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == bench:
-                    found.append(int(entry.name))
+            if entry.name.isdigit() and word in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
     return found
+
+
+def _parent(number: int) -> int:
+    try:
+        # After the name in brackets: state and parent.
+        return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
 
 
 def _await_gone(processes: list[int]) -> None:

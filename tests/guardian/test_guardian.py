@@ -242,7 +242,7 @@ class TestInterlocks:
             it.look(Look.GLANCE)
         assert it.end() == SAFE
 
-    def test_readings_of_the_bench_come_with_what_they_tripped(self, station, vo2, cautious):
+    def test_readings_of_the_bench_come_with_what_they_tripped(self, station, cautious):
         # No look of its own before the bench has looked.
         it = station(file=cautious, safety__rate="0.1")
         temperatures = [0.0]
