@@ -9,6 +9,11 @@ import pytest
 from benches import IN_TIME, LONG
 from chaos import LEASE, METHODS
 
+from bench.guardian.channel import LONGEST_ANSWER
+from bench.rig_file import load_rig
+
+RECONNECT = load_rig("vo2").safety.reconnect
+
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="it forks")]
 
 
@@ -27,8 +32,11 @@ def test_whatever_fails_the_output_goes_off(vo2):
     found = [json.loads(line) for line in done.stdout.splitlines()]
     assert [each["method"] for each in found] == list(METHODS)
     assert not [each["method"] for each in found if not each["failed"]]
-    left = [each for each in found if each["off_after"] is None or each["off_after"] > 1.1 * LEASE + IN_TIME]
-    assert not left
+    for each in found:
+        # While a request is carried out the bench cannot be late; an answer that is lost is noticed by its time.
+        allowed = LONGEST_ANSWER + RECONNECT if each["method"] == "Guardian._hand_over" else 1.1 * LEASE
+        assert each["off_after"] is not None, each
+        assert each["off_after"] < allowed + IN_TIME, each
     assert not [each for each in found if each["on_at_the_end"]]
     for each in found:
         assert each["safe"].keys() == {"tec", "psd"}

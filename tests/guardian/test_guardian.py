@@ -84,7 +84,7 @@ class TestRequests:
         values = it.look(Look.GLANCE)
         assert values.keys() == {signal.name for signal in it.description.signals}
         assert values["tec_setpoint"] == it.setpoint("tec") == 40.0
-        assert it.quick_reader(["psd_position"])().keys() == {"psd_position"}
+        assert it.quick_reader(["psd_position"])().keys() == {"psd_position", "curvature"}
         it.check({"tec": [15.0, 95.0]})
         with pytest.raises(LimitError, match="tec: set-point 99 °C is outside"):
             it.apply({"tec": 99.0})
