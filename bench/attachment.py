@@ -6,7 +6,7 @@ import json
 import math
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bench.clock import Clock, ScaledClock
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.faults import ScheduledFault
 
 _NAME = "the served laboratory"
 _TIMEOUT = 30.0
@@ -152,9 +153,22 @@ class ControlClient:
         """Wait until a laboratory time (s) has come; return the time then."""
         return float(self.request("wait", until=until, **self._rig)["time"])
 
-    def fault(self, name: str, **values: float) -> None:
-        """Make a fault happen; `values` are what can be chosen of it."""
-        self.request("fault", fault=name, values=values, **self._rig)
+    def fault(self, name: str, *, duration: float | None = None, **values: float) -> None:
+        """Make a fault happen, for a time (s) or without an end; `values` are what can be chosen of it."""
+        self.request("fault", fault=name, values=values, duration=duration, **self._rig)
+
+    def end_fault(self, name: str) -> None:
+        """End a fault that goes on."""
+        self.request("end-fault", fault=name, **self._rig)
+
+    def schedule(self, faults: Sequence[ScheduledFault]) -> None:
+        """Let faults happen at instants that count from now."""
+        entries = [each.model_dump(exclude_none=True) for each in faults]
+        self.request("schedule", faults=entries, **self._rig)
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the faults that have happened: `time`, `fault`, `what` (begins, ends) and `values` of each."""
+        return list(self.request("events", **self._rig)["events"])
 
     def operate(self, task: str, value: float) -> None:
         """Do by hand what a protocol's prompt asks for."""
@@ -177,7 +191,7 @@ class ControlClient:
         self.request("hang", instrument=instrument, **self._rig)
 
     def plug_in(self, instrument: str) -> None:
-        """Undo `unplug`, `cut` and `hang`."""
+        """End all faults of the line of an instrument."""
         self.request("plug-in", instrument=instrument, **self._rig)
 
     def corrupt(self, instrument: str) -> None:
@@ -231,6 +245,11 @@ class AttachedClock(Clock):
         """Close the connections of all threads."""
         for control in self._opened:
             control.close()
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether the server is gone, and its instruments with it."""
+        return self._alone is not None
 
     @property
     def _control(self) -> ControlClient:
@@ -307,6 +326,10 @@ class Attachment:
         Raises ConfigurationError if the laboratory cannot.
         """
         self._control.operate(task, value)
+
+    def schedule(self, faults: Sequence[ScheduledFault]) -> None:
+        """Let faults happen in the served laboratory; `bench.faults.FaultyLaboratory`."""
+        self._control.schedule(faults)
 
     def close(self) -> None:
         """Leave the laboratory; it goes on."""

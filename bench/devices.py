@@ -99,6 +99,25 @@ class Limits:
         return f"{self.low:g} to {self.high:g} {self.unit}"
 
 
+@dataclass(frozen=True)
+class Finding:
+    """What a check of an instrument found.
+
+    Attributes
+    ----------
+    subject : str
+        What was looked at, in a word or two, such as `watchdog`.
+    text : str
+        What was found, with numbers and units.
+    advice : str
+        What to do; empty if all is well.
+    """
+
+    subject: str
+    text: str
+    advice: str = ""
+
+
 class BlueskyReading(TypedDict):
     """One value in the form of `bluesky.protocols.Reading`; the timestamp is seconds since 1970 UTC."""
 
@@ -347,6 +366,13 @@ class Device(ABC):
     def repeats(self) -> int:
         """Number of requests that were repeated since the device was connected, as their answers were lost."""
         return 0
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare what the instrument itself says with the settings; nothing moves, and nothing is changed.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        return ()
 
     def reconnect(self) -> None:
         """Open the line again after it was lost, and check that the instrument is as it was left.

@@ -37,6 +37,7 @@ Group = Literal[
     "commands",
 ]
 """What can be registered; the group of the entry points is `bench.` and this name."""
+GROUPS: tuple[Group, ...] = get_args(Group)
 
 OWN_PACKAGE = "actuator-bench"
 _OWN_FOLDERS = ("protocols", "drivers", "sim_devices", "rigs")
@@ -87,8 +88,8 @@ def entries(group: Group) -> Mapping[str, Entry]:
 
     Raises ConfigurationError if two packages register the same name.
     """
-    if group not in get_args(Group):
-        raise ValueError(f"group: expected one of {', '.join(get_args(Group))}, got {group!r}")
+    if group not in GROUPS:
+        raise ValueError(f"group: expected one of {', '.join(GROUPS)}, got {group!r}")
     found: dict[str, Entry] = {}
     for point in metadata.entry_points(group=f"bench.{group}"):
         package = point.dist.name if point.dist is not None else "unknown"
@@ -132,8 +133,46 @@ def check_own_packages() -> None:
             )
 
 
+_beside: set[Path] = set()
+"""The folders of the rig and protocol files that were read."""
+
+
 def import_beside(file: Path) -> None:
     """Let the modules in the folder of a file be imported; they come last and hide no installed module."""
-    folder = str(file.resolve().parent)
-    if folder not in sys.path:
-        sys.path.append(folder)
+    folder = file.resolve().parent
+    _beside.add(folder)
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+def check_import(module: str) -> None:
+    """Check that a file may have a module imported, as importing runs its code.
+
+    It may, if the module is of the bench, of a package that registers a part, or in the folder of a rig or protocol
+    file that was read; or if the program has imported it already.
+
+    Raises ConfigurationError if it may not; says how to register it.
+    """
+    top = module.partition(".")[0]
+    if not top or module in sys.modules or top in ("bench", *_OWN_FOLDERS):
+        return
+    try:
+        spec = importlib.util.find_spec(top)
+    except ValueError:
+        # What runs as a script has none.
+        spec = None
+    # Without one there is nothing to import, and the import says so.
+    if spec is None:
+        return
+    places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))]
+    if places and Path(places[0]).resolve().parent in _beside:
+        return
+    parts = (entry for group in GROUPS for entry in entries(group).values())
+    if top in {entry.reference.partition(":")[0].partition(".")[0] for entry in parts}:
+        return
+    where = places[0] if places else spec.origin
+    raise ConfigurationError(
+        f"module {module} ({where}) may not be imported, as it is neither of the bench, "
+        "nor of a package that registers a part, nor beside the rig file; move it there, or register it in the "
+        f"""pyproject.toml of its package: [project.entry-points."bench.devices"] NAME = "{module}:CLASS\""""
+    )

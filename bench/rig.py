@@ -13,10 +13,10 @@ from bench.binding import check_roles
 from bench.clock import Clock, make_clock
 from bench.derived import Derived
 from bench.description import RigDescription
-from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Signal
+from bench.devices import Actuator, Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
-from bench.rig_file import DeviceEntry, Laboratory, RigFile
+from bench.rig_file import Laboratory, RigFile
 from bench.roles import BlockPlayer, Floats, JointReader
 from bench.safety import SAFE, make_safe
 
@@ -67,15 +67,13 @@ class Rig:
                 ports = self.laboratory.open()
                 stack.callback(self.laboratory.close)
             for entry in file.devices:
-                settings = _wired(entry, ports, file.path)
+                settings = entry.wired(ports, file.path)
                 device = entry.driver.connect(entry.name, settings, clock)
                 stack.callback(_close, device)
                 self.devices[entry.name] = device
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
-            self.description = RigDescription(
-                file, {name: DeviceDescription.of(device) for name, device in self.devices.items()}, self.signals
-            )
+            self.description = RigDescription(file, self._describe_devices(), self.signals)
             self._check_references()
             self._stack = stack.pop_all()
 
@@ -122,7 +120,7 @@ class Rig:
 
         Devices on different lines may be asked at the same time.
         """
-        sources = self._sources(wanted)
+        sources = self.sources(wanted)
         readers = {}
         for name, device in self.devices.items():
             is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
@@ -137,7 +135,7 @@ class Rig:
 
         It returns what these devices deliver and the derived ones of the signals; set-points are not among them.
         """
-        sources = self._sources(wanted)
+        sources = self.sources(wanted)
         names = self.readers(Look.PART, wanted)
         readers = _quick_readers([self.devices[name] for name in names])
         derived = [(name, each.compute) for name, each in self.derived.items() if name in sources]
@@ -169,7 +167,7 @@ class Rig:
                 return partial(_play, player, sensor, period)
         return None
 
-    def _sources(self, wanted: Collection[str]) -> set[str]:
+    def sources(self, wanted: Collection[str]) -> set[str]:
         """Return signals, and those that the derived ones among them come from."""
         sources = {*wanted}
         # Each derived signal comes from what stands before it.
@@ -196,6 +194,16 @@ class Rig:
             if len(readings) == len(self.devices) or all(source in values for source in derived.sources):
                 values[name] = derived.compute(values)
         return values
+
+    def _describe_devices(self) -> dict[str, DeviceDescription]:
+        described = {}
+        for name, device in self.devices.items():
+            try:
+                described[name] = DeviceDescription.of(device)
+            # Limits in the wrong order, say, which its settings did not check.
+            except ValueError as error:
+                raise ConfigurationError(f"{self.file.path}: devices.{name}: {error}") from None
+        return described
 
     def _bind_signals(self) -> tuple[Signal, ...]:
         """Return the signals of devices and derived ones; each derived one may use those above it in the file."""
@@ -277,17 +285,3 @@ def _close(device: Device) -> None:
     # A line that is gone cannot be closed either; that must not hide how the run ended.
     with suppress(Exception):
         device.close()
-
-
-def _wired(entry: DeviceEntry, ports: Mapping[str, str], path: str) -> DriverSettings:
-    port = getattr(entry.settings, "port", "")
-    scheme = "emulated://"
-    if not isinstance(port, str) or not port.startswith(scheme):
-        return entry.settings
-    name = port.removeprefix(scheme)
-    if name not in ports:
-        known = ", ".join(scheme + other for other in ports) or "none: the rig has no [emulation]"
-        raise ConfigurationError(
-            f"{path}: devices.{entry.name}.port = {port!r}: the laboratory has no such instrument; there are: {known}"
-        )
-    return entry.settings.model_copy(update={"port": ports[name]})

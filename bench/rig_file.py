@@ -51,7 +51,10 @@ A rig file is TOML::
     ...
 
 Unknown keys are errors. A port `emulated://NAME` is wired to the instrument of that name in the emulated
-laboratory; any other port is the real one. Python modules in the folder of the rig file can be named in it.
+laboratory; any other port is the real one.
+
+A rig file is code: reading it imports the modules that it names. They are those of the bench, those of packages that
+register a part (`bench.registry`), and those in the folder of the rig file; any other is refused.
 """
 
 from __future__ import annotations
@@ -75,6 +78,7 @@ from bench.devices import Device, DriverSettings
 from bench.errors import ConfigurationError
 from bench.interlocks import Interlock
 from bench.layout import DashboardLayout
+from bench.locks import EMULATED
 
 
 class _Table(BaseModel):
@@ -183,6 +187,33 @@ class DeviceEntry:
     driver: Any
     settings: DriverSettings
 
+    def wired(self, ports: Mapping[str, str], path: str) -> DriverSettings:
+        """Return the settings with the true port in the place of `emulated://NAME`.
+
+        Parameters
+        ----------
+        ports : mapping of str to str
+            What the laboratory opened, by name.
+        path : str
+            Of the rig file, for messages.
+
+        Raises
+        ------
+        ConfigurationError
+            If the laboratory has no such instrument.
+        """
+        port = getattr(self.settings, "port", "")
+        if not isinstance(port, str) or not port.startswith(EMULATED):
+            return self.settings
+        name = port.removeprefix(EMULATED)
+        if name not in ports:
+            known = ", ".join(EMULATED + other for other in ports) or "none: the rig has no [emulation]"
+            raise ConfigurationError(
+                f"{path}: devices.{self.name}.port = {port!r}: the laboratory has no such instrument; "
+                f"there are: {known}"
+            )
+        return self.settings.model_copy(update={"port": ports[name]})
+
 
 @dataclass(frozen=True)
 class RigFile:
@@ -225,7 +256,7 @@ class RigFile:
     def in_process(self) -> bool:
         """Whether every device is emulated in this process, so that time can stand while the process computes."""
         ports = [str(getattr(entry.settings, "port", "")) for entry in self.devices]
-        return self.emulated and all(port.startswith("emulated://") for port in ports)
+        return self.emulated and all(port.startswith(EMULATED) for port in ports)
 
     def served_by(self, laboratory: Any) -> RigFile:  # noqa: ANN401 - without Settings
         """Return the same rig with a `Laboratory` that is open already in place of its own."""
@@ -465,6 +496,10 @@ def _load(group: registry.Group, reference: object, key: str) -> Any:  # noqa: A
         names = ", ".join(registry.entries(group)) or "none"
         raise ConfigurationError(f"{key} = {reference!r}: expected module:class, or a registered name: {names}")
     module, _, name = reference.partition(":")
+    try:
+        registry.check_import(module)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{key} = {reference!r}: {error}") from None
     try:
         imported = importlib.import_module(module)
     # A module of the user's own may fail in any way.

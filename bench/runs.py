@@ -19,21 +19,22 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.attachment import AttachedClock, attach
+from bench.attachment import AttachedClock, Attachment, attach
 from bench.binding import Slots
-from bench.clock import Stopwatch, wall_time
+from bench.clock import Clock, Stopwatch, wall_time
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
+from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.rig import Rig, clock_for
-from bench.rig_file import load_rig
+from bench.rig_file import RigFile, load_rig
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -75,6 +76,11 @@ class Run:
         Whether to write the .rrd beside the journal while the run goes on.
     attach : Path, optional
         Endpoints file of `bench emulate`: the emulated laboratory is served there, on its own clock and seed.
+    interlock_rate : float, optional
+        Looks at the interlocks of an emulated rig in a laboratory second, Hz, beside each reading and tick; on
+        hardware the rig file says it, `[safety] rate`.
+    faults : Path, optional
+        Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
     """
 
     protocol: ProtocolDefinition
@@ -87,6 +93,8 @@ class Run:
     live: bool = False
     recording: bool = True
     attach: Path | None = None
+    interlock_rate: float | None = None
+    faults: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -134,33 +142,34 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     """
     stopwatch = Stopwatch()
     rig_file = load_rig(run.rig, run.overrides)
-    if run.attach is None:
-        clock = clock_for(rig_file, run.clock)
-    elif not rig_file.emulated:
-        raise ConfigurationError(f"rig {rig_file.name} has no emulated laboratory that could be served elsewhere")
-    else:
-        attachment = attach(run.attach, rig_file.name)
-        clock = attachment.clock
     parameters = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
+    faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     guardian: RemoteStation | None = None
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
+        clock, attachment = _clock(run, rig_file, stack)
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
         clock.interrupted = interrupts.abort_requested
         # A guardian makes the devices safe as soon as this process is gone.
         interrupts.leave_by(_leave)
         if run.attach is None and rig_file.in_process:
-            station: Station = LocalStation(Rig(rig_file, clock, run.seed))
+            rig = Rig(rig_file, clock, run.seed)
+            laboratory: object = rig.laboratory
+            station: Station = LocalStation(rig, run.interlock_rate)
         else:
-            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed)
-            station = guardian = RemoteStation(guarded, clock, dict)
+            doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
+            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
+            laboratory, station = attachment, RemoteStation(guarded, clock)
+            guardian = station
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
+        if run.faults is not None:
+            schedule_faults(laboratory, faults, run.faults)
         description = station.description
         slots = description.slots(run.protocol)
         expected = plan(run.protocol, parameters, slots)
@@ -203,6 +212,17 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:
+    """Return the clock of a run, and the served laboratory that it is of."""
+    if run.attach is None:
+        return clock_for(file, run.clock), None
+    if not file.emulated:
+        raise ConfigurationError(f"rig {file.name} has no emulated laboratory that could be served elsewhere")
+    attachment = attach(run.attach, file.name)
+    stack.callback(attachment.close)
+    return attachment.clock, attachment
 
 
 def _leave(reason: str, station: Station | None = None, journal: Path | None = None) -> None:
@@ -266,6 +286,7 @@ def _metadata(
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
+        "interlock_rate": run.interlock_rate if file.in_process and run.attach is None else file.safety.rate,
         "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
         "epoch": clock.epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in station.description.devices.items()},

@@ -37,7 +37,7 @@ from typing import ClassVar, Literal, NamedTuple, TypeVar
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
-from bench.devices import Identity
+from bench.devices import Finding, Identity
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import LoadCell
 from drivers.device import LineDevice, Slope
@@ -85,6 +85,7 @@ _MOST_DECIMALS = 5
 _ORDER_LOOKS = 3
 _TARE_TIMEOUT = 1.0  # s that the instrument is given to show a change of tare
 _POLL = 0.05
+_CONVERSIONS = 5  # looked at by the check of the instrument itself
 
 _BLOCK = struct.Struct(">ffH")
 _READING_BLOCK = f"reading register 0x{_COMBINED:04X}"
@@ -600,6 +601,27 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 f"readings are stale: the converter has stood at {adc} for {now - self._adc_since:.3g} s; switch the "
                 "instrument off and on, and connect again",
             )
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Read the filter back, and see that the converter works.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        wanted, found = self._settings.filter, self._line.read_integer(_FILTER)
+        advice = "" if found == wanted else f"another program changed it from {wanted}; end that"
+        conversions = set()
+        for _ in range(_CONVERSIONS):
+            conversions.add(self._line.read_integer(_ADC_SAMPLE))
+            self._clock.sleep(_POLL)
+        works = len(conversions) > 1
+        return (
+            Finding("filter", f"{found} in the instrument", advice),
+            Finding(
+                "converter",
+                f"from {min(conversions)} to {max(conversions)} in {_CONVERSIONS} readings",
+                "" if works else "switch the instrument off and on, if its converter stands still for longer",
+            ),
+        )
 
 
 def _agree(weight: float, digits: int) -> bool:

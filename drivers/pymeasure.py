@@ -33,6 +33,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
+from bench import registry
 from bench.clock import Clock
 from bench.command_table import (
     ANY_TEXT,
@@ -45,7 +46,7 @@ from bench.command_table import (
     template,
 )
 from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import GeneralActuator, GeneralSensor
 from drivers.device import LineDevice, attempt
 from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
@@ -107,13 +108,18 @@ def instrument_class(reference: str) -> Any:  # noqa: ANN401 - a class of the li
     Raises
     ------
     ValueError
-        If PyMeasure is not installed, or there is no such class, or it is no instrument.
+        If PyMeasure is not installed, the class may not be imported, there is none, or it is no instrument.
     """
     if importlib.util.find_spec("pymeasure") is None:
         raise ValueError("needs PyMeasure; install it by: pip install 'actuator-bench[pymeasure]'")
     from pymeasure.instruments import Instrument
 
     module, _, name = reference.partition(":")
+    try:
+        if module.partition(".")[0] != "pymeasure":
+            registry.check_import(module)
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from None
     try:
         found = getattr(importlib.import_module(module), name)
     # A module of the user's own may fail in any way.

@@ -1,25 +1,34 @@
-"""Base of the emulated laboratories: the lines of their instruments, and events at a given time."""
+"""Base of the emulated laboratories: the lines of their instruments, and their faults."""
 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
 
+import numpy as np
+
 from bench.clock import Clock
 from bench.errors import ConfigurationError
+from bench.faults import ScheduledFault
 from sim_devices import protocol_emulated
+from sim_devices.faults.calendar import Calendar
+from sim_devices.faults.fault import Fault, FaultEvent
+from sim_devices.faults.instrument import instrument_faults
+from sim_devices.faults.line import AnswerFault, FaultyLine, FaultySerial, FaultyTcpServer
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
+from sim_devices.wire import TcpServer, WireServer
 from sim_devices.world import World
 
 T = TypeVar("T")
+
+_HOUR = 3600.0
+_STREAM = 0xFA17
+"""Beside the seed, so that no plant and no instrument draws the same numbers."""
 
 
 @dataclass(frozen=True)
@@ -41,25 +50,6 @@ class TrueValue:
     is_output: bool = False
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Something that can go wrong at any time.
-
-    Attributes
-    ----------
-    summary : str
-        What happens, in one line.
-    inject : callable
-        Make it happen; takes `values` by name.
-    values : mapping of str to float
-        What can be chosen, with its defaults, in the units that the summary says.
-    """
-
-    summary: str
-    inject: Callable[..., None]
-    values: Mapping[str, float] = field(default_factory=dict)
-
-
 def tec_faults(tec: EmulatedTEC) -> dict[str, Fault]:
     """Return the faults of a laboratory that a TEC controller protects itself from (5216G, error numbers)."""
     return {
@@ -77,30 +67,64 @@ class EmulatedLaboratory:
         Its name in messages.
     servers : mapping of str to server
         The instruments by the name of their port: the wire servers of serial ones, and those on TCP.
+    world : World, optional
+        The time of plant and instruments.
+    instruments : mapping of str to object
+        The emulated instruments behind the servers, by the same names. One that has `power_cycle` can be restarted,
+        one that has `freeze` and `thaw` can be frozen.
+    faults : mapping of str to Fault
+        What can go wrong in plant, sensors and instruments; the faults of the lines are added.
+    seed : int
+        Seed of the disturbed answers, and of faults at a rate that have no seed of their own.
 
     Attributes
     ----------
-    world : World or None
-        The time of plant and instruments; None if there is no plant.
-    instruments : mapping of str to object
-        The emulated instruments behind the servers, by the same names; one that has `power_cycle` can be restarted.
     faults : mapping of str to Fault
-        What can go wrong, by name.
+        What can go wrong, by name: `FAULT`, or `INSTRUMENT.FAULT`.
+    lines : mapping of str to FaultyLine
+        The lines of the instruments, by the name of their port.
+    events : list of FaultEvent
+        The faults that have happened.
     """
 
-    world: World | None = None
-    instruments: Mapping[str, object] = MappingProxyType({})
-    faults: Mapping[str, Fault] = MappingProxyType({})
-
-    def __init__(self, title: str, servers: Mapping[str, WireServer | ModbusTcpInstrument], clock: Clock) -> None:
+    def __init__(
+        self,
+        title: str,
+        servers: Mapping[str, WireServer | TcpServer],
+        clock: Clock,
+        *,
+        world: World | None = None,
+        instruments: Mapping[str, object] = MappingProxyType({}),
+        faults: Mapping[str, Fault] = MappingProxyType({}),
+        seed: int = 0,
+    ) -> None:
+        self.world = world
+        self.instruments = instruments
+        self.events: list[FaultEvent] = []
         self._title = title
-        self._servers = servers
         self._clock = clock
+        self._seed = seed
         self._opened = ExitStack()
+        self._calendar = Calendar()
+        self._is_entered = False
+        self._ends: dict[str, Callable[[], None]] = {}
+        self.lines: dict[str, FaultyLine] = {}
+        self._servers: dict[str, FaultySerial | FaultyTcpServer] = {}
+        every = dict(faults)
+        for number, (name, server) in enumerate(servers.items()):
+            # A stream of its own for each line: a fault of one must not change what happens on another.
+            rng = np.random.default_rng((seed, _STREAM, number))
+            line = FaultyLine(name, server, clock, self, rng, self.end)
+            self.lines[name] = line
+            self._servers[name] = (
+                FaultyTcpServer(server, line) if isinstance(server, TcpServer) else FaultySerial(server, line)
+            )
+            every |= line.faults() | instrument_faults(name, instruments.get(name), line)
+        self.faults: Mapping[str, Fault] = MappingProxyType(every)
 
     @property
-    def servers(self) -> Mapping[str, WireServer | ModbusTcpInstrument]:
-        """The instruments by the name of their port, to be served elsewhere."""
+    def servers(self) -> Mapping[str, WireServer | TcpServer]:
+        """The instruments by the name of their port, with the faults of their lines, to be served elsewhere."""
         return MappingProxyType(self._servers)
 
     def open(self) -> Mapping[str, str]:
@@ -115,23 +139,133 @@ class EmulatedLaboratory:
         """Return the state of the plant and of the outputs as they are, by name; the world stands at the present."""
         return {}
 
-    def inject(self, fault: str, values: Mapping[str, float] | None = None) -> None:
-        """Make a fault happen.
+    def inject(self, fault: str, values: Mapping[str, float] | None = None, duration: float | None = None) -> None:
+        """Make a fault happen now.
 
-        Raises ConfigurationError if there is no such fault, or it does not take these values.
+        Parameters
+        ----------
+        fault : str
+            Its name.
+        values : mapping of str to float, optional
+            What is chosen of it.
+        duration : float, optional
+            Laboratory time after which it ends, s; for ever if not given.
+
+        Raises
+        ------
+        ConfigurationError
+            If there is no such fault, or it does not take these values or a duration.
         """
-        if fault not in self.faults:
-            known = ", ".join(self.faults) or "none"
-            raise ConfigurationError(f"the {self._title} has no fault {fault!r}; it has: {known}")
-        known_values = self.faults[fault].values
-        for name in values or {}:
-            if name not in known_values:
-                raise ConfigurationError(
-                    f"fault {fault} takes no value {name!r}; it takes: {', '.join(known_values) or 'none'}"
-                )
+        chosen = self._fault(fault).chosen(fault, values or {}, duration)
+        self._present()
+        self._begin(fault, chosen, duration)
+
+    def end(self, fault: str) -> None:
+        """End a fault that goes on; one that does not is left alone.
+
+        Raises ConfigurationError if there is no such fault.
+        """
+        known, now = self._fault(fault), self._present()
+        if fault not in self._ends:
+            return
+        self._ends.pop(fault)()
+        values = {"disturbed": float(known.disturbed())} if isinstance(known, AnswerFault) else {}
+        if known.undo is not None:
+            known.undo()
+        self.events.append(FaultEvent(now, fault, "ends", values))
+
+    def mend(self, instrument: str) -> None:
+        """End all faults of the line of an instrument."""
+        self._present()
+        for fault in [each for each in self._ends if each in self.lines[instrument].faults()]:
+            self.end(fault)
+
+    def schedule(self, faults: Sequence[ScheduledFault]) -> None:
+        """Let faults happen, their instants counted from now.
+
+        Raises ConfigurationError if there is no such fault, or one does not take its values or its duration; none
+        is scheduled then.
+        """
+        for number, each in enumerate(faults, 1):
+            try:
+                self._fault(each.fault).chosen(each.fault, each.values, each.duration)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"fault {number} of the schedule: {error}") from None
+        for line in self.lines.values():
+            line.is_watched = True
+        begun = self._present()
+        for number, each in enumerate(faults):
+            if each.at is not None:
+                self.at(begun + each.at, partial(self._happen, each))
+            else:
+                rng = np.random.default_rng((self._seed, _STREAM, number) if each.seed is None else each.seed)
+                self._add_next(each, rng, begun, begun)
+
+    def at(self, instant: float, act: Callable[[], None]) -> Callable[[], None]:
+        """Do something at an instant (s of laboratory time), when the world stands there; return what prevents it."""
+        if not self._is_entered:
+            self._is_entered = True
+            # Not before it is needed: the world asks for deadlines with each sample of a fast loop.
+            if self.world is not None:
+                self.world.add(self._calendar)
+        return self._calendar.add(instant, act)
+
+    def catch_up(self) -> None:
+        """Let the faults that are due by the clock's present time happen."""
         if self.world is not None:
-            self.world.advance()
-        self.faults[fault].inject(**{**known_values, **(values or {})})
+            if self._calendar.deadline() <= self._clock.now():
+                self.world.advance()
+        else:
+            while self._calendar.deadline() <= self._clock.now():
+                self._calendar.expire()
+
+    def next_change(self) -> float:
+        """Return the laboratory time (s) of the next fault that begins or ends; infinity if there is none."""
+        return self._calendar.deadline()
+
+    def _fault(self, name: str) -> Fault:
+        if name not in self.faults:
+            known = ", ".join(self.faults) or "none"
+            raise ConfigurationError(f"the {self._title} has no fault {name!r}; it has: {known}")
+        return self.faults[name]
+
+    def _present(self) -> float:
+        """Bring the world to the present and return the time, s; within what is due, that is its instant."""
+        if self.world is None:
+            return self._clock.now()
+        self.world.advance()
+        return self.world.time
+
+    def _happen(self, each: ScheduledFault) -> None:
+        self._begin(each.fault, self.faults[each.fault].chosen(each.fault, each.values, each.duration), each.duration)
+
+    def _add_next(self, each: ScheduledFault, rng: np.random.Generator, begun: float, last: float) -> None:
+        """Enter the next instant of a fault that comes at a rate: after a time that is distributed exponentially."""
+        assert each.rate is not None
+        instant = last + float(rng.exponential(_HOUR / each.rate))
+        if each.until is not None and instant > begun + each.until:
+            return
+
+        def happen() -> None:
+            self._happen(each)
+            self._add_next(each, rng, begun, instant)
+
+        self.at(instant, happen)
+
+    def _begin(self, name: str, chosen: Mapping[str, float], duration: float | None) -> None:
+        fault = self.faults[name]
+        if name in self._ends:
+            self.end(name)
+        if fault.undo is not None:
+            take_out = _nothing
+            if duration is not None:
+                take_out = self.at(self._present() + duration, partial(self.end, name))
+            self._ends[name] = take_out
+        if duration is not None:
+            for line in self.lines.values():
+                line.is_watched = True
+        self.events.append(FaultEvent(self._present(), name, "begins", chosen))
+        fault.begin(**chosen)
 
     def operate(self, task: str, value: float) -> None:  # noqa: ARG002
         """Refuse a task.
@@ -153,18 +287,5 @@ def compile_loops(plant: T, use: Callable[[T], object]) -> None:
     use(copy.deepcopy(plant))
 
 
-class Event:
-    """Something that happens once, at its time (s); a `Timed` part of the world."""
-
-    def __init__(self, instant: float, happen: Callable[[], None]) -> None:
-        self._due = instant
-        self._happen = happen
-
-    def deadline(self) -> float:
-        """Return when it is due, s; inf once it has happened."""
-        return self._due
-
-    def expire(self) -> None:
-        """Make it happen."""
-        self._due = math.inf
-        self._happen()
+def _nothing() -> None:
+    pass

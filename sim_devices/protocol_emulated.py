@@ -10,14 +10,15 @@ clock; a connection of an instrument on TCP (`sim_devices.wire.modbus_tcp`) take
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException
 
 from bench.clock import Clock
-from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpStream
+from sim_devices.wire import Connection, Stream, TcpServer, WireServer
+from sim_devices.wire.modbus_tcp import FramingError
 
 _SCHEME = "emulated://"
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
@@ -27,7 +28,7 @@ _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
 class _Socket:
     """The place of an instrument at its address."""
 
-    server: WireServer | ModbusTcpInstrument
+    server: WireServer | TcpServer
     clock: Clock
     taken: bool = True
 
@@ -42,7 +43,7 @@ def install() -> None:
         serial.protocol_handler_packages.append(package)
 
 
-def register(name: str, server: WireServer | ModbusTcpInstrument, clock: Clock) -> str:
+def register(name: str, server: WireServer | TcpServer, clock: Clock) -> str:
     """Put an emulated instrument at an address of its own in this process, and return the address.
 
     It is `emulated://NAME`, or `emulated://NAME-2` and so on while other instruments of that name are there.
@@ -91,23 +92,22 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def _plug_in(self) -> None:
         socket = _sockets[self._name]
-        stream: WireServer | ModbusTcpStream
-        if isinstance(socket.server, ModbusTcpInstrument):
+        stream: Stream
+        self._connection: Connection | None = None
+        if isinstance(socket.server, TcpServer):
             try:
-                stream = socket.server.connect()
+                stream = self._connection = socket.server.connect()
             except ConnectionRefusedError as refusal:
                 raise SerialException(f"{_SCHEME}{self._name}: {refusal}") from None
         else:
             stream = socket.server
         self._socket, self._stream = socket, stream
-        self._receive = stream.receive
-        self._line = None if isinstance(stream, ModbusTcpStream) else stream
         self._clock = socket.clock
 
     def close(self) -> None:
         """Disconnect."""
-        if self.is_open and isinstance(self._stream, ModbusTcpStream):
-            self._stream.close()
+        if self.is_open and self._connection is not None:
+            self._connection.close()
         self.is_open = False
 
     @property
@@ -125,7 +125,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         """
         self._check()
         received = self._received
-        if self._line is not None or len(received) < size:
+        if self._connection is None or len(received) < size:
             self._wait_for(size)
         data = bytes(received[:size])
         del received[:size]
@@ -143,15 +143,18 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     def _wait_for(self, size: int) -> None:
         """Let time pass until so many bytes are there, at most the timeout."""
         self._hear()
-        if self._timeout == 0:
-            return
-        end = math.inf if self._timeout is None else self._clock.now() + self._timeout
+        if self._timeout != 0:
+            self._wait_until(size, self._end_of_timeout())
+
+    def _end_of_timeout(self) -> float:
+        return math.inf if self._timeout is None else self._clock.now() + self._timeout
+
+    def _wait_until(self, size: int, end: float) -> None:
+        """Let time pass until so many bytes are there, at most until `end` (s)."""
         while len(self._received) < size:
-            instant = end
-            if self._line is not None:
-                due = self._line.next_unsolicited()
-                # What is overdue and has not come does not come.
-                instant = min(end, due) if due > self._clock.now() else end
+            due = self._stream.next_unsolicited()
+            # What is overdue and has not come does not come.
+            instant = min(end, due) if due > self._clock.now() else end
             if instant == math.inf:
                 raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
             self._clock.sleep_until(instant)
@@ -160,8 +163,10 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
                 return
 
     def _hear(self) -> None:
-        if self._line is not None:
-            self._received += self._line.unsolicited()
+        try:
+            self._received += self._stream.unsolicited()
+        except (FramingError, ConnectionError) as error:
+            raise self._ended(error) from None
 
     def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
         """Return what was received up to `expected`, or `size` bytes; what there is after the timeout on the clock.
@@ -171,14 +176,17 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         self._check()
         self._hear()
         received = self._received
-        end = received.find(expected)
-        found = len(received) + 1 if end < 0 else end + len(expected)
-        if size is not None and size < found:
-            found = size
-        if found > len(received):
-            return self.read(found)
-        data = bytes(received[:found])
-        del received[:found]
+        most = sys.maxsize if size is None else size
+        begin = received.find(expected)
+        if begin < 0 and self._timeout != 0:
+            until, before = self._end_of_timeout(), -1
+            while begin < 0 and before < len(received) < most:
+                before = len(received)
+                self._wait_until(before + 1, until)
+                begin = received.find(expected)
+        count = min(len(received) if begin < 0 else begin + len(expected), most)
+        data = bytes(received[:count])
+        del received[:count]
         return data
 
     def write(self, data: bytes, /) -> int:
@@ -189,24 +197,24 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         if not self.is_open or not self._socket.taken:
             self._check()
         sent = bytes(data)
-        if self._line is None:
+        if self._connection is not None:
             try:
-                self._received += self._receive(sent)
+                self._received += self._stream.receive(sent)
             except (FramingError, ConnectionError) as error:
                 raise self._ended(error) from None
             return len(sent)
         self._clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
         self._hear()
-        answer = self._receive(sent)
+        answer = self._stream.receive(sent)
         self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
 
     def exchange(self, data: bytes) -> bytes:
         """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
-        if self._line is None and self.is_open and self._socket.taken and not self._received:
+        if self._connection is not None and self.is_open and self._socket.taken and not self._received:
             try:
-                return self._receive(data)
+                return self._connection.receive(data)
             except (FramingError, ConnectionError) as error:
                 raise self._ended(error) from None
         self.write(data)
@@ -234,7 +242,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             raise PortNotOpenError
         if self._socket.taken:
             return
-        if self._name not in _sockets or self._line is None:
+        if self._name not in _sockets or self._connection is not None:
             raise SerialException(f"{_SCHEME}{self._name} was unplugged")
         # A serial line that is plugged in again goes on; a connection does not.
         self._plug_in()

@@ -152,9 +152,9 @@ class SCPILaboratory(EmulatedLaboratory):
     def __init__(self, settings: SCPILaboratorySettings, clock: Clock, seed: int) -> None:
         found = tables(settings.devices)
         self.plant = network(found, settings.signals)
-        self.world = World(self.plant, clock)
+        world = World(self.plant, clock)
         generators = np.random.default_rng(seed).spawn(len(found))
-        self.instruments: dict[str, EmulatedTextInstrument] = {}
+        instruments: dict[str, EmulatedTextInstrument] = {}
         for (device, (port, table)), rng in zip(found.items(), generators, strict=True):
             meters = {}
             for name in table.signals:
@@ -162,6 +162,8 @@ class SCPILaboratory(EmulatedLaboratory):
                 read = partial(self.plant.value, f"{device}_{name}")
                 meters[name] = Meter(read, physics.noise, physics.resolution)
             drive = partial(self.plant.set, f"{device}_output") if isinstance(table, ActuatorTable) else None
-            self.instruments[port] = EmulatedTextInstrument(device, self.world, table, meters, rng, drive)
-        servers = {port: TextServer(instrument) for port, instrument in self.instruments.items()}
-        super().__init__("laboratory of text instruments", servers, clock)
+            instruments[port] = EmulatedTextInstrument(device, world, table, meters, rng, drive)
+        servers = {port: TextServer(instrument) for port, instrument in instruments.items()}
+        super().__init__(
+            "laboratory of text instruments", servers, clock, world=world, instruments=instruments, seed=seed
+        )

@@ -127,6 +127,25 @@ def run(
             help="Endpoints file of `bench emulate --json`: use the instruments served there, on their clock.",
         ),
     ] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Faults of the emulated laboratory from a file (.toml, .jsonl): at = seconds of laboratory time "
+            "from the start of the run, or rate an hour with a seed; fault, values, duration. "
+            "docs/reference/emulate.md lists them.",
+        ),
+    ] = None,
+    interlock_rate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            min=0.01,
+            max=50.0,
+            help="Look at the interlocks of an emulated rig so often in a laboratory second, beside each reading; on "
+            "hardware the rig file says it ([safety] rate, 5 Hz).",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
@@ -173,6 +192,8 @@ def run(
         folder=out,
         live=live,
         attach=attach,
+        interlock_rate=interlock_rate,
+        faults=faults,
     )
     # Until the result is printed: a terminal that hangs must not keep the process from being ended.
     with Interrupts(say_at_once) as interrupts:

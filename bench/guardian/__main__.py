@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from bench.clock import Stopwatch, WallClock
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.process import Guardian
 from bench.guardian.start import inherited
+from bench.locks import Holder, Locks, port_of
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.safety import make_safe
@@ -20,21 +22,32 @@ _PATIENCE = 60.0
 """Time for the first message, s."""
 
 
-def _open(hello: Message) -> Rig:
-    """Connect the rig that the bench names.
+def _open(hello: Message, stack: ExitStack) -> Rig:
+    """Lock and connect the rig that the bench names; nothing is sent to an instrument that another bench uses.
 
     Raises
     ------
     ConfigurationError
-        If the rig file is wrong.
+        If the rig file is wrong, or another bench uses one of the lines or instruments.
     DeviceError
         If a device cannot be connected.
     """
     file = load_rig(hello["rig"], hello["overrides"])
-    if hello["attach"] is None:
-        return Rig(file, WallClock(), hello["seed"])
-    attachment = attach(Path(hello["attach"]), file.name)
-    return Rig(file.served_by(attachment), attachment.clock, hello["seed"])
+    locks = stack.enter_context(Locks(Holder.of_this_process(file.name, hello["doing"], hello["process"])))
+    if hello["attach"] is not None:
+        attachment = attach(Path(hello["attach"]), file.name)
+        ports = attachment.open()
+        locks.take_lines(port_of(entry.wired(ports, file.path)) for entry in file.devices)
+        rig = Rig(file.served_by(attachment), attachment.clock, hello["seed"])
+        stack.callback(rig.close)
+        # Served instruments of several laboratories may have the same serial numbers.
+        return rig
+    locks.take_lines(port_of(entry.settings) for entry in file.devices)
+    rig = Rig(file, WallClock(), hello["seed"])
+    stack.callback(rig.close)
+    for device in rig.devices.values():
+        locks.take_instrument(device.identity)
+    return rig
 
 
 def _describe(rig: Rig) -> dict[str, Any]:
@@ -49,34 +62,36 @@ def _describe(rig: Rig) -> dict[str, Any]:
 def main() -> int:
     """Hold the rig that the bench names until its run has ended and every device is safe."""
     channel = Channel(inherited(sys.argv[1:]))
-    waited = Stopwatch()
-    try:
-        received: list[Message] = []
-        # It may come in pieces.
-        while not received:
-            if waited.seconds() > _PATIENCE:
-                return 1
-            if channel.wait(_PATIENCE):
-                received = channel.receive()
-        hello = received[0]
+    with ExitStack() as stack:
         try:
-            rig = _open(hello)
-        except Exception as error:
-            channel.send({"n": hello["n"], "error": to_message(error)})
+            hello = _first_message(channel)
+            if hello is None:
+                return 1
+            try:
+                rig = _open(hello, stack)
+            except Exception as error:
+                channel.send({"n": hello["n"], "error": to_message(error)})
+                return 1
+        except ChannelError:
             return 1
-    except ChannelError:
-        return 1
-    try:
-        guardian = Guardian(channel, rig, hello["process"])
-        guardian.begin(hello, _describe(rig))
-        guardian.serve()
-    except BaseException:
-        # A defect; its lines may not be closed before the devices are safe.
-        make_safe(rig.devices.values())
-        raise
-    finally:
-        rig.close()
+        try:
+            guardian = Guardian(channel, rig, hello["process"])
+            guardian.begin(hello, _describe(rig))
+            guardian.serve()
+        except BaseException:
+            # A defect; its lines may not be closed before the devices are safe.
+            make_safe(rig.devices.values())
+            raise
     return 0
+
+
+def _first_message(channel: Channel) -> Message | None:
+    """Return the first message, which may come in pieces; None if it does not come."""
+    waited = Stopwatch()
+    while waited.seconds() < _PATIENCE:
+        if channel.wait(_PATIENCE) and (received := channel.receive()):
+            return received[0]
+    return None
 
 
 if __name__ == "__main__":

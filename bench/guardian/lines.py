@@ -21,11 +21,12 @@ SAFE, BENCH, LOOK = range(3)
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a call of a device."""
+    """What came of a call of a device; `was_away` is whether its line was lost and came back meanwhile."""
 
     device: str
     value: Any
     error: BaseException | None
+    was_away: bool
 
 
 @dataclass(order=True)
@@ -84,21 +85,20 @@ class LineThreads:
     def _work(self, calls: queue.PriorityQueue[_Call]) -> None:
         while True:
             call = calls.get()
-            value, problem = None, None
             try:
-                value = self._carry(call)
+                result = self._carry(call)
             # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
             except BaseException as error:
-                problem = error
+                result = Result(call.device, None, error, was_away=False)
             # The thread is needed for the safe state, whatever becomes of an answer.
             with suppress(Exception):
-                call.done(Result(call.device, value, problem))
+                call.done(result)
 
-    def _carry(self, call: _Call) -> Any:  # noqa: ANN401 - what a device returns
+    def _carry(self, call: _Call) -> Result:
         if call.priority != SAFE and self._ending.is_set():
             raise DeviceConnectionError(call.device, "was not asked, as the run has ended")
         try:
-            return call.call()
+            return Result(call.device, call.call(), None, was_away=False)
         except DeviceConnectionError as lost:
             # The safe state opens a line of its own.
             if call.priority == SAFE or self._ending.is_set():
@@ -109,4 +109,4 @@ class LineThreads:
             # A set-point that waited for its line may not be sent after the end.
             if self._ending.is_set():
                 raise
-            return call.call()
+            return Result(call.device, call.call(), None, was_away=True)

@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.attachment import AttachedClock
 from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
-from bench.errors import BenchError, ConfigurationError, GuardianError
+from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianError
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import LONGEST_ANSWER, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
@@ -47,6 +48,12 @@ _TRY_FOR = 600.0
 _BLIND = 2.0
 """Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
 
+_TRIES = 3
+"""How often all devices are read again after a line was lost and came back while they were read."""
+
+_NOTHING = Result("", None, None, was_away=False)
+"""The result of a request that concerns no device."""
+
 _LONGEST_WAIT = 0.5
 """Longest time between two turns of the loop, s."""
 
@@ -60,6 +67,8 @@ class _Job:
     failed: Callable[[BaseException], None]
     values: dict[str, Any] = field(default_factory=dict)
     error: BaseException | None = None
+    was_late: bool = False
+    """Whether a line was away meanwhile, so that the values are of different times."""
 
 
 class Guardian:
@@ -95,10 +104,12 @@ class Guardian:
         for each in (self._wake, self._woken):
             each.setblocking(False)
         self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
-        self._looking = False
+        self._looking: set[str] = set()
+        self._latest: dict[str, dict[str, float]] = {}
+        self._concerned = {name: self._signals_of(name) for name in self._looked_at}
         self._request: Message | None = None
         self._requested = 0.0
-        self._last_seen = self._wall.now()
+        self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
         self._bench_is_there = True
         self._writes_stacks = False
         self._ending: float | None = None
@@ -164,16 +175,18 @@ class Guardian:
             self._core.trip(GuardianError("the guardian was asked to end by SIGTERM"))
         self._core.advance(now)
         if self._request is not None:
-            self._last_seen = now
+            self._seen_at = dict.fromkeys(self._seen_at, now)
             if (taken := now - self._requested) > LONGEST_ANSWER + self._rig.file.safety.reconnect:
                 self._core.trip(GuardianError(f"a request was not carried out within {taken:.0f} s"))
-        elif self._watched and now - self._last_seen > _BLIND + self._blind_allowance():
-            self._core.trip(GuardianError(f"the interlocks could not be looked at for {now - self._last_seen:.1f} s"))
+        for name, seen in self._seen_at.items():
+            if now - seen > _BLIND + self._longest_away(name):
+                self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
         if self._core.over:
             self._keep_safe(now)
-        elif self._core.look_due(now) and not self._looking and self._looked_at:
-            self._looking = True
-            self._start(LOOK, self._looked_at, self._seen, self._blind)
+        elif self._core.look_due(now):
+            for name in self._looked_at.keys() - self._looking:
+                self._looking.add(name)
+                self._submit(LOOK, name, self._looked_at[name], self._take_look)
 
     def _is_over(self) -> bool:
         if self._ending is None or self._safe is None:
@@ -181,7 +194,14 @@ class Guardian:
         if not (self._unsafe or self._pending):
             return self._reported or not self._bench_is_there
         # A driver that hangs for good does not keep this process for good.
-        return not self._bench_is_there and self._wall.now() - self._ending > _TRY_FOR
+        return not self._bench_is_there and self._is_in_vain()
+
+    def _is_in_vain(self) -> bool:
+        """Return whether it is of no use to try again: after 10 min, or as the emulated laboratory is gone."""
+        assert self._ending is not None
+        clock = self._rig.clock
+        gone = isinstance(clock, AttachedClock) and clock.is_alone
+        return gone or self._wall.now() - self._ending > _TRY_FOR
 
     # The bench
 
@@ -231,7 +251,9 @@ class Guardian:
         self._request = None
         try:
             self._core.reply(self._wall.now())
-            news, self._news = self._news, []
+            # Threads of lines append to it.
+            news = self._news[:]
+            del self._news[: len(news)]
             cause = self._core.cause
             pause, self._core.pause = self._core.pause, ""
             self._channel.send(
@@ -260,15 +282,19 @@ class Guardian:
         self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
         self._reply(message)
 
-    def _look(self, message: Message) -> None:
+    def _look(self, message: Message, tries: int = _TRIES) -> None:
         readers = self._rig.readers(Look(message["look"]), message["wanted"])
 
         def done(readings: dict[str, Any]) -> None:
+            # What other devices gave before a line was back is too old to stand beside it.
+            if job.was_late and tries > 1:
+                self._look(message, tries - 1)
+                return
             values = self._rig.assembled({name: readings[name] for name in readers})
             self._judge(self._rig.clock.now(), values)
             self._reply(message, values)
 
-        self._start(BENCH, readers, done, partial(self._refuse, message))
+        job = self._start(BENCH, readers, done, partial(self._refuse, message))
 
     def _apply(self, message: Message) -> None:
         setpoints = message["setpoints"]
@@ -343,14 +369,24 @@ class Guardian:
     def _look_readers(self) -> dict[str, Callable[[], dict[str, float]]]:
         """Return what is asked at each look: what interlocks need, and what feeds the watchdogs of instruments."""
         readers = self._rig.readers(Look.PART, self._watched)
-        for name, device in self._rig.devices.items():
-            if device.watchdog:
-                readers.setdefault(name, device.glance)
+        for name, device in self._rig.actuators.items():
+            readers.setdefault(name, device.glance)
         return {name: readers[name] for name in self._rig.devices if name in readers}
 
-    def _seen(self, readings: dict[str, Any]) -> None:
-        self._looking = False
-        values = self._rig.assembled({name: readings[name] for name in self._looked_at})
+    def _signals_of(self, name: str) -> frozenset[str]:
+        """Return the signals of a device, and the derived ones that come from them."""
+        own = {signal_.name for signal_ in self._rig.devices[name].signals}
+        return frozenset(own | {each for each in self._rig.derived if not own.isdisjoint(self._rig.sources({each}))})
+
+    def _take_look(self, result: Result) -> None:
+        """Judge what a device has shown at a look; a line that is away keeps no other from being looked at."""
+        self._looking.discard(result.device)
+        if result.error is not None:
+            self._core.trip(_as_bench_error(result.error))
+            return
+        self._latest[result.device] = result.value
+        known = self._rig.assembled({name: self._latest[name] for name in self._looked_at if name in self._latest})
+        values = {name: known[name] for name in self._concerned[result.device] if name in known}
         self._box.saw(values)
         self._judge(self._rig.clock.now(), values)
 
@@ -364,25 +400,16 @@ class Guardian:
 
     def _judge(self, t: float, values: dict[str, float]) -> None:
         now = self._wall.now()
-        if self._watched <= values.keys():
-            self._last_seen = now
+        for name in self._seen_at:
+            if self._concerned[name] & self._watched <= values.keys():
+                self._seen_at[name] = now
         setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
         findings = self._core.judge(t, values, setpoints, now=now, factor=self._factor)
         self._news += news_of(findings)
 
-    def _blind(self, error: BaseException) -> None:
-        self._looking = False
-        self._core.trip(_as_bench_error(error))
-
-    def _blind_allowance(self) -> float:
-        return max((self._longest_away(name) for name in self._looked_at), default=0.0)
-
     def _longest_away(self, name: str) -> float:
         longest = self._rig.file.safety.reconnect
-        device = self._rig.devices[name]
-        if any(signal_.name in self._watched for signal_ in device.signals):
-            return min(longest, _BLIND)
-        return longest
+        return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
         text = f"{name}: line lost for {seconds:.1f} s: {why}"
@@ -458,12 +485,15 @@ class Guardian:
         calls: Mapping[str, Callable[[], Any]],
         done: Callable[[dict[str, Any]], None],
         failed: Callable[[BaseException], None],
-    ) -> None:
+    ) -> _Job:
+        """Have something done by several devices; return what the results are collected in."""
         job = _Job(set(calls), done, failed)
-        if not calls:
-            done({})
         for name, call in calls.items():
             self._submit(priority, name, call, partial(self._take_part, job))
+        if not calls:
+            self._results.put((partial(self._take_part, job), _NOTHING))
+            self._wake_main()
+        return job
 
     def _submit(self, priority: int, device: str, call: Callable[[], Any], take: Callable[[Result], None]) -> None:
         """Have something done on the line of a device; `take` is called by the main loop with what came of it."""
@@ -472,6 +502,9 @@ class Guardian:
     def _hand_over(self, take: Callable[[Result], None], result: Result) -> None:
         # In the thread of a line.
         self._results.put((take, result))
+        self._wake_main()
+
+    def _wake_main(self) -> None:
         with suppress(OSError):
             self._wake.send(b"\0")
 
@@ -490,6 +523,7 @@ class Guardian:
         job.waiting.discard(result.device)
         job.values[result.device] = result.value
         job.error = job.error or result.error
+        job.was_late = job.was_late or result.was_away
         if job.waiting:
             return
         if job.error is not None:

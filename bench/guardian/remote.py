@@ -26,6 +26,7 @@ from bench.rig import Look
 from bench.rig_file import RigFile
 from bench.roles import Floats
 from bench.station.interface import Arrivals, News, Station
+from bench.upkeep.rescue import rescue_by_another_process
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
@@ -61,6 +62,8 @@ class GuardedRig:
         Endpoints file of `bench emulate`, where the instruments are served.
     seed : int
         Seed of everything random in an emulated laboratory.
+    doing : str
+        What it is opened for, in a few words, for who finds the rig in use.
     """
 
     file: RigFile
@@ -68,13 +71,14 @@ class GuardedRig:
     overrides: Mapping[str, str]
     attach: Path | None
     seed: int
+    doing: str
 
 
 class RemoteStation(Station):
     """A station in another process.
 
-    One request is outstanding at a time, and each has a number. A guardian that is lost is replaced by `rescue`,
-    which makes the devices safe; this process never opens a line.
+    One request is outstanding at a time, and each has a number. If the guardian is lost, `bench safe` in a process of
+    its own makes the devices safe; this one never opens a line.
 
     Parameters
     ----------
@@ -82,8 +86,6 @@ class RemoteStation(Station):
         What to open.
     clock : Clock
         The clock of the run.
-    rescue : callable
-        Makes the devices of the rig safe without a guardian; returns by device `safe`, or what went wrong.
 
     Raises
     ------
@@ -95,9 +97,9 @@ class RemoteStation(Station):
         If the guardian does not start.
     """
 
-    def __init__(self, guarded: GuardedRig, clock: Clock, rescue: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
         self.clock = clock
-        self._rescue = rescue
+        self._guarded = guarded
         self._answer_within = LONGEST_ANSWER + guarded.file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
@@ -120,6 +122,7 @@ class RemoteStation(Station):
                 overrides=dict(guarded.overrides),
                 attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
+                doing=guarded.doing,
                 process=os.getpid(),
             )
         except BaseException as error:
@@ -252,8 +255,10 @@ class RemoteStation(Station):
             faulthandler.unregister(_STACKS)
             self._stacks.close()
             path = Path(self._stacks.name)
-            if not path.stat().st_size:
-                path.unlink()
+            # The folder may be gone.
+            with suppress(OSError):
+                if not path.stat().st_size:
+                    path.unlink()
             self._stacks = None
         if self._log.closed:
             return
@@ -276,8 +281,9 @@ class RemoteStation(Station):
         self._process.kill()
         self._has_ended()
         self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
+        guarded = self._guarded
         try:
-            return self._rescue()
+            return rescue_by_another_process(guarded.rig, guarded.overrides, guarded.attach, self.description.devices)
         except Exception as failure:
             return dict.fromkeys(self.description.devices, f"{type(failure).__name__}: {failure}")
 

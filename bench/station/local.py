@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
 from bench.devices import Actuator, Status
-from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.interlocks import Finding, InterlockWatch
 from bench.rig import Look, Rig
 from bench.roles import Floats
@@ -18,6 +19,9 @@ from bench.station.interface import Arrivals, News, Station, masked, news_of
 from bench.station.reconnection import reconnect
 
 _T = TypeVar("_T")
+
+_TRIES = 3
+"""How often all devices are read again after a line was lost and came back while they were read."""
 
 
 class LocalStation(Station):
@@ -44,6 +48,7 @@ class LocalStation(Station):
         self._statuses: list[Status] = []
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
+        self._lost: set[str] = set()
 
     @property
     def has_operator(self) -> bool:
@@ -67,11 +72,32 @@ class LocalStation(Station):
     def look(self, look: Look, wanted: Collection[str] = ()) -> dict[str, float]:
         """Read the devices; values by signal name."""
         readers = self._rig.readers(look, wanted)
-        return self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+        lost: set[str] = set()
+        for _ in range(_TRIES):
+            self._lost.clear()
+            try:
+                values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+            except DeviceError as error:
+                if others := (lost | self._lost) - {error.device}:
+                    raise _blamed(error, others) from error
+                raise
+            # What other devices gave before a line was back is too old to stand beside it.
+            if not self._lost:
+                break
+            lost |= self._lost
+        return values
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
         """Return a function that takes a quick reading of the devices that some signals come from."""
-        return self._rig.quick_reader(wanted)
+        read = self._rig.quick_reader(wanted)
+
+        def read_again() -> dict[str, float]:
+            try:
+                return read()
+            except DeviceConnectionError:
+                return self.look(Look.PART, wanted)
+
+        return read_again
 
     def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
         """Return a function that sends those of some set-points that have changed."""
@@ -92,7 +118,11 @@ class LocalStation(Station):
                 for actuator, value in changed:
                     actuator.check(value)
             for actuator, value in changed:
-                actuator.set(value)
+                try:
+                    actuator.set(value)
+                except DeviceConnectionError as error:
+                    self._reconnect(actuator.name, error)
+                    actuator.set(value)
 
         return move
 
@@ -185,10 +215,24 @@ class LocalStation(Station):
         try:
             return call()
         except DeviceConnectionError as error:
-            device = self._rig.devices[name]
-            seconds = reconnect(device, error, self.clock, self._rig.file.safety.reconnect, lambda: self._core.over)
-            self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
+            self._reconnect(name, error)
             return call()
+
+    def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
+        longest = self._rig.file.safety.reconnect
+        seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
+        self._lost.add(name)
+        self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
+
+    def _feed_others(self, name: str) -> bool:
+        """Keep the watchdogs of other instruments from expiring; return False, as the run has not ended."""
+        for other, device in self._rig.actuators.items():
+            # That of a servo only stops a motion, so it declares none.
+            if other != name:
+                # What is wrong with it the next reading finds.
+                with suppress(DeviceError):
+                    device.glance()
+        return False
 
     def _note(self, findings: tuple[Finding, ...]) -> None:
         if findings:
@@ -197,3 +241,9 @@ class LocalStation(Station):
     def _raise_if_tripped(self) -> None:
         if self._core.cause is not None:
             raise self._core.cause
+
+
+def _blamed(error: DeviceError, lost: Collection[str]) -> DeviceError:
+    """Return an error that also names the devices that were out of reach, which may be the cause of it."""
+    text = str(error).removeprefix(f"{error.device}: ")
+    return type(error)(error.device, f"{text} ({', '.join(sorted(lost))} had been out of reach just before)")

@@ -31,7 +31,7 @@ def reconnect(
     longest : float
         How long the line may be away, s; an instrument with a watchdog only for 0.6 of its time.
     given_up : callable
-        Whether the run has ended meanwhile.
+        Called between two attempts; returns whether the run has ended meanwhile.
 
     Returns
     -------

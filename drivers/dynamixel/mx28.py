@@ -22,16 +22,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
 from bench.clock import Clock
-from bench.devices import Actuator, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.devices import Actuator, Finding, Identity, Limits, Status
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.dynamixel.protocol2 import (
-    FEEDBACK,
     PING,
     RANGE_ERROR,
     READ,
@@ -54,6 +53,7 @@ _ACCELERATION_UNIT = 214.577 * 2.0 * math.pi / 3600.0  # 214.577 rev/min² in ra
 _WATCHDOG_UNIT = 0.02  # s
 _DELAY_UNIT = 2e-6  # s
 _WATCHDOG_EXPIRED = 255  # −1 in one byte
+_EXPIRED = -1
 _EXTENDED_POSITION_MODE = 4
 _REQUIRED_SHUTDOWN = 0b110100  # overload, electrical shock, overheating
 _ANSWER_EVERYTHING = 2  # value of the status return level
@@ -62,9 +62,9 @@ _START_TIMEOUT = 5.0
 _REBOOT_DELAY = 0.2
 _EMERGENCY_PATIENCE = 1.0  # s for a reboot on the way to the safe state
 _STANDSTILL = 1.0  # s beside the goal without a motion that count as blocked
-_SUSPICIOUS_SILENCE = 0.8  # share of the watchdog's time
-_ARRIVAL = struct.Struct("<B3xhii")  # moving, moving status and PWM, load, velocity, position
-_ARRIVAL_ADDRESS = 122
+_SAFE_WITHIN = 2.0  # with a reboot
+_MOST_READINGS = 4
+_SAME_TICK = 5e-3  # s after which the realtime tick, in ms, has moved on
 
 
 @dataclass
@@ -102,6 +102,43 @@ _GOAL = _Item(116, 4, "goal position")
 _POSITION = _Item(132, 4, "position")
 _VOLTAGE = _Item(144, 2, "input voltage")
 _TEMPERATURE = _Item(146, 1, "temperature")
+
+_TICK, _MOVING, _LOAD, _VELOCITY = 120, 122, 126, 128
+_FEEDBACK = struct.Struct("<BBBbiHBhii")
+_FEEDBACK_BYTES = tuple(
+    address + offset
+    for address, size in (
+        (_RETURN_LEVEL.address, 1),
+        (_TORQUE.address, 1),
+        (_HARDWARE_ERROR.address, 1),
+        (_WATCHDOG.address, 1),
+        (_GOAL.address, 4),
+        (_TICK, 2),
+        (_MOVING, 1),
+        (_LOAD, 2),
+        (_VELOCITY, 4),
+        (_POSITION.address, 4),
+    )
+    for offset in range(size)
+)
+"""Addresses that the indirect data stand for; the return level, which is 2, tells whether they still do."""
+_INDIRECT_ADDRESSES, _INDIRECT_DATA = 168, 224
+
+
+class _Feedback(NamedTuple):
+    """What the servo reports in one reading, in its units."""
+
+    return_level: int
+    torque: int
+    hardware_error: int
+    watchdog: int
+    goal: int
+    tick: int
+    moving: int
+    load: int
+    velocity: int
+    position: int
+
 
 HARDWARE_ERRORS: Mapping[int, tuple[str, str]] = {
     0: ("input voltage", "check the power supply and its cable; allowed are the voltage limits set in the servo"),
@@ -211,6 +248,16 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     is raised with its meaning, voltage and temperature. After a shutdown only `reboot` or a power cycle brings
     the torque back, and both lose the number of turns.
 
+    That is all it does by itself: the torque stays on after the death of its host, so `watchdog` is None, and only
+    `safe` switches the torque off.
+
+    A reading is one block of indirect data (addresses 168 to 251): torque, bus watchdog, goal, realtime tick, motion,
+    load, velocity, position, and the status return level. The indirect addresses live in RAM: after a restart the
+    level is 0 there instead of 2. So the next reading finds the restart before it believes a position, which may be
+    off by whole turns; from then on every reading and every set-point is a `DeviceRestartedError`, until the servo is
+    connected again with its `zero_counts` checked. A goal or a torque that is not the one that was sent is a
+    `DeviceError` of the next reading, and so is a tick that stands still.
+
     The first set-point after the torque was off takes the present position as the goal before it switches the
     torque on, so that the shaft does not jump to a previous goal.
 
@@ -222,9 +269,11 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
         self._names = [signal.name for signal in self.signals]
-        self._goal = 0
-        self._armed = False
-        self._expired = False
+        self._goal: int | None = 0
+        self._on = self._restarted = False
+        self._tick = -1
+        self._read_at = -math.inf
+        self._read_feedback = line.reading(_INDIRECT_DATA, _FEEDBACK.size)
 
     @classmethod
     def _open_line(cls, name: str, settings: MX28SettingsT, clock: Clock) -> ServoLine:
@@ -235,6 +284,16 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """The allowed set-points: the limits of the settings."""
         return self._settings.limits
 
+    @property
+    def safe_within(self) -> float:
+        """Longest time that `safe` takes on a line that works, s, with the reboot of a servo that refuses."""
+        return _SAFE_WITHIN
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected."""
+        return self._line.repeats
+
     def set(self, value: float) -> Status:
         """Move to a set-point, with a resolution of 0.00153 rad; switches the torque on if it is off.
 
@@ -243,8 +302,9 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """
         self.check(value)
         goal = self._counts(value / self._settings.per_radian)
-        _, _, position, _, _ = self._feedback()
-        if not self._read(_TORQUE):
+        found = self._feedback()
+        position = found.position
+        if not found.torque:
             self._switch_on(position)
         self._write_goal(goal)
         self._setpoint = value
@@ -254,10 +314,10 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def measure(self) -> dict[str, float]:
         """Measure position, velocity and inferred load (1), in one round trip."""
-        load, velocity, position, _, _ = self._feedback()
+        found = self._feedback()
         direction = self._settings.direction
-        velocity_in_unit = direction * velocity * _VELOCITY_UNIT * self._settings.per_radian
-        values = (self._position(position), velocity_in_unit, direction * load * 1e-3)
+        velocity = direction * found.velocity * _VELOCITY_UNIT * self._settings.per_radian
+        values = (self._position(found.position), velocity, direction * found.load * 1e-3)
         return dict(zip(self._names, values, strict=True))
 
     def stop(self, success: bool = True) -> None:  # noqa: ARG002 - bluesky's form
@@ -274,16 +334,29 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         If the servo refuses or still reports its torque on, its output is set to zero and it is rebooted,
         which loses the number of turns.
         """
-        failures = attempt(partial(self._write, _TORQUE, 0))
-        if not self._is_off():
+        line = self._line
+        line.urgent = True
+        try:
+            failures = attempt(partial(self._write, _TORQUE, 0))
+        finally:
+            line.urgent = False
+        lost = bool(failures) and isinstance(failures[0], DeviceConnectionError)
+        if lost and line.answered:
+            # Another line is tried before the reboot, which loses the number of turns.
+            raise self._unconfirmed("torque", failures)
+        if lost:
+            goal_pwm = struct.pack("<Hh", _GOAL_PWM.address, 0)
+            attempt(partial(line.tell, WRITE, goal_pwm), partial(line.tell, REBOOT, b""))
+            if not self._is_off():
+                raise self._unconfirmed("torque", failures)
+        elif not self._is_off():
             attempt(partial(self._write, _GOAL_PWM, 0), partial(self._reboot, _EMERGENCY_PATIENCE))
             if not self._is_off():
                 raise self._unconfirmed("torque", failures)
-        self._armed = False
+        self._on = False
         # The torque is off, so whether the watchdog could be disarmed does not matter for safety.
         with suppress(DeviceError):
             self._write(_WATCHDOG, 0)
-            self._expired = False
 
     def reboot(self) -> None:
         """Restart the servo and configure it again: clears a hardware error whose cause is gone.
@@ -330,7 +403,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         if self._read(_TORQUE):
             raise DeviceError(self.name, "does not switch its torque off; power-cycle it")
         self._write(_WATCHDOG, 0)
-        self._armed = self._expired = False
+        self._on = False
         delay, drive_mode, mode, _ = self._read(_MODES).to_bytes(_MODES.size, "little")
         self._set_up(_MODE, mode, _EXTENDED_POSITION_MODE)
         self._set_up(_DRIVE_MODE, drive_mode, 0)
@@ -338,8 +411,24 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         shutdown = self._read(_SHUTDOWN)
         self._set_up(_SHUTDOWN, shutdown, shutdown | _REQUIRED_SHUTDOWN)
         # A servo that does not report its feedback is found here, not in the first motion.
+        self._map_feedback()
+        self._restarted = False
         self._feedback()
         self._setpoint = math.nan
+
+    def _map_feedback(self) -> None:
+        """Have the indirect data stand for the feedback."""
+        addresses = struct.pack(f"<{len(_FEEDBACK_BYTES)}H", *_FEEDBACK_BYTES)
+        try:
+            self._line.order(WRITE, struct.pack("<H", _INDIRECT_ADDRESSES) + addresses)
+        except RefusedError as error:
+            raise self._refusal("its indirect addresses", error) from None
+
+    def _renew_line(self) -> None:
+        repeats = self._line.repeats
+        super()._renew_line()
+        self._line.repeats = repeats
+        self._read_feedback = self._line.reading(_INDIRECT_DATA, _FEEDBACK.size)
 
     def _ensure_answers(self) -> None:
         """Raise the status return level if need be: below 2 the servo does not answer writes, at 0 no reads."""
@@ -373,21 +462,28 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         if present == value:
             return
         self._write(item, value)
+        self._require(item, value)
+
+    def _require(self, item: _Item, value: int) -> None:
         found = self._read(item)
         if found != value:
             raise DeviceError(self.name, f"keeps its {item.title} at {found} instead of {value}; power-cycle it")
 
     def _switch_on(self, position: int) -> None:
-        """Switch the torque on at the present position, under the watchdog."""
+        """Switch the torque on at the present position, under the watchdog, after a look at mode and profile."""
         settings = self._settings
         self._write(_WATCHDOG, 0)
-        self._write(_PROFILE_ACCELERATION, self._acceleration_units)
-        self._write(_PROFILE_VELOCITY, self._velocity_units)
+        for item, value in (
+            (_PROFILE_ACCELERATION, self._acceleration_units),
+            (_PROFILE_VELOCITY, self._velocity_units),
+        ):
+            self._write(item, value)
+            self._require(item, value)
+        self._require(_MODE, _EXTENDED_POSITION_MODE)
         self._write_goal(position)
         self._write(_WATCHDOG, round(settings.watchdog / _WATCHDOG_UNIT))
         self._write(_TORQUE, 1)
-        self._armed, self._expired = settings.watchdog > 0.0, False
-        self._line.longest_silence = 0.0
+        self._on = True
         if self._line.alert:
             raise self._fault()
 
@@ -396,9 +492,12 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
             self._line.order(WRITE, struct.pack("<Hi", _GOAL.address, counts))
         except RefusedError as error:
             if error.code == RANGE_ERROR and self._read(_WATCHDOG) == _WATCHDOG_EXPIRED:
-                self._expired = True
                 raise self._watchdog_error() from None
             raise self._refusal(f"{self._text(counts)} ({counts} counts) as its {_GOAL.title}", error) from None
+        except DeviceConnectionError:
+            # It may have arrived.
+            self._goal = None
+            raise
         self._goal = counts
         if self._line.alert:
             raise self._fault()
@@ -431,52 +530,83 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     def _text(self, counts: int) -> str:
         return f"{self._position(counts):.{self._DIGITS}g} {self.limits.unit}"
 
-    def _feedback(self) -> tuple[int, int, int, int, int]:
-        """Return load, velocity, position, voltage and temperature in the servo's units; raise what is wrong."""
-        try:
-            data = self._line.feedback()
-        except RefusedError as error:
-            raise self._refusal("to report its feedback", error) from None
-        self._check()
-        load, velocity, position, voltage, temperature = FEEDBACK.unpack(data)
-        return load, velocity, position, voltage, temperature
+    def _feedback(self) -> _Feedback:
+        """Return what the servo reports; raise what is wrong with it."""
+        found = self._look()
+        if self._on:
+            self._check_held(found)
+        return found
 
-    def _check(self) -> None:
-        """Raise a hardware error that the last answer reported, and a watchdog that has expired."""
+    def _look(self) -> _Feedback:
+        """Return what the servo reports; raise a hardware error and a restart."""
+        if self._restarted:
+            raise self._restart_error()
+        for number in range(_MOST_READINGS):
+            if number:
+                self._line.repeats += 1
+            asked_at = self._clock.now()
+            try:
+                found = _Feedback(*_FEEDBACK.unpack(self._read_feedback()))
+            except RefusedError as error:
+                raise self._refusal("to report its feedback", error) from None
+            if found.return_level != _ANSWER_EVERYTHING:
+                self._restarted = True
+                raise self._restart_error()
+            # The answer of before once more: doubled on its way, and late.
+            if found.tick != self._tick or asked_at - self._read_at <= _SAME_TICK:
+                break
+        else:
+            raise DeviceError(self.name, "its realtime tick stands still; power-cycle it")
+        self._tick, self._read_at = found.tick, self._clock.now()
         if self._line.alert:
             raise self._fault()
-        silence, self._line.longest_silence = self._line.longest_silence, 0.0
-        if not self._armed:
-            return
-        # The feedback does not include the watchdog: it is read when there was time for it to expire.
-        if self._expired or silence > _SUSPICIOUS_SILENCE * self._settings.watchdog:
-            self._expired = self._read(_WATCHDOG) == _WATCHDOG_EXPIRED
-            if self._expired:
-                raise self._watchdog_error()
+        return found
+
+    def _check_held(self, found: _Feedback) -> None:
+        """Raise if the servo does not hold what was sent to it."""
+        if found.watchdog == _EXPIRED:
+            raise self._watchdog_error()
+        if not found.torque:
+            self._on = False
+            raise DeviceError(
+                self.name,
+                "its torque was switched off, and not by this bench; find out by whom, and check zero_counts",
+            )
+        if self._goal is not None and found.goal != self._goal:
+            raise DeviceError(
+                self.name,
+                f"its goal was changed to {self._text(found.goal)} by another host, from {self._text(self._goal)}; "
+                "find out which",
+            )
+
+    def _restart_error(self) -> DeviceRestartedError:
+        return DeviceRestartedError(
+            self.name,
+            "the servo has restarted: its torque is off and the number of turns is lost; check its power supply and "
+            "zero_counts, and connect it again",
+        )
 
     def _arrived(self, goal: int, standstill: _Standstill) -> bool:
-        try:
-            data = self._line.ask(READ, struct.pack("<HH", _ARRIVAL_ADDRESS, _ARRIVAL.size), _ARRIVAL.size)
-        except RefusedError as error:
-            raise self._refusal("to report whether it moves", error) from None
-        self._check()
-        moving, load, _, position = _ARRIVAL.unpack(data)
+        found = self._look()
         if goal != self._goal:
             raise DeviceError(self.name, f"{self._text(goal)} was replaced by another goal on the way")
-        if moving:
+        if not found.torque:
+            self._on = False
+            raise DeviceError(self.name, f"the torque was switched off before it reached {self._text(goal)}")
+        self._check_held(found)
+        if found.moving:
             standstill.since = math.inf
             return False
-        if abs(position - goal) * _COUNT <= self._settings.tolerance:
+        if abs(found.position - goal) * _COUNT <= self._settings.tolerance:
             return True
-        if not self._read(_TORQUE):
-            raise DeviceError(self.name, f"the torque was switched off before it reached {self._text(goal)}")
         now = self._clock.now()
         standstill.since = min(standstill.since, now)
         if now - standstill.since >= _STANDSTILL:
             raise DeviceError(
                 self.name,
-                f"stands at {self._text(position)} instead of {self._text(goal)}, under a load of "
-                f"{abs(load) / 10:.0f} %: take away what blocks it, lower the load, or allow a larger tolerance",
+                f"stands at {self._text(found.position)} instead of {self._text(goal)}, under a load of "
+                f"{abs(found.load) / 10:.0f} %: take away what blocks it, lower the load, or allow a larger "
+                "tolerance",
             )
         return False
 
@@ -489,7 +619,8 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         return DeviceError(
             self.name,
             f"hardware error 0x{bits:02X} ({texts}; {volts:.1f} V, {celsius} °C): {advice}; "
-            "then switch the servo off and on, which loses the number of turns: check zero_counts",
+            f"then run `bench recover RIG {self.name}`, or switch the servo off and on, which loses the number of "
+            "turns: check zero_counts",
         )
 
     def _watchdog_error(self) -> DeviceError:
@@ -539,3 +670,15 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def _refusal(self, what: str, error: RefusedError) -> DeviceError:
         return DeviceError(self.name, f"refused {what}: {error}")
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Report the supply voltage and the temperature, and whether a power cycle can lose a turn.
+
+        Raises DeviceError if the servo does not answer.
+        """
+        voltage, temperature = self._read(_VOLTAGE), self._read(_TEMPERATURE)
+        span = abs((self.limits.high - self.limits.low) / self._settings.per_radian) / (2.0 * math.pi)
+        turns = f"the limits span {span:.2g} turns"
+        if span >= 1.0:
+            turns += "; which of them it is in is lost when it is switched off"
+        return Finding("power supply", f"{0.1 * voltage:.1f} V, servo {temperature} °C"), Finding("turns", turns)

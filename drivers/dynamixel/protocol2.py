@@ -5,8 +5,10 @@ Source: ROBOTIS e-Manual, Protocol 2.0 (packets, CRC, error numbers).
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import serial
 from pydantic import Field
@@ -16,9 +18,6 @@ from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, o
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 RANGE_ERROR = 4
-FEEDBACK = struct.Struct("<hii8xHB")
-"""Block of the control table: load, velocity, position, two trajectories, voltage, temperature."""
-FEEDBACK_ADDRESS = 126
 
 _HEADER = b"\xff\xff\xfd\x00"
 _HEAD = 7  # header, id, length
@@ -26,6 +25,7 @@ _SHORTEST_ANSWER = 11  # the head, instruction, error, CRC
 _SHORTEST_LENGTH, _LONGEST_LENGTH = 3, 256  # bytes after the head; the longest answer has 26
 _MOST_NOISE = 1024  # bytes without a packet
 _MOST_STRAY_PACKETS = 8
+_LATEST = 3.0  # time-outs after its request until which an answer may come
 _STATUS = 0x55
 _ALERT = 0x80
 _CRC_ERROR = 3
@@ -63,16 +63,20 @@ class ServoLine:
     """The serial line to one servo: packets, their CRC and stuffing, and sending again.
 
     A request that brings no answer, or a damaged one, is sent again, twice at most; all requests of the driver may
-    be carried out twice. As answers carry no number, late answers to a request that was sent twice are waited for
-    before the next request. Packets of other servos are skipped, and so is the echo of the request that adapters of
-    two-wire lines give.
+    be carried out twice. As answers carry no number, what has come is discarded before each request, and none is sent
+    before an answer that is missing can come no more: it may be three time-outs late. Packets of other servos are
+    skipped, and so is the echo of the request that adapters of two-wire lines give.
 
     Attributes
     ----------
     alert : bool
         Whether the last answer reported a hardware error.
-    longest_silence : float
-        Longest time between two answers since the attribute was last set to zero, s.
+    answered : bool
+        Whether the servo has answered since the line was opened.
+    repeats : int
+        How many requests were sent again.
+    urgent : bool
+        Whether requests are sent without waiting for what may still come.
     """
 
     def __init__(self, device: str, settings: ServoLineSettings, clock: Clock) -> None:
@@ -81,21 +85,19 @@ class ServoLine:
         self._clock = clock
         self._received = bytearray()
         self._heads: dict[int, bytes] = {}
-        self._unsettled = False
+        self._quiet_at = -math.inf
         self._silence = f"no answer within {settings.timeout:g} s"
-        self._answered_at = clock.now()
-        self.alert = False
-        self.longest_silence = 0.0
-        self._feedback_request = frame(settings.id, READ, struct.pack("<HH", FEEDBACK_ADDRESS, FEEDBACK.size))
+        self.alert = self.answered = self.urgent = False
+        self.repeats = 0
         self._port = open_port(device, settings)
 
     def close(self) -> None:
         """Release the line."""
         self._port.close()
 
-    def feedback(self) -> bytes:
-        """Return the feedback block, 21 bytes from address 126; errors are those of `ask`."""
-        return self._exchange(self._feedback_request, FEEDBACK.size)
+    def reading(self, address: int, length: int) -> Callable[[], bytes]:
+        """Return a function that reads bytes of the control table; its errors are those of `ask`."""
+        return partial(self._exchange, frame(self._settings.id, READ, struct.pack("<HH", address, length)), length)
 
     def ask(self, instruction: int, parameters: bytes, length: int) -> bytes:
         """Send an instruction; return the `length` bytes of its answer.
@@ -114,41 +116,41 @@ class ServoLine:
         self._exchange(frame(self._settings.id, instruction, parameters), 0)
 
     def tell(self, instruction: int, parameters: bytes) -> None:
-        """Send an instruction that may or may not be answered."""
+        """Send an instruction that may or may not be answered; raises `DeviceConnectionError` if the line is lost."""
         try:
             self._port.write(frame(self._settings.id, instruction, parameters))
-            self._settle()
+            self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
 
     def _exchange(self, request: bytes, length: int) -> bytes:
         problem = self._silence
         try:
-            if self._unsettled:
-                self._settle()
-            for _ in range(1 + RESENDS):
+            if self._clock.now() < self._quiet_at and not self.urgent:
+                self._clock.sleep_until(self._quiet_at)
+            for number in range(1 + RESENDS):
+                if number:
+                    # The answer to the first one may come as well, after the one that is taken.
+                    self.repeats += 1
+                    self._expect_late()
+                self._received.clear()
+                self._port.reset_input_buffer()
                 self._port.write(request)
                 problem, error, content = self._answer(length)
                 if problem == "":
-                    self._note_answer(error)
-                    if self._unsettled:
-                        self._settle()
+                    self.answered = True
+                    self.alert = bool(error & _ALERT)
                     if error & ~_ALERT:
                         raise RefusedError(error & ~_ALERT)
                     return content
-                self._unsettled = True
-                self._received.clear()
-                if problem != self._silence:
-                    self._port.reset_input_buffer()
+            self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
         raise no_answer(self._device, self._settings, problem, "id", self._settings.id)
 
-    def _note_answer(self, error: int) -> None:
-        now = self._clock.now()
-        self.longest_silence = max(self.longest_silence, now - self._answered_at)
-        self._answered_at = now
-        self.alert = bool(error & _ALERT)
+    def _expect_late(self) -> None:
+        """Take note that an answer to what is sent now may come late."""
+        self._quiet_at = self._clock.now() + _LATEST * self._settings.timeout
 
     def _answer(self, length: int) -> tuple[str, int, bytes]:
         """Return what is wrong with the answer, if anything, its error byte and its content."""
@@ -222,14 +224,6 @@ class ServoLine:
             read += len(chunk)
             ended = len(chunk) < missing
         return b""
-
-    def _settle(self) -> None:
-        """Wait until nothing more comes, and forget it."""
-        for _ in range(_MOST_STRAY_PACKETS):
-            if len(self._port.read(_LONGEST_LENGTH)) < _LONGEST_LENGTH:
-                break
-        self._received.clear()
-        self._unsettled = False
 
 
 def _crc_step(value: int) -> int:

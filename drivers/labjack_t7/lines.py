@@ -16,6 +16,7 @@ from typing import TypeVar
 from pydantic import Field
 
 from bench.clock import Clock
+from bench.devices import Finding
 from bench.errors import DeviceError
 from drivers.device import LineActuator
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
@@ -211,6 +212,14 @@ class DigitalOutput:
         lines = present.lines & ~self._bit
         self._change(present, replace(present, dio_enabled=int(bool(lines)), inhibit=~lines & _ALL_LINES))
 
+    @property
+    def guarded_for(self) -> int | None:
+        """Silence of all hosts, s, after which the watchdog switches the line off; None if it does not."""
+        present = self._watchdog()
+        off = 0 if self._active_high else self._bit
+        switches_off = present.lines & present.direction & self._bit and present.state & self._bit == off
+        return present.seconds if switches_off else None
+
     def _others(self, watchdog: _Watchdog) -> bool:
         """Return whether something else than this line is under the watchdog."""
         if watchdog.lines & ~self._bit:
@@ -282,3 +291,15 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
             if not self._output.is_on:
                 self._output.unguard()
         super().close()
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Read the watchdog of the instrument back.
+
+        Raises DeviceError if the instrument does not answer.
+        """
+        found, wanted = self._output.guarded_for, self._settings.watchdog
+        if found is not None and found <= wanted:
+            return (Finding("watchdog read back", f"{found} s in the instrument, switches {self._output} off"),)
+        text = "does not switch it off" if found is None else f"{found} s"
+        advice = f"end what else uses the instrument: {wanted} s was written on connecting"
+        return (Finding("watchdog read back", f"{self._output}: {text}", advice),)

@@ -21,7 +21,7 @@ from typing import ClassVar
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status
+from bench.devices import Finding, Identity, Limits, Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
@@ -78,6 +78,8 @@ _OBJECT_TEMPERATURE = Parameter(1000, "object temperature", real=True)
 _SINK_TEMPERATURE = Parameter(1001, "sink temperature", real=True)
 _CURRENT = Parameter(1020, "output current", real=True)
 _VOLTAGE = Parameter(1021, "output voltage", real=True)
+_SUPPLY_VOLTAGE = Parameter(1060, "driver input voltage", real=True, of_channel=False)
+_BASE_TEMPERATURE = Parameter(1063, "base plate temperature", real=True, of_channel=False)
 _STABILITY = Parameter(1200, "temperature is stable")
 _INPUT = Parameter(2000, "output stage input selection")
 _ENABLE = Parameter(2010, "output stage enable")
@@ -86,8 +88,11 @@ _VOLTAGE_LIMIT = Parameter(2031, "voltage limitation", real=True)
 _WATCHDOG = Parameter(2060, "communication watchdog", real=True, of_channel=False)
 _TARGET = Parameter(3000, "target object temperature", real=True)
 _POLARITY = Parameter(3034, "positive current heats")
+_LOWEST_OBJECT = Parameter(4010, "lower error threshold of the object temperature", real=True)
+_HIGHEST_OBJECT = Parameter(4011, "upper error threshold of the object temperature", real=True)
 _STABLE_WINDOW = Parameter(4040, "temperature window of stability", real=True)
 _STABLE_TIME = Parameter(4041, "minimum time in the window of stability", real=True)
+_HIGHEST_SINK = Parameter(5011, "upper error threshold of the sink temperature", real=True)
 _RESTART_DELAY = Parameter(6310, "delay till restart", real=True, of_channel=False)
 _LIVE_ENABLED = Parameter(50000, "live enable")
 _LIVE_CURRENT = Parameter(50001, "live current", real=True)
@@ -534,7 +539,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return DeviceError(
             self.name,
             f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
-            "then switch the device off and on to clear the error",
+            f"then clear it by `bench recover RIG {self.name}`, or switch the device off and on",
         )
 
     def _read(self, parameter: Parameter) -> float:
@@ -575,3 +580,27 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 self.name,
                 f"refused {value:g} as its {parameter.title} (parameter {parameter.number}): {error}{allowed}",
             ) from None
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare limits with the settings, and temperature limits with the device's error thresholds.
+
+        Raises DeviceError if the device does not answer.
+        """
+        settings = self._settings
+        findings = []
+        for key, parameter, wanted, unit in (
+            ("current_limit", _CURRENT_LIMIT, settings.current_limit, "A"),
+            ("voltage_limit", _VOLTAGE_LIMIT, settings.voltage_limit, "V"),
+        ):
+            found = self._read(parameter)
+            advice = "" if found == single(wanted) else f"another program changed it from {wanted:g} {unit}; end that"
+            findings.append(Finding(key, f"{found:g} {unit} in the device", advice))
+        lowest, highest = self._read(_LOWEST_OBJECT), self._read(_HIGHEST_OBJECT)
+        low, high = settings.temperature_limits
+        advice = ""
+        if self._mode is TECMode.TEMPERATURE and not lowest <= low <= high <= highest:
+            advice = f"set temperature_limits, {low:g} to {high:g} °C, within the thresholds of errors 137 and 138"
+        text = f"{lowest:g} to {highest:g} °C of the object, up to {self._read(_HIGHEST_SINK):g} °C of the sink"
+        findings.append(Finding("error thresholds", text, advice))
+        text = f"{self._read(_SUPPLY_VOLTAGE):.3g} V, base plate {self._read(_BASE_TEMPERATURE):.3g} °C"
+        return (*findings, Finding("power supply", text))

@@ -1,7 +1,8 @@
-"""CANopen on an slcan adapter: service data objects of one node, and its heartbeat.
+"""CANopen on an slcan adapter: service data objects of one node, its process data, and its heartbeat.
 
-Source: CiA 301 (SDO, abort codes, heartbeat). The examples in Roboteq's manual leave the bits e and s of the command
-byte clear; the device takes the standard ones that are used here, and answers of both forms are understood.
+Source: CiA 301 (SDO, abort codes, SYNC, heartbeat). The examples in Roboteq's manual leave the bits e and s of
+the command byte clear; the device takes the standard ones that are used here, and answers of both forms are
+understood.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from binascii import unhexlify
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
@@ -25,9 +26,11 @@ from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
 _LONGEST_TEXT = 256
+_LATEST = 3.0  # time-outs after its request until which an answer may come
 
 _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
 _SDO_LINE = 21  # characters of a line with an SDO
+_SYNC = b"t0800\r"
 _ABORT = 0x80
 _TIMED_OUT = 0x0504_0000
 _BOOT_UP = 0
@@ -112,13 +115,21 @@ class NodeLine:
 
     A request that brings no answer is sent again, twice at most; all of them may be carried out twice without
     harm. An answer for another object is a late one to an earlier request, and is skipped. As nothing tells two
-    answers for one object apart, answers that are missing are waited for before the next request, for the timeout
-    at most. Calls must not overlap.
+    answers for one object apart, no request is sent before an answer that is missing can come no more: it may be
+    three time-outs late. Calls must not overlap.
 
     Attributes
     ----------
     round_trip : float
         How long the last request that was answered took, s.
+    repeats : int
+        How many requests were sent again.
+    answered : bool
+        Whether the node has answered since the line was opened.
+    restarted : bool
+        Whether the node has reported a restart since this was last set to false.
+    urgent : bool
+        Whether requests are sent without waiting for what may still come.
     """
 
     def __init__(self, device: str, settings: NodeSettings, clock: Clock) -> None:
@@ -130,9 +141,10 @@ class NodeLine:
         self._answer_heads = frozenset((answer_head, answer_head.lower()))
         self._queries: dict[tuple[int, int], tuple[bytes, bytes]] = {}
         self._heard: set[int] = set()
-        self._restarted = False
-        self._missing = 0
+        self._quiet_at = -math.inf
         self.round_trip = 0.0
+        self.repeats = 0
+        self.answered = self.restarted = self.urgent = False
         try:
             self._adapter = SlcanAdapter(settings, settings.bitrate)
         except (CanError, serial.SerialException, OSError, ValueError) as error:
@@ -147,10 +159,19 @@ class NodeLine:
         """Return how long ago the node's last heartbeat was heard, s."""
         return self._clock.now() - self._heard_at
 
-    def take_restart(self) -> bool:
-        """Return whether the node has restarted since this was last asked."""
-        restarted, self._restarted = self._restarted, False
-        return restarted
+    def await_heartbeat(self, patience: float) -> None:
+        """Listen until a heartbeat comes, for so many seconds at most.
+
+        Raises `DeviceConnectionError` if the line is lost.
+        """
+        end, before = self._clock.now() + patience, self._heard_at
+        try:
+            while self._heard_at == before and self._clock.now() < end:
+                line = self._adapter.line()
+                if line is not None:
+                    self._notice(line)
+        except (CanError, serial.SerialException, OSError) as error:
+            raise self._lost(error) from None
 
     def read(self, item: Entry, sub: int) -> int:
         """Read a number; errors are `AbortedError` and `DeviceConnectionError`."""
@@ -167,32 +188,99 @@ class NodeLine:
 
     def read_text(self, item: Entry) -> str:
         """Read a text, in one piece or in segments; errors as of `read`."""
-        for _ in range(RESENDS):
-            # A segment cannot be asked for again; the whole text can.
-            with suppress(DeviceConnectionError):
-                return self._read_text(item)
-        return self._read_text(item)
+        multiplexer = struct.pack("<HB", item.index, 0)
+        request = self._request(b"\x40" + multiplexer)
+        for number in range(1 + RESENDS):
+            answer = self._exchange(request, multiplexer)
+            if answer[0] & 2:
+                text = answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
+                break
+            try:
+                text = self._read_segments(item, multiplexer)
+                break
+            except DeviceConnectionError:
+                # A segment cannot be asked for again; the whole text can.
+                if number == RESENDS:
+                    raise
+                self.repeats += 1
+        return text.split(b"\0")[0].decode("ascii", "replace").strip()
 
-    def write(self, item: Entry, value: int, sub: int, *, before: float = math.inf) -> None:
+    def write(self, item: Entry, value: int, sub: int, *, before: float = math.inf, after: bytes = b"") -> None:
         """Write a number, which is to arrive before an instant (s); errors are those of `read`.
 
-        Raises `MissedError` if it would arrive later: it is not sent then, or not sent again.
+        The line `after` is sent in front of it. Raises `MissedError` if it would arrive later: it is not sent then,
+        or not sent again.
         """
-        multiplexer = struct.pack("<HB", item.index, sub)
-        data = value.to_bytes(item.size, "little", signed=item.signed)
-        request = self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data)
-        answer = self._exchange(request, multiplexer, before)
+        request, multiplexer = self._download(item, value, sub)
+        answer = self._exchange(after + request, multiplexer, before)
         if answer[0] != 0x60:
             raise DeviceError(self._device, f"answered {answer.hex(' ')} for its {described(item, sub)}")
 
-    def _read_text(self, item: Entry) -> str:
-        multiplexer = struct.pack("<HB", item.index, 0)
-        answer = self._exchange(self._request(b"\x40" + multiplexer), multiplexer)
-        if answer[0] & 2:
-            text = answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
-        else:
-            text = self._read_segments(item, multiplexer)
-        return text.split(b"\0")[0].decode("ascii", "replace").strip()
+    def tell(self, item: Entry, value: int, sub: int) -> None:
+        """Write a number without waiting for the answer; raises `DeviceConnectionError` if the line is lost."""
+        self.transmit(self._download(item, value, sub)[0])
+        self._quiet_at = self._clock.now() + _LATEST * self._settings.timeout
+
+    def transmit(self, line: bytes) -> None:
+        """Send a line; raises `DeviceConnectionError` if the line is lost."""
+        try:
+            self._adapter.transmit(line)
+        except (CanError, serial.SerialException, OSError) as error:
+            raise self._lost(error) from None
+
+    def synchronize(self, heads: Sequence[bytes], before: bytes = b"") -> list[bytes]:
+        """Send a SYNC; return the process data that follow it, back to back, in hexadecimal digits.
+
+        Parameters
+        ----------
+        heads : sequence of bytes
+            Beginning of the line of each PDO, up to its length, in the order in which they come.
+        before : bytes
+            What is sent in front of the SYNC.
+
+        Returns
+        -------
+        list of bytes
+            The data of each; none if not all of them come within the timeout.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line is lost.
+        """
+        adapter, clock = self._adapter, self._clock
+        found: list[bytes] = []
+        try:
+            self._hear()
+            adapter.transmit(before + _SYNC)
+            end = clock.now() + self._settings.timeout
+            for _ in range(_MOST_FRAMES):
+                line = adapter.line()
+                if line is None:
+                    break
+                head = line[:5]
+                if head in heads:
+                    if head != heads[len(found)]:
+                        # What came before it belongs to an earlier SYNC.
+                        found.clear()
+                    if head == heads[len(found)] and len(line) == 5 + 2 * int(head[4:]):
+                        found.append(line[5:])
+                        if len(found) == len(heads):
+                            self.answered = True
+                            return found
+                else:
+                    self._notice(line)
+                if clock.now() >= end:
+                    break
+        except (CanError, serial.SerialException, OSError) as error:
+            raise self._lost(error) from None
+        return []
+
+    def _download(self, item: Entry, value: int, sub: int) -> tuple[bytes, bytes]:
+        """Return the line of a request that writes a number, and the object that its answer names."""
+        multiplexer = struct.pack("<HB", item.index, sub)
+        data = value.to_bytes(item.size, "little", signed=item.signed)
+        return self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data), multiplexer
 
     def _read_segments(self, item: Entry, multiplexer: bytes) -> bytes:
         text, toggle, last = b"", 0, False
@@ -220,26 +308,35 @@ class NodeLine:
         adapter, clock = self._adapter, self._clock
         refusals = adapter.refusals
         try:
-            while (line := adapter.line(wait=False)) is not None:
-                self._notice(line)
-            if self._missing:
-                self._settle()
+            if clock.now() < self._quiet_at and not self.urgent:
+                clock.sleep_until(self._quiet_at)
+            self._hear()
             # Twice the same segment would be a wrong toggle bit.
-            for _ in range(1 + RESENDS if multiplexer else 1):
+            for number in range(1 + RESENDS if multiplexer else 1):
                 sent_at = clock.now()
                 if sent_at + self.round_trip >= before:
                     raise MissedError
+                if number:
+                    # The answer to the first one may come as well, after the one that is taken.
+                    self._quiet_at = sent_at + _LATEST * self._settings.timeout
+                    self.repeats += 1
                 adapter.transmit(request)
                 answer = self._answer(multiplexer, sent_at)
                 if answer is not None:
+                    self.answered = True
                     self.round_trip = clock.now() - sent_at
                     if answer[0] == _ABORT:
                         raise AbortedError(int.from_bytes(answer[4:], "little"))
                     return answer
-                self._missing += 1
+            self._quiet_at = sent_at + _LATEST * self._settings.timeout
         except (CanError, serial.SerialException, OSError) as error:
-            raise lost_line(self._device, self._settings, _cause(error)) from None
+            raise self._lost(error) from None
         raise self._silence(adapter.refusals - refusals)
+
+    def _hear(self) -> None:
+        """Take note of what has come, which answers nothing."""
+        while (line := self._adapter.line(wait=False)) is not None:
+            self._notice(line)
 
     def _answer(self, multiplexer: bytes, sent_at: float) -> bytes | None:
         """Return the answer, or None if it does not come in time."""
@@ -259,17 +356,6 @@ class NodeLine:
                 return None
         return None
 
-    def _settle(self) -> None:
-        """Wait for the answers that are missing, for the timeout at most; they are late, and are not used."""
-        end = self._clock.now() + self._settings.timeout
-        for _ in range(_MOST_FRAMES):
-            line = self._adapter.line()
-            if line is not None and self._notice(line):
-                self._missing -= 1
-            if line is None or not self._missing or self._clock.now() >= end:
-                break
-        self._missing = 0
-
     def _notice(self, line: bytes) -> bytes:
         """Return the eight bytes of an SDO of the node, none for other frames; take note of a heartbeat."""
         try:
@@ -288,7 +374,10 @@ class NodeLine:
             self._heard.add(node)
         elif state:
             self._heard_at = self._clock.now()
-            self._restarted = self._restarted or state[0] == _BOOT_UP
+            self.restarted = self.restarted or state[0] == _BOOT_UP
+
+    def _lost(self, error: BaseException) -> DeviceConnectionError:
+        return lost_line(self._device, self._settings, _cause(error))
 
     def _silence(self, refusals: int) -> DeviceConnectionError:
         settings = self._settings

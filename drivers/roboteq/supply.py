@@ -12,7 +12,7 @@ The duty cycle of the output is D = command / 1000. The voltage depends on the l
   Vbus.
 
 Vbus is the battery voltage that the device measures (object 0x210D, resolution 0.1 V). It is read with every
-set-point and every measurement, and the command follows it when it has moved by more than the last digit, so
+set-point and every reading, and the command follows it when it has moved by more than the last digit, so
 that the flicker of that digit does not reach the load.
 
 The bench builder sets these once, over USB and with the maker's software: the node, the bit rate, `^RWD` (watchdog),
@@ -32,11 +32,12 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
-from bench.devices import Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.devices import Finding, Identity, Limits, Status
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import VoltageSupply
 from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
+from drivers.roboteq.process_data import ProcessData, Report
 
 DEVICE_TYPE = 0x000F0191
 """Object 0x1000 of a controller: device profile 401 (electronic data sheet)."""
@@ -47,6 +48,9 @@ _LAST_DIGIT = 0.1  # of the battery voltage, V
 _ARRIVAL_TIMEOUT = 5.0
 _STOP_TIMEOUT = 1.0  # for the ramp of the device
 _STOP_POLL = 0.02
+_HEARTBEAT_SHARE = 1.0 / 3.0  # three in the time allowed, so that one that is lost does not matter
+_SAFE_WITHIN = 2.5  # the ramp twice, before and after the emergency stop
+_MOST_READINGS = 6  # of one value until it has come twice
 
 _DEVICE_TYPE = Entry(0x1000, "device type")
 _DEVICE_NAME = Entry(0x1008, "device name")
@@ -71,7 +75,10 @@ FAULT_FLAGS: Mapping[int, tuple[str, str]] = {
     0x02: ("over-voltage", "check the power supply"),
     0x04: ("under-voltage", "check the power supply, its cable and its current limit"),
     0x08: ("short circuit", "check the load and its cables"),
-    0x10: ("emergency stop", "find out who stopped it and why, then switch the controller off and on"),
+    0x10: (
+        "emergency stop",
+        "find out who stopped it and why, then run `bench recover`, or switch the controller off and on",
+    ),
     0x20: ("setup fault", "check the configuration with the maker's software"),
     0x40: ("MOSFET failure", "the power stage is damaged: have the controller repaired"),
     0x80: ("default configuration loaded", "load the configuration again with the maker's software"),
@@ -137,6 +144,12 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     that comes too late raises `DeviceError`, as the voltage was not held. The set-point is 0 after the output was
     dropped.
 
+    A reading is one SYNC and the process data that follow it (`drivers.roboteq.process_data`); a controller that does
+    not take their configuration is asked object by object, and a value that has changed is then asked for until it
+    has come twice. A restart is known by the boot-up message, and with process data by the mark that it loses; from
+    then on every reading and every set-point is a `DeviceRestartedError`. A command that another host has sent is a
+    `DeviceError` of the next reading with process data.
+
     The current is the one that the controller reports, with its resolution of 0.1 A; of what it is the mean within
     a PWM period is not documented.
 
@@ -150,11 +163,14 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         self._lock = threading.RLock()
         self._limits = Limits(*settings.voltage_limits, "V")
         self._voltage_name, self._current_name = (signal.name for signal in self.signals)
-        self._channels: tuple[int, ...] = (settings.channel,)
+        # The channel of this driver first.
+        self._channels = tuple(sorted(range(1, _MOST_CHANNELS + 1), key=lambda number: number != settings.channel))
+        self._process_data: ProcessData | None = None
+        self._known: dict[tuple[int, int], int] = {}
         self._command = 0
         self._battery = math.nan
         self._commanded_at = -math.inf
-        self._powered = False
+        self._powered = self._obeyed = self._restarted = False
         self._order = 0
 
     @classmethod
@@ -171,6 +187,24 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """The allowed set-points, V: the settings' `voltage_limits`."""
         return self._limits
 
+    @property
+    def watchdog(self) -> float | None:
+        """Silence of the host after which the controller drops its output (^RWD), s; None if it never does.
+
+        Only commands end the silence: `glance`, `measure` and waiting for a status send the present one again.
+        """
+        return self._settings.watchdog or None
+
+    @property
+    def safe_within(self) -> float:
+        """Longest time that `safe` takes on a line that works, s: the ramp, and again after the emergency stop."""
+        return _SAFE_WITHIN
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected."""
+        return self._line.repeats
+
     def set(self, value: float) -> Status:
         """Apply a voltage in V, as `output` defines it.
 
@@ -180,8 +214,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """
         self.check(value)
         with self._lock:
-            self._check()
-            battery = self._read_battery()
+            battery = self._look().battery / 10
             command = self._command_for(value, battery)
             if self._was_silent() or not self._send(command):
                 self._zero()
@@ -193,7 +226,6 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
                         "and the key watchdog)",
                     )
             self._setpoint, self._battery = value, battery
-            self._powered = False
             self._order += 1
             order = self._order
         interval = min(0.1, 0.25 * self._settings.watchdog) if self._settings.watchdog else 0.1
@@ -208,24 +240,60 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         output that was dropped and a restart of the device are each a `DeviceError`.
         """
         with self._lock:
-            power = self._read(_POWER, self._settings.channel)
-            battery = self._read_battery()
-            current = self._read(_AMPS, self._settings.channel) / 10
-            self._check()
-            self._keep(power, battery)
-            return {self._voltage_name: self._voltage(power, battery), self._current_name: current}
+            report = self._look()
+            battery = report.battery / 10
+            self._keep(report)
+            return {self._voltage_name: self._voltage(report.power, battery), self._current_name: report.current / 10}
+
+    def reconnect(self) -> None:
+        """Open the line again after it was lost, and check that the controller is as it was left.
+
+        Errors are those of `Device.reconnect`; an output that the watchdog has dropped meanwhile is a `DeviceError`.
+        """
+        with self._lock:
+            super().reconnect()
+
+    def _renew_line(self) -> None:
+        repeats = self._line.repeats
+        super()._renew_line()
+        self._line.repeats = repeats
+
+    def _check_unchanged(self) -> None:
+        if self._process_data is not None and not self._process_data.is_marked(self._line):
+            raise self._found_restarted()
+        # A node that answers but sends no heartbeat is not as it was left.
+        opened = self._line.heartbeat_age()
+        self._line.await_heartbeat(self._settings.heartbeat)
+        if self._line.heartbeat_age() >= opened + self._settings.heartbeat:
+            raise self._no_heartbeat()
+        self.glance()
 
     def _make_safe(self) -> None:
         """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
         with self._lock:
             self._order += 1
-            channel = self._settings.channel
-            zeros = [partial(self._write, _COMMAND, 0, number) for number in self._resumable()]
-            failures = attempt(*zeros, partial(self._write, _STOP, channel))
+            line, channel = self._line, self._settings.channel
+            first, *others = self._resumable()
+            line.urgent = True
+            try:
+                failures = attempt(partial(self._write, _COMMAND, 0, first))
+            finally:
+                line.urgent = False
+            if failures and isinstance(failures[0], DeviceConnectionError):
+                if line.answered:
+                    # Another line is tried before the emergency stop, which has to be released.
+                    raise self._unconfirmed("output", failures)
+                orders = [*((_COMMAND, 0, number) for number in others), (_STOP, channel, 0), (_EMERGENCY_STOP, 1, 0)]
+                failures += attempt(*(partial(line.tell, *order) for order in orders))
+            else:
+                zeros = [partial(self._zero_channel, number) for number in others]
+                failures += attempt(*zeros, partial(self._write, _STOP, channel))
             self._setpoint, self._command = 0.0, 0
+            self._obeyed = False
             if not failures and self._is_off():
                 return
-            failures += attempt(self.emergency_stop)
+            if line.answered:
+                failures += attempt(self.emergency_stop)
             if not self._is_off():
                 raise self._unconfirmed("output", failures)
 
@@ -250,7 +318,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             self._zero()
             self._write(_RELEASE, 1)
             self._drop()
-            self._check()
+            self._look()
 
     def close(self) -> None:
         """Release the line; a voltage that is on stays on until the device's watchdog drops it."""
@@ -281,19 +349,17 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
     def _start(self) -> None:
         self._configure()
-        self._check()
+        self._look()
 
     def _restart(self) -> None:
         self._configure()
         self.release()
-        self._check()
 
     def _configure(self) -> None:
         settings = self._settings
         now = self._clock.now()
-        self._channels = ()
-        # The channel of this driver first; which others there are shows in the same way.
-        for channel in sorted(range(1, _MOST_CHANNELS + 1), key=lambda number: number != settings.channel):
+        channels: tuple[int, ...] = ()
+        for channel in self._channels:
             try:
                 self._line.write(_COMMAND, 0, channel)
             except AbortedError as error:
@@ -304,13 +370,16 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
                         f"{self.name}: channel: the controller does not have channel {channel} ({error})"
                     ) from None
             else:
-                self._channels += (channel,)
+                channels += (channel,)
+        self._channels = channels
         self._commanded_at, self._command = now, 0
-        self._line.take_restart()
-        # Three heartbeats in the time allowed, so that one that is lost does not matter.
-        allowed = int(1e3 * settings.heartbeat / 3.0)
+        allowed = int(1e3 * settings.heartbeat * _HEARTBEAT_SHARE)
         if not 0 < self._read(_HEARTBEAT_TIME) <= allowed:
             self._write(_HEARTBEAT_TIME, min(allowed, 0xFFFF))
+        process_data = ProcessData(self.name, settings.node, settings.channel)
+        self._process_data = process_data if process_data.configure(self._line) else None
+        # What was heard of a start before this one does not count.
+        self._line.restarted = False
 
     def _command_for(self, volts: float, battery: float) -> int:
         """Return the command that comes nearest to a voltage without going beyond the limits."""
@@ -335,21 +404,36 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         watchdog = self._settings.watchdog
         return self._clock.now() - self._commanded_at >= watchdog > 0.0 or self._commanded_at == -math.inf
 
-    def _keep(self, power: int, battery: float) -> None:
-        """Send the present command again, or raise if the device has dropped it; `power` is what it applies."""
+    def _keep(self, report: Report) -> None:
+        """Send the present command again, or raise if the device does not obey it any more."""
         if self._command == 0:
+            self._refuse_other(report)
+            if self._process_data is not None:
+                self._line.transmit(self._process_data.next_mark())
             return
         # Before it has seen any power of this set-point, the device may be in its ramp.
-        dropped = self._powered and power == 0
-        self._powered = self._powered or power * self._command > 0
+        dropped = self._powered and report.power == 0
+        self._powered = self._powered or report.power * self._command > 0
         if self._was_silent() or dropped:
             raise self._dropped()
+        self._refuse_other(report)
         # The last digit flickers; following it would make the voltage flicker.
-        if abs(battery - self._battery) > 1.5 * _LAST_DIGIT:
-            self._command = self._command_for(self._setpoint, battery)
-            self._battery = battery
-        if not self._send(self._command):
+        battery = report.battery / 10
+        follow = abs(battery - self._battery) > 1.5 * _LAST_DIGIT
+        if not self._send(self._command_for(self._setpoint, battery) if follow else self._command):
             raise self._dropped()
+        if follow:
+            self._battery = battery
+
+    def _refuse_other(self, report: Report) -> None:
+        """Raise if the device obeyed the present command and obeys another one now."""
+        if abs(report.command - self._command) <= 1:
+            self._obeyed = True
+        elif self._obeyed:
+            raise DeviceError(
+                self.name,
+                f"its command was changed to {report.command} by another host, from {self._command}; find out which",
+            )
 
     def _dropped(self) -> DeviceError:
         """End the set-point that was not held; return the error."""
@@ -365,6 +449,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def _drop(self) -> None:
         """Command 0, which ends the present set-point."""
         self._order += 1
+        self._obeyed = False
         self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
         self._zero()
 
@@ -372,25 +457,33 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """Command 0 on every channel that this command may resume, back to back."""
         now = self._clock.now()
         for channel in self._resumable():
-            self._write(_COMMAND, 0, channel)
+            self._zero_channel(channel)
         self._commanded_at, self._command = now, 0
+        self._obeyed = False
+
+    def _zero_channel(self, channel: int) -> None:
+        """Command 0 on a channel; of the other channels it is not known before `connect` which there are."""
+        try:
+            self._line.write(_COMMAND, 0, channel)
+        except AbortedError as error:
+            if channel == self._settings.channel or error.code not in ABSENT:
+                raise self._refused(_COMMAND, 0, channel, error) from None
 
     def _resumable(self) -> tuple[int, ...]:
         """Return the channels that the next command may resume, that of this driver first.
 
         All of them after a silence, unless the last command was 0: so were those to the other channels.
         """
-        return self._channels if self._command and self._was_silent() else self._channels[:1]
+        resumable = self._was_silent() and (self._command != 0 or self._commanded_at == -math.inf)
+        return self._channels if resumable else self._channels[:1]
 
     def _arrived(self, order: int) -> bool:
         with self._lock:
             if order != self._order:
                 raise DeviceError(self.name, "was given another command before it arrived")
-            power = self._read(_POWER, self._settings.channel)
-            battery = self._read_battery()
-            self._check()
-            arrived = abs(power - self._command) <= 1
-            self._keep(power, battery)
+            report = self._look()
+            arrived = abs(report.power - self._command) <= 1
+            self._keep(report)
             return arrived
 
     def _is_off(self) -> bool:
@@ -405,10 +498,64 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             return False
         return True
 
-    def _check(self) -> None:
-        """Raise what is wrong with the device."""
-        faults = self._read(_FAULTS)
-        flags = self._read(_CHANNEL_FLAGS, self._settings.channel)
+    def _look(self) -> Report:
+        """Return what the device reports; raise what is wrong with it."""
+        if self._restarted:
+            raise self._found_restarted()
+        report = self._by_object() if self._process_data is None else self._by_process_data(self._process_data)
+        if report.faults or report.channel_flags:
+            raise self._reported(report.faults, report.channel_flags)
+        if self._line.restarted:
+            raise self._found_restarted()
+        if self._line.heartbeat_age() > self._settings.heartbeat:
+            # After a loss of the line the next one is under way.
+            self._line.await_heartbeat(_HEARTBEAT_SHARE * self._settings.heartbeat)
+        if self._line.heartbeat_age() > self._settings.heartbeat:
+            raise self._no_heartbeat()
+        return report
+
+    def _no_heartbeat(self) -> DeviceConnectionError:
+        return DeviceConnectionError(
+            self.name,
+            f"no heartbeat of node {self._settings.node} for {self._line.heartbeat_age():.3g} s, "
+            f"{self._settings.heartbeat:g} s are allowed; check the bus and the heartbeat of the controller (^CHB)",
+        )
+
+    def _by_process_data(self, process_data: ProcessData) -> Report:
+        try:
+            return process_data.report(
+                self._line, self._command, lambda: self._command == 0 or not self._was_silent()
+            )
+        except DeviceConnectionError:
+            if self._line.restarted or not process_data.is_marked(self._line):
+                raise self._found_restarted() from None
+            raise
+
+    def _by_object(self) -> Report:
+        channel = self._settings.channel
+        return Report(
+            self._read(_POWER, channel),
+            self._read(_VOLTS, _BATTERY),
+            self._read(_AMPS, channel),
+            self._read(_FAULTS),
+            self._read(_CHANNEL_FLAGS, channel),
+            self._command,
+        )
+
+    def _found_restarted(self) -> DeviceRestartedError:
+        """Take note of a restart, and return the error."""
+        if not self._restarted:
+            self._restarted = True
+            self._order += 1
+            self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
+            self._command = 0
+        return DeviceRestartedError(
+            self.name,
+            "the device has restarted and its output dropped; check its power supply, and connect it again",
+        )
+
+    def _reported(self, faults: int, flags: int) -> DeviceError:
+        """Return the error for what the device reports."""
         problems = [f"fault: {text}; {advice}" for bit, (text, advice) in FAULT_FLAGS.items() if faults & bit]
         problems += [
             f"channel {self._settings.channel}: {text}; {advice}"
@@ -418,41 +565,44 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         unknown = faults & ~sum(FAULT_FLAGS)
         if unknown:
             problems.append(f"fault flags 0x{unknown:X}, unknown to this driver; look them up in the manual")
-        if problems:
-            raise DeviceError(self.name, " | ".join(problems))
-        if self._line.take_restart():
-            self._drop()
-            raise DeviceError(self.name, "the device has restarted and its output dropped; check its power supply")
-        age = self._line.heartbeat_age()
-        if age > self._settings.heartbeat:
-            raise DeviceConnectionError(
-                self.name,
-                f"no heartbeat of node {self._settings.node} for {age:.3g} s, {self._settings.heartbeat:g} s are "
-                "allowed; check the bus and the heartbeat of the controller (^CHB)",
-            )
-
-    def _read_battery(self) -> float:
-        return self._read(_VOLTS, _BATTERY) / 10
+        return DeviceError(self.name, " | ".join(problems))
 
     def _send(self, command: int) -> bool:
         """Send a command; return whether it arrived before the device's watchdog could expire."""
         # The device takes it somewhere between request and answer; the earlier one is the safe assumption.
         now, watchdog = self._clock.now(), self._settings.watchdog
         end = self._commanded_at + watchdog if watchdog else math.inf
+        mark = b"" if self._process_data is None else self._process_data.next_mark()
         try:
-            self._write(_COMMAND, command, self._settings.channel, before=end)
+            self._write(_COMMAND, command, self._settings.channel, before=end, after=mark)
         except MissedError:
             return False
+        except DeviceConnectionError:
+            # It may have arrived.
+            self._obeyed = False
+            raise
         if self._clock.now() >= end:
             return False
+        if command != self._command:
+            self._powered = self._powered and command * self._command > 0
+            self._obeyed = False
         self._commanded_at, self._command = now, command
         return True
 
     def _read(self, item: Entry, sub: int = 0) -> int:
+        """Return a value that is the one known already, or that has come twice: slcan has no check sum."""
+        key = item.index, sub
+        seen: set[int | None] = {self._known.get(key)}
         try:
-            return self._line.read(item, sub)
+            for _ in range(_MOST_READINGS):
+                value = self._line.read(item, sub)
+                if value in seen:
+                    self._known[key] = value
+                    return value
+                seen.add(value)
         except AbortedError as error:
             raise DeviceError(self.name, f"refused to report its {described(item, sub)}: {error}") from None
+        raise DeviceError(self.name, f"never reports the same {described(item, sub)} twice; check the adapter's line")
 
     def _read_text(self, item: Entry) -> str:
         """Return a text; empty if the device does not have the object."""
@@ -461,11 +611,25 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         except AbortedError:
             return ""
 
-    def _write(self, item: Entry, value: int, sub: int = 0, *, before: float = math.inf) -> None:
+    def _write(self, item: Entry, value: int, sub: int = 0, *, before: float = math.inf, after: bytes = b"") -> None:
         try:
-            self._line.write(item, value, sub, before=before)
+            self._line.write(item, value, sub, before=before, after=after)
         except AbortedError as error:
             raise self._refused(item, value, sub, error) from None
 
     def _refused(self, item: Entry, value: int, sub: int, error: AbortedError) -> DeviceError:
         return DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}")
+
+    def self_check(self) -> tuple[Finding, ...]:
+        """Compare the battery voltage with the limits; the watchdog cannot be read by CANopen.
+
+        Raises DeviceError if the device does not answer.
+        """
+        with self._lock:
+            battery = self._read(_VOLTS, _BATTERY) / 10
+        highest = max(self._limits.high, -self._limits.low)
+        advice = ""
+        if battery < highest:
+            advice = f"check the power supply, or lower voltage_limits: {highest:g} V cannot be reached"
+        unread = f"^RWD cannot be read by CANopen; the rig file says {1e3 * self._settings.watchdog:g} ms"
+        return Finding("power supply", f"{battery:.1f} V", advice), Finding("watchdog read back", unread)

@@ -17,9 +17,13 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
 from rigs.hybrid.witness import WitnessRegisters
+from sim_devices.faults.fault import Fault, Quantity
+from sim_devices.faults.sensor import FaultySensor
+from sim_devices.faults.supply import ClippedPeltier
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops, tec_faults
+from sim_devices.instruments.meerstetter_table import DeviceStatus
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
@@ -111,13 +115,26 @@ class HybridLaboratory(EmulatedLaboratory):
         )
         compile_loops(self.plant, _use)
         self.world = World(self.plant, clock)
-        self.tec = EmulatedTEC("tec", self.world, self.plant.peltier, rng=tec)
+        peltier = ClippedPeltier(self.plant.peltier)
+        self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec)
         self.tec.write_parameter(_CURRENT_LIMIT_PARAMETER, settings.current_limit)
         self.tec.write_parameter(_COLDEST_PARAMETER, _COLDEST)
         self._beyond = 0.0
-        self.displacement = DisplacementSensor(lambda: self.plant.deflection + self._beyond, rng=sensor)
-        self.base = Thermistor(lambda: self.plant.base_temperature, rng=base)
-        self.tip = Thermistor(lambda: self.plant.tip_temperature, rng=tip)
+        self._stuck: float | None = None
+        sensors = [
+            FaultySensor(name, self.world, seen, unit, scale=scale, beyond=beyond, seed=(seed, i))
+            for i, (name, seen, unit, scale, beyond) in enumerate(
+                (
+                    ("displacement", lambda: self._deflection() + self._beyond, "m", 5e-6, 1e-3),
+                    ("base", lambda: self.plant.base_temperature, "K", 5.0, 140.0),
+                    ("tip", lambda: self.plant.tip_temperature, "K", 5.0, 140.0),
+                ),
+                1,
+            )
+        ]
+        self.displacement = DisplacementSensor(sensors[0], rng=sensor)
+        self.base = Thermistor(sensors[1], rng=base)
+        self.tip = Thermistor(sensors[2], rng=tip)
         self.amplifier = PiezoAmplifier(self.world, self.plant, gain=GAIN, settling_time=SETTLING_TIME, rng=amplifier)
         wires: list[Callable[[], float]] = [
             self.displacement,
@@ -138,28 +155,48 @@ class HybridLaboratory(EmulatedLaboratory):
             {
                 "t7": ModbusTcpInstrument(self.t7),
                 "tec": MeComServer(self.tec),
-                "witness": ModbusTcpInstrument(WitnessRegisters(self.world, self.plant)),
+                "witness": ModbusTcpInstrument(WitnessRegisters(self.world, self._deflection)),
             },
             clock,
+            world=self.world,
+            instruments={"t7": self.t7, "tec": self.tec},
+            faults={
+                "open-thermistor": Fault(
+                    "a wire of the thermistor at the base breaks",
+                    partial(setattr, self.base, "open", True),
+                    undo=partial(setattr, self.base, "open", False),
+                ),
+                "shorted-thermistor": Fault(
+                    "the wires of the thermistor at the tip touch",
+                    partial(setattr, self.tip, "shorted", True),
+                    undo=partial(setattr, self.tip, "shorted", False),
+                ),
+                "out-of-range": Fault(
+                    "the displacement sensor sees the tip further away",
+                    self._go_beyond,
+                    {"metres": Quantity(1e-3, "m", -1.0, 1.0, "displacement that is added")},
+                    undo=partial(self._go_beyond, 0.0),
+                ),
+                **tec_faults(self.tec),
+                "amplifier-trips": Fault("the amplifier switches itself off, if it is on", self.amplifier.trip),
+                "amplifier-clipped": Fault(
+                    "the output of the amplifier is clipped",
+                    self.amplifier.clip,
+                    {"volts": Quantity(10.0, "V", 0.0, PiezoAmplifier.SATURATION, "highest output of either sign")},
+                    undo=partial(self.amplifier.clip, PiezoAmplifier.SATURATION),
+                ),
+                "supply-clipped": peltier.fault(0.02),
+                "cantilever-stuck": Fault(
+                    "the cantilever stands still, as if it touched something", self._stick, undo=self._come_loose
+                ),
+                **{name: fault for each in sensors for name, fault in each.faults().items()},
+            },
+            seed=seed,
         )
-        self.instruments = {"t7": self.t7, "tec": self.tec}
-        self.faults = {
-            "open-thermistor": Fault(
-                "a wire of the thermistor at the base breaks", partial(setattr, self.base, "open", True)
-            ),
-            "shorted-thermistor": Fault(
-                "the wires of the thermistor at the tip touch", partial(setattr, self.tip, "shorted", True)
-            ),
-            "out-of-range": Fault(
-                "the displacement sensor sees the tip so much further (metres)", self._go_beyond, {"metres": 1e-3}
-            ),
-            **tec_faults(self.tec),
-            "amplifier-trips": Fault("the amplifier switches itself off, if it is on", self.amplifier.trip),
-        }
         if settings.ambient_step:
-            self.world.add(Event(settings.ambient_step_time, self._step_room))
+            self.at(settings.ambient_step_time, self._step_room)
         if settings.fault != "none":
-            self.world.add(Event(settings.fault_time, partial(self.inject, settings.fault)))
+            self.at(settings.fault_time, partial(self.inject, settings.fault))
 
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of cantilever, controller and amplifier."""
@@ -169,7 +206,7 @@ class HybridLaboratory(EmulatedLaboratory):
             "tip_temperature": TrueValue(plant.tip_temperature, "°C"),
             "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
             "ambient_temperature": TrueValue(plant.ambient_temperature, "°C"),
-            "deflection": TrueValue(plant.deflection, "m"),
+            "deflection": TrueValue(self._deflection(), "m"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.tec_voltage, "V"),
             "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
@@ -177,6 +214,15 @@ class HybridLaboratory(EmulatedLaboratory):
             "amplifier_command": TrueValue(self.t7.tdac_volts(0), "V", is_output=True),
             "amplifier_enable": TrueValue(self.t7.dio_level(ENABLE_LINE, pulled_down=True), is_output=True),
         }
+
+    def _deflection(self) -> float:
+        return self.plant.deflection if self._stuck is None else self._stuck
+
+    def _stick(self) -> None:
+        self._stuck = self._deflection()
+
+    def _come_loose(self) -> None:
+        self._stuck = None
 
     def _step_room(self) -> None:
         self.plant.step_ambient(self._settings.ambient_step)

@@ -7,7 +7,7 @@ the deflection in m, a 64-bit floating-point number, highest word first.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from pydantic import Field
@@ -19,7 +19,6 @@ from bench.roles import PositionSensor
 from drivers.device import LineDevice
 from drivers.modbus import RefusedError
 from drivers.modbus_tcp import Connection, share
-from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.wire.modbus import ILLEGAL_ADDRESS, Frame, Packet, RegisterError
 from sim_devices.world import World
 
@@ -32,9 +31,9 @@ _REGISTERS = (0, 4)
 class WitnessRegisters:
     """The registers of the witness; a `sim_devices.wire.modbus.PacketBank`."""
 
-    def __init__(self, world: World, plant: HybridCantilever) -> None:
+    def __init__(self, world: World, deflection: Callable[[], float]) -> None:
         self._world = world
-        self._plant = plant
+        self._deflection = deflection
 
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return the words of the deflection; raise `RegisterError` for any other registers."""
@@ -49,7 +48,7 @@ class WitnessRegisters:
     def _read(self, packet: bytes) -> bytes:  # noqa: ARG002
         with self._world.lock:
             self._world.advance_locked()
-            return _VALUE.pack(self._plant.deflection)
+            return _VALUE.pack(self._deflection())
 
     def write_registers(self, address: int, values: list[int]) -> None:  # noqa: ARG002
         """Raise `RegisterError`: nothing can be written."""

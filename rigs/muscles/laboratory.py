@@ -17,13 +17,16 @@ from pydantic import Field
 from bench.clock import Clock
 from bench.errors import ConfigurationError
 from bench.rig_file import LaboratorySettings
+from sim_devices.faults.fault import Fault, Quantity
+from sim_devices.faults.sensor import FaultySensor
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_drum import EmulatedDrum
 from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
-from sim_devices.laboratory import EmulatedLaboratory, Event, Fault, TrueValue, compile_loops
+from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
@@ -45,6 +48,8 @@ _HEARTBEAT_TIME = 0x1017
 """Object of the supply with the period of its heartbeat, ms; 0 for none."""
 _BROKEN_CELL = -1e3
 """Reading of a load cell with a broken wire, N."""
+_BOTTOM = 0.05
+"""Where the end of a broken muscle lies, m from rest: beyond the stroke of the position sensor."""
 
 FaultName = Literal[
     "none",
@@ -133,21 +138,43 @@ class Frame:
     ----------
     drum : EmulatedDrum or None
         The stage's drum, once it is there.
+    is_broken : bool
+        A fault: the muscle is torn, so that no current flows, nothing pulls, and its end lies at the bottom.
     """
 
     def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
+        self.is_broken = False
         self._fastened = False
+        self._voltage = 0.0
 
     def apply(self, voltage: float) -> None:
         """Apply the voltage of the supply, V, to the muscle's wires."""
+        self._voltage = voltage
+        if self.is_broken:
+            voltage = 0.0
         self.muscle.apply(min(max(voltage, 0.0), self.muscle.parameters.maximum_voltage))
 
     @property
     def current(self) -> float:
         """Current through the muscle, A."""
-        return self.muscle.current
+        return 0.0 if self.is_broken else self.muscle.current
+
+    @property
+    def force(self) -> float:
+        """Tension, N."""
+        return 0.0 if self.is_broken else self.muscle.force
+
+    @property
+    def position(self) -> float:
+        """Position of the end, m from rest; of a broken muscle at the bottom."""
+        return _BOTTOM if self.is_broken else self.muscle.position
+
+    def tear(self, broken: bool = True) -> None:
+        """Break the muscle, or put it together again."""
+        self.is_broken = broken
+        self.apply(self._voltage)
 
     def hang(self, newton: float) -> None:
         """Take the end off the stage, if it is there, and hang a load on it."""
@@ -198,8 +225,18 @@ class MuscleLaboratory(EmulatedLaboratory):
         compile_loops(self.muscle, _use)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
-        self._cell_is_broken = self._load_is_forgotten = False
+        self._load_is_forgotten = False
         self._load_factor = 1.0
+        self._force_sensor, self._position_sensor = (
+            FaultySensor(name, self.world, seen, unit, scale=scale, beyond=beyond, seed=(seed, i))
+            for i, (name, seen, unit, scale, beyond) in enumerate(
+                (
+                    ("force", lambda: self.frame.force, "N", 2.0, _BROKEN_CELL),
+                    ("position", lambda: self.frame.position, "m", 1e-3, _BOTTOM),
+                ),
+                1,
+            )
+        )
         self.supply = EmulatedRoboteq(
             "supply",
             self.world,
@@ -211,7 +248,7 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.load_cell = EmulatedDAD141(
             "load_cell",
             self.world,
-            self._sensed_force,
+            self._force_sensor,
             rng=cell,
             weight_limits=(-5.0, 50.0),
             zero_tracking=0,
@@ -219,13 +256,10 @@ class MuscleLaboratory(EmulatedLaboratory):
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
-        self.magnet = RatiometricSensor(lambda: self.muscle.position + settings.rest_position, rng=sensor)
+        self.magnet = RatiometricSensor(lambda: self._position_sensor() + settings.rest_position, rng=sensor)
         self.t7 = EmulatedT7(self.world, {0: self.magnet.output, 1: self.magnet.supply}, rng=t7)
-        self.t7.add_follower(lambda: self.muscle.blow(self.t7.dio_level(FAN_LINE)))
-        self.instruments = {"t7": self.t7, "supply": self.supply, "load_cell": self.load_cell, "stage": self.servo}
-        self.faults = self._faults()
-        if settings.fault != "none":
-            self.world.add(Event(settings.fault_time, partial(self.inject, settings.fault)))
+        self._fan_stands = False
+        self.t7.add_follower(self._blow)
         super().__init__(
             "muscle laboratory",
             {
@@ -235,7 +269,13 @@ class MuscleLaboratory(EmulatedLaboratory):
                 "stage": Dynamixel2Server([self.servo]),
             },
             clock,
+            world=self.world,
+            instruments={"t7": self.t7, "supply": self.supply, "load_cell": self.load_cell, "stage": self.servo},
+            faults=self._faults(),
+            seed=seed,
         )
+        if settings.fault != "none":
+            self.at(settings.fault_time, partial(self.inject, settings.fault))
 
     def operate(self, task: str, value: float) -> None:
         """Hang a load of `value` N on the muscle, or fasten its end to the stage.
@@ -258,12 +298,12 @@ class MuscleLaboratory(EmulatedLaboratory):
         """Return the state of muscle, supply, stage and fan."""
         return {
             **self.muscle_truth(),
-            "force": TrueValue(self.muscle.force, "N"),
-            "position": TrueValue(self.muscle.position, "m"),
+            "force": TrueValue(self.frame.force, "N"),
+            "position": TrueValue(self.frame.position, "m"),
             "supply_voltage": TrueValue(self.supply.voltage, "V", is_output=True),
-            "supply_current": TrueValue(self.muscle.current, "A"),
+            "supply_current": TrueValue(self.frame.current, "A"),
             "stage_angle": TrueValue(self.servo.position, "rad"),
-            "stage_torque": TrueValue(self.servo.torque_enabled, is_output=True),
+            "stage_torque": TrueValue(self.servo.holds, is_output=True),
             "fan": TrueValue(self.t7.dio_level(FAN_LINE), is_output=True),
         }
 
@@ -275,37 +315,63 @@ class MuscleLaboratory(EmulatedLaboratory):
 
     def _faults(self) -> dict[str, Fault]:
         return {
-            "silent-supply": Fault("nothing reaches the supply, and nothing comes from it", self.supply.unplug),
+            "silent-supply": Fault(
+                "nothing reaches the supply, and nothing comes from it", self.supply.unplug, undo=self.supply.plug_in
+            ),
             "missing-heartbeat": Fault(
                 "the supply sends no heartbeat any more", partial(self.supply.write_object, _HEARTBEAT_TIME, 0)
             ),
             "low-battery": Fault(
-                "the voltage behind the supply changes (volts)",
-                lambda volts: setattr(self.supply, "battery_voltage", volts),
-                {"volts": 4.5},
+                "the voltage behind the supply changes, and clips its output",
+                self._charge,
+                {"volts": Quantity(4.5, "V", 0.0, 60.0, "voltage behind the supply")},
+                undo=partial(self._charge, self._settings.battery_voltage),
+            ),
+            "supply-short-circuit": Fault(
+                "the supply sees a short circuit, and drops its output",
+                partial(self.supply.trip, SupplyFault.SHORT_CIRCUIT),
+                undo=self.supply.clear,
             ),
             "unplugged-sensor": Fault(
-                "the position sensor loses its supply", partial(setattr, self.magnet, "supply_volts", 0.0)
+                "the position sensor loses its supply",
+                partial(setattr, self.magnet, "supply_volts", 0.0),
+                undo=partial(setattr, self.magnet, "supply_volts", self.magnet.supply_volts),
             ),
             "servo-overload": Fault("the servo trips and lets go", partial(self.servo.trip, HardwareError.OVERLOAD)),
-            "broken-load-cell": Fault(
-                "a wire of the load cell breaks", partial(setattr, self, "_cell_is_broken", True)
-            ),
-            "frozen-load-cell": Fault(
-                "the converter of the load cell stands still", partial(setattr, self.load_cell, "frozen", True)
+            "broken-load-cell": self._force_sensor.faults()["force.out-of-range"],
+            "broken-muscle": Fault("the muscle is torn", self.frame.tear, undo=partial(self.frame.tear, False)),
+            "fan-stands": Fault(
+                "the fan does not turn, also when it is on",
+                partial(self._stop_fan, True),
+                undo=partial(self._stop_fan, False),
             ),
             "forgotten-load": Fault(
-                "the operator hangs nothing from now on", partial(setattr, self, "_load_is_forgotten", True)
+                "the operator hangs nothing from now on",
+                partial(setattr, self, "_load_is_forgotten", True),
+                undo=partial(setattr, self, "_load_is_forgotten", False),
             ),
             "heavy-load": Fault(
-                "the operator hangs a multiple of the load from now on (factor)",
-                lambda factor: setattr(self, "_load_factor", factor),
-                {"factor": 2.0},
+                "the operator hangs a multiple of the load from now on",
+                self._overload,
+                {"factor": Quantity(2.0, "", 0.0, 100.0, "multiple of the load")},
+                undo=partial(setattr, self, "_load_factor", 1.0),
             ),
+            **self._force_sensor.faults(),
+            **self._position_sensor.faults(),
         }
 
-    def _sensed_force(self) -> float:
-        return _BROKEN_CELL if self._cell_is_broken else self.muscle.force
+    def _blow(self) -> None:
+        self.muscle.blow(self.t7.dio_level(FAN_LINE) and not self._fan_stands)
+
+    def _stop_fan(self, stands: bool) -> None:
+        self._fan_stands = stands
+        self._blow()
+
+    def _overload(self, factor: float) -> None:
+        self._load_factor = factor
+
+    def _charge(self, volts: float) -> None:
+        self.supply.battery_voltage = volts
 
 
 class _ThermalSettings(MuscleLaboratorySettings):

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
 from bench.rig_file import LaboratorySettings
+from sim_devices.faults.fault import Fault, Quantity
+from sim_devices.faults.sensor import FaultySensor
+from sim_devices.faults.supply import ClippedPeltier
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.instruments.meerstetter_tec import DeviceStatus, EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, Fault, TrueValue, compile_loops, tec_faults
+from sim_devices.instruments.meerstetter_table import DeviceStatus
+from sim_devices.instruments.meerstetter_tec import EmulatedTEC
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
+
+_SPOT = 1
+"""Beside the seed, for the noise of a faulty sensor; the streams of the laboratory stay as they are."""
 
 
 class VO2LaboratorySettings(LaboratorySettings):
@@ -62,39 +70,73 @@ class VO2Laboratory(EmulatedLaboratory):
         self.plant = VO2Cantilever(specimen, plant_stream)
         compile_loops(self.plant, lambda plant: plant.advance(plant.parameters.step))
         self.world = World(self.plant, clock)
-        self.tec = EmulatedTEC("tec", self.world, self.plant, rng=tec_stream)
+        peltier = ClippedPeltier(self.plant)
+        self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec_stream)
         self._misalignment = 0.0
-        detector = NormalisedPSD(
-            lambda: self.plant.tip_deflection + self._misalignment,
-            settings.volts_per_metre,
-            settings.psd_noise,
-            rng=psd_stream,
+        self._stuck: tuple[float, float] | None = None
+        spot = FaultySensor(
+            "spot",
+            self.world,
+            lambda: self._bending()[1] + self._misalignment,
+            "m",
+            scale=10e-6,
+            beyond=1e-3,
+            seed=(seed, _SPOT),
         )
+        detector = NormalisedPSD(spot, settings.volts_per_metre, settings.psd_noise, rng=psd_stream)
         self.t7 = EmulatedT7(self.world, {0: detector}, rng=t7_stream)
-        super().__init__("VO2 laboratory", {"psd": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)}, clock)
-        self.instruments = {"psd": self.t7, "tec": self.tec}
-        self.faults = {
-            **tec_faults(self.tec),
-            "displaced-spot": Fault(
-                "the laser spot stands where it would with so much more deflection (metres)",
-                self._displace,
-                {"metres": 20e-6},
-            ),
-        }
+        super().__init__(
+            "VO2 laboratory",
+            {"psd": ModbusTcpInstrument(self.t7), "tec": MeComServer(self.tec)},
+            clock,
+            world=self.world,
+            instruments={"psd": self.t7, "tec": self.tec},
+            faults={
+                **tec_faults(self.tec),
+                "supply-clipped": peltier.fault(0.5),
+                **spot.faults(),
+                "displaced-spot": Fault(
+                    "the laser spot stands where it would with more deflection",
+                    self._displace,
+                    {"metres": Quantity(20e-6, "m", -1e-3, 1e-3, "deflection that is added")},
+                    undo=partial(self._displace, 0.0),
+                ),
+                "spot-off-the-psd": Fault(
+                    "the laser spot is beyond the end of the PSD",
+                    partial(self._displace, 1.0),
+                    undo=partial(self._displace, 0.0),
+                ),
+                "cantilever-stuck": Fault(
+                    "the cantilever stands still, as if it touched something", self._stick, undo=self._come_loose
+                ),
+            },
+            seed=seed,
+        )
 
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of film, plate and controller."""
         plant = self.plant
+        curvature, deflection = self._bending()
         return {
             "plate_temperature": TrueValue(plant.plate_temperature, "°C"),
             "film_temperature": TrueValue(plant.film_temperature, "°C"),
             "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
-            "curvature": TrueValue(plant.curvature, "1/m"),
-            "tip_deflection": TrueValue(plant.tip_deflection, "m"),
+            "curvature": TrueValue(curvature, "1/m"),
+            "tip_deflection": TrueValue(deflection, "m"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.voltage, "V"),
             "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
         }
+
+    def _bending(self) -> tuple[float, float]:
+        """Return curvature (1/m) and deflection of the tip (m)."""
+        return (self.plant.curvature, self.plant.tip_deflection) if self._stuck is None else self._stuck
+
+    def _stick(self) -> None:
+        self._stuck = self._bending()
+
+    def _come_loose(self) -> None:
+        self._stuck = None
 
     def _displace(self, metres: float) -> None:
         self._misalignment = metres

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,7 @@ from sim_devices.instruments.dynamixel_table import (
     FULL_PWM,
     GOALS,
     HIGHEST_GOAL,
+    INDIRECT_ADDRESSES,
     ITEMS,
     POSITION,
     PWM,
@@ -65,7 +67,7 @@ from sim_devices.instruments.dynamixel_table import (
     HardwareError,
     Item,
 )
-from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.world import World
 
 MODEL_NUMBER = 30
@@ -98,7 +100,7 @@ ARRIVAL_TOLERANCE = 0.01
 _CLEAR_KEY = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 
 
-class EmulatedMX28(EmulatedInstrument, Servo):
+class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
     """One MX-28, as its control table and as the role of a servo.
 
     Called directly, angles are those of the position registers: zero at count 0, positive as the counts are.
@@ -118,6 +120,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
     rng : numpy.random.Generator, optional
         Noise of the encoder; without it the readings are free of noise.
     """
+
+    MEASURED = (124, 126, 128, 132, 136, 140, 144, 146)
 
     def __init__(
         self,
@@ -140,7 +144,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._saved = {address: item.default for address, item in ITEMS.items() if item.in_eeprom}
         self._saved |= {0: model_number, 6: firmware, 7: bus_id}
         self._values = {address: item.default for address, item in ITEMS.items()} | self._saved
-        self._readings: dict[int, Callable[[], float]] = {
+        self._readings: dict[int, Callable[..., Any]] = {
             69: lambda: self._registered is not None,
             70: lambda: self._hardware_error,
             120: lambda: int(self.world.time * 1e3) % 32768,
@@ -189,6 +193,12 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             if self._trajectory is None:
                 return self._angle
             return self._trajectory.at(self.world.time + seconds)[0]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the torque is on at the clock's present time; does not feed the watchdog."""
+        with self.world.at_present():
+            return self._values[64] == 1
 
     @property
     def bus_id(self) -> int:
@@ -374,6 +384,9 @@ class EmulatedMX28(EmulatedInstrument, Servo):
             self._temperature = celsius
             self._protect()
 
+    def _readings_changed(self) -> None:
+        self._table = ControlTable(self._values, self._readings)
+
     # Timed events.
 
     def deadline(self) -> float:
@@ -555,6 +568,8 @@ class EmulatedMX28(EmulatedInstrument, Servo):
                 self._command()
         elif address in GOALS:
             self._command()
+        elif address in INDIRECT_ADDRESSES:
+            self._table.forget()
         if address in (64, 98):
             self._feed()
 
@@ -572,6 +587,7 @@ class EmulatedMX28(EmulatedInstrument, Servo):
         self._values |= {address: item.default for address, item in ITEMS.items() if not item.in_eeprom}
         self._values |= self._saved
         self._values[100] = self._values[36]
+        self._table.forget()
         self._hardware_error = HardwareError(0)
         self._registered = None
         self._switch_off()

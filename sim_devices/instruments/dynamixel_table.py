@@ -177,6 +177,9 @@ ITEMS = {
 }
 """The control table by address, with the indirect addresses and their data."""
 
+INDIRECT_ADDRESSES = frozenset(first + 2 * place for first, _, count in INDIRECT for place in range(count))
+"""Where the indirect addresses are kept."""
+
 _INDIRECT_ADDRESS_OF = {data + place: first + 2 * place for first, data, count in INDIRECT for place in range(count)}
 """Where the address is kept that a byte of indirect data stands for."""
 
@@ -266,18 +269,26 @@ class ControlTable:
         return address if kept is None else self._values[kept]
 
     def _block(self, address: int, length: int) -> _Block | None:
-        """Return form and sources of addresses that are whole items and no indirect data; None for others."""
+        """Return form and sources of addresses that stand for whole items, once each; None for others."""
         known = self._blocks.get((address, length))
         if known is not None:
             return known
-        items, end = [], address
-        while end < address + length and end in ITEMS and end not in _INDIRECT_ADDRESS_OF:
-            items.append(ITEMS[end])
-            end += ITEMS[end].size
-        if not items or end != address + length:
+        meant = [self._meant(byte) for byte in range(address, address + length)]
+        items, place = [], 0
+        while place < length and meant[place] in ITEMS:
+            item = ITEMS[meant[place]]
+            if meant[place : place + item.size] != list(range(item.address, item.address + item.size)):
+                return None
+            items.append(item)
+            place += item.size
+        if not items or place != length or len(set(items)) < len(items):
             return None
         block = self._blocks[address, length] = self._block_of(items)
         return block
+
+    def forget(self) -> None:
+        """Forget what the indirect data stand for, as their addresses have changed."""
+        self._blocks.clear()
 
     def _block_of(self, items: Sequence[Item]) -> _Block:
         form = struct.Struct("<" + "".join(_FORMATS[item.size, item.signed][1:] for item in items))

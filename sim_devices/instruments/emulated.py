@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
+from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -119,6 +121,41 @@ class LineFaults:
         """Flip one bit."""
         middle = len(answer) // 2
         return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
+
+
+class FreezingReadings:
+    """An instrument whose measured values can stand still, while it answers and obeys as ever.
+
+    Attributes
+    ----------
+    MEASURED : tuple of int
+        Those of its readings that it measures.
+    """
+
+    MEASURED: ClassVar[tuple[int, ...]]
+    world: World
+
+    _readings: dict[int, Callable[..., Any]]
+    _thawed: dict[int, Callable[..., Any]] | None = None
+
+    def freeze(self) -> None:
+        """Let measured values stand at what they are when they are next read."""
+        with self.world.at_present():
+            if self._thawed is None:
+                self._thawed = {number: self._readings[number] for number in self.MEASURED}
+                self._readings.update({number: cache(reading) for number, reading in self._thawed.items()})
+                self._readings_changed()
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        with self.world.at_present():
+            if self._thawed is not None:
+                self._readings.update(self._thawed)
+                self._thawed = None
+                self._readings_changed()
+
+    def _readings_changed(self) -> None:
+        """Forget what was kept of the readings; an instrument that keeps some overrides it."""
 
 
 class EmulatedInstrument(LineFaults, EmulatedDevice):

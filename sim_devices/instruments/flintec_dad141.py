@@ -248,6 +248,16 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         """Whether the instrument answers requests at the clock's present time."""
         return self.plugged_in and self.world.clock.now() >= self._starts_at
 
+    def freeze(self) -> None:
+        """Let the converter stand still, and with it everything that is read."""
+        with self.world.at_present():
+            self.frozen = True
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        with self.world.at_present():
+            self.frozen = False
+
     # The conversion.
 
     def deadline(self) -> float:

@@ -217,6 +217,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.firmware = firmware
         self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._normals = normals(rng)
+        self._held: dict[int, float] | None = None
         self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
@@ -254,6 +255,14 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             for follow in self._restart_followers:
                 follow()
             self._lead()
+
+    def freeze(self) -> None:
+        """Let each input stand at its next reading."""
+        self._held = {}
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._held = None
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -437,13 +446,19 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             return settings.burst
 
     def _convert(self, channel: int, scale: _Scale | None = None) -> float:
+        held = self._held
+        if held is not None and channel in held:
+            return held[channel]
         settings = self._inputs[channel]
         volts = self._sources[channel]()
         if settings.negative != SINGLE_ENDED:
             volts -= self._sources[settings.negative]()
         noise, step, lowest, highest = scale or settings.scale
         volts = round((volts + noise * next(self._normals)) / step) * step
-        return volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        volts = volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        if held is not None:
+            held[channel] = volts
+        return volts
 
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default

@@ -28,14 +28,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import TECAmplifier, TECMode
-from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.instruments.meerstetter_table import (
     CONTROLLER,
     ENABLE_LIVE,
@@ -103,7 +103,7 @@ class PeltierLoad(Protocol):
         """Switch the output off."""
 
 
-class EmulatedTEC(EmulatedInstrument, TECAmplifier):
+class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
     """One TEC-1091 with its Peltier element, as the parameter table and as the role of a TEC amplifier.
 
     Parameters
@@ -113,6 +113,8 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
     rng : numpy.random.Generator, optional
         Noise of the object temperature; without it the readings are free of noise.
     """
+
+    MEASURED = (1000, 1001, 1020, 1021)
 
     def __init__(
         self,
@@ -136,7 +138,7 @@ class EmulatedTEC(EmulatedInstrument, TECAmplifier):
         }
         self._values = dict(self._saved)
         self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 102: serial_number, 103: firmware}
-        self._readings: dict[int, Callable[[], float]] = {
+        self._readings: dict[int, Callable[..., Any]] = {
             104: lambda: self._status,
             105: lambda: self._error,
             106: lambda: self._error_instance,

@@ -30,16 +30,17 @@ runs, user variables (0x2005).
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from bench.devices import Identity, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import VoltageSupply
-from sim_devices.instruments.emulated import EmulatedInstrument, RequestRefusedError
+from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.instruments.roboteq_objects import (
     CHANNELS,
     DICTIONARY,
@@ -53,7 +54,7 @@ from sim_devices.instruments.roboteq_objects import (
     Fault,
     NodeState,
 )
-from sim_devices.instruments.roboteq_pdo import ProcessDataObjects, is_configuration
+from sim_devices.instruments.roboteq_pdo import Objects, ProcessDataObjects, is_configuration
 from sim_devices.world import World
 
 DEVICE_TYPE = 0x000F0191
@@ -89,7 +90,7 @@ class HeatingLoad(Protocol):
         """Current through the load, A."""
 
 
-class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
+class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
     """One SDC2160 with its load, as the object dictionary and as the role of a voltage supply.
 
     Parameters
@@ -115,6 +116,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     rng : numpy.random.Generator, optional
         Noise of the readings of battery voltage and current; without it they are free of noise.
     """
+
+    MEASURED = (0x2100, 0x2102, 0x210C, 0x210D)
 
     def __init__(
         self,
@@ -149,6 +152,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._commands = [0] * CHANNELS
         self._counters = [0] * CHANNELS
         self._variables = [0] * VARIABLES
+        self._forms: dict[Objects, struct.Struct] = {}
         self._pdos = ProcessDataObjects(node, send_rates, world.clock.now())
         self._held = False
         self._trips = Fault(0)
@@ -164,7 +168,7 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._quiet_until = -math.inf
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
-        self._readings: dict[int, Callable[[int], int]] = {
+        self._readings: dict[int, Callable[..., Any]] = {
             0x1000: lambda _: DEVICE_TYPE,
             0x1001: lambda _: 1 if self._faults() else 0,
             0x1016: lambda sub: self._consumer_heartbeats[sub - 1] if sub else len(self._consumer_heartbeats),
@@ -300,6 +304,8 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
     def receive_process_data(self, identifier: int, data: bytes) -> None:
         """Obey an RPDO; other frames, short ones, and values that are refused, change nothing."""
         objects = self._pdos.received(identifier)
+        if not objects:
+            return
         forms = [FORMATS[DICTIONARY[key].kind] for key in objects]
         if self._state is not NodeState.OPERATIONAL or len(data) < sum(form.size for form in forms):
             return
@@ -313,7 +319,11 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
         if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
             return []
-        return [(identifier, b"".join(map(self._encoded, objects))) for identifier, objects in pdos]
+        with self.world.lock:
+            self.world.advance()
+            # Each object is measured once, however many of the frames carry it.
+            values: dict[tuple[int, int], int] = {}
+            return [(identifier, self._encoded(objects, values)) for identifier, objects in pdos]
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -326,8 +336,16 @@ class EmulatedRoboteq(EmulatedInstrument, VoltageSupply):
         self._quiet_until = instant - 1e-6
         return instant
 
-    def _encoded(self, key: tuple[int, int]) -> bytes:
-        return FORMATS[DICTIONARY[key].kind].pack(self.read_object(*key))
+    def _encoded(self, objects: Objects, values: dict[tuple[int, int], int]) -> bytes:
+        """Return objects as a frame carries them; those that are missing in `values` are measured."""
+        form = self._forms.get(objects)
+        if form is None:
+            codes = (FORMATS[DICTIONARY[key].kind].format[1:] for key in objects)
+            form = self._forms[objects] = struct.Struct("<" + "".join(codes))
+        for key in objects:
+            if key not in values:
+                values[key] = self._readings[key[0]](key[1])
+        return form.pack(*[values[key] for key in objects])
 
     # Faults.
 

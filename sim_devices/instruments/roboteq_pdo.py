@@ -33,6 +33,10 @@ _LAST_SYNCHRONOUS, _FIRST_BY_TIME = 240, 254
 _BITS = 64
 
 
+Objects = tuple[tuple[int, int], ...]
+"""Index and subindex of the objects that a PDO carries."""
+
+
 @dataclass
 class _Pdo:
     """One process data object."""
@@ -45,6 +49,7 @@ class _Pdo:
     interval: float = 0.0
     due: float = math.inf
     syncs: int = field(default=0)
+    _objects: Objects | None = field(default=None, init=False)
 
     @property
     def exists(self) -> bool:
@@ -55,9 +60,20 @@ class _Pdo:
         return self.cob_id & 0x7FF
 
     @property
-    def objects(self) -> list[tuple[int, int]]:
+    def objects(self) -> Objects:
         """Index and subindex of what it carries, in order."""
-        return [(entry >> 16, entry >> 8 & 0xFF) for entry in self.entries[: self.count]]
+        if self._objects is None:
+            self._objects = tuple((entry >> 16, entry >> 8 & 0xFF) for entry in self.entries[: self.count])
+        return self._objects
+
+    def map(self, place: int, entry: int) -> None:
+        """Map an object to a place from 0 on, which does not count before `count` is set."""
+        self.entries[place] = entry
+        self._objects = None
+
+    def carry(self, count: int) -> None:
+        """Carry the first objects that are mapped, so many."""
+        self.count, self._objects = count, None
 
 
 class ProcessDataObjects:
@@ -105,10 +121,10 @@ class ProcessDataObjects:
             if pdo.exists or (sub and pdo.count):
                 raise RequestRefusedError(AbortCode.UNSUPPORTED)
             if sub:
-                pdo.entries[sub - 1] = value
+                pdo.map(sub - 1, value)
             else:
                 _check_mapping(pdo, value)
-                pdo.count = value
+                pdo.carry(value)
         elif sub == 1:
             if value & ~(_DESTROYED | _NO_REMOTE | 0x7FF):
                 raise RequestRefusedError(AbortCode.VALUE)
@@ -118,7 +134,7 @@ class ProcessDataObjects:
                 raise RequestRefusedError(AbortCode.VALUE)
             pdo.kind, pdo.syncs = value, 0
 
-    def take_due(self, now: float) -> list[tuple[int, list[tuple[int, int]]]]:
+    def take_due(self, now: float) -> list[tuple[int, Objects]]:
         """Return identifier and objects of each TPDO that is due by its interval, once each."""
         due = []
         for pdo in self._scheduled:
@@ -134,23 +150,23 @@ class ProcessDataObjects:
             (pdo.due for pdo in self._scheduled if pdo.exists and pdo.kind >= _FIRST_BY_TIME), default=math.inf
         )
 
-    def take_synchronous(self) -> list[tuple[int, list[tuple[int, int]]]]:
+    def take_synchronous(self) -> list[tuple[int, Objects]]:
         """Count a SYNC; return identifier and objects of each TPDO that it asks for."""
         asked = []
         for pdo in self._transmit:
-            if pdo.exists and pdo.kind <= _LAST_SYNCHRONOUS:
+            if pdo.kind <= _LAST_SYNCHRONOUS and pdo.exists:
                 pdo.syncs += 1
                 if pdo.syncs >= pdo.kind:
                     pdo.syncs = 0
                     asked.append((pdo.identifier, pdo.objects))
         return asked
 
-    def received(self, identifier: int) -> list[tuple[int, int]]:
+    def received(self, identifier: int) -> Objects:
         """Return the objects that a frame with an identifier writes, none if it is no RPDO."""
         for pdo in self._receive:
             if pdo.exists and pdo.identifier == identifier:
                 return pdo.objects
-        return []
+        return ()
 
     def _at(self, index: int) -> tuple[_Pdo, bool]:
         """Return the PDO that an object configures, and whether the object is its mapping."""

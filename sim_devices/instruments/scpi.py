@@ -85,6 +85,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
         self.table = table
         self._meters = meters
         self._drive = drive
+        self._frozen: dict[str, float] | None = None
         self.errors: deque[str] = deque()
         self._actions = self._all_actions()
         # The same, by messages as they were sent: a host sends the same few again and again.
@@ -234,7 +235,22 @@ class EmulatedTextInstrument(EmulatedInstrument):
         if self._drive is not None:
             self._drive(self.output)
 
+    def freeze(self) -> None:
+        """Let each signal stand at its next reading; the output is obeyed as ever."""
+        self._frozen = {}
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._frozen = None
+
     def _reading(self, name: str) -> float:
+        if self._frozen is None:
+            return self._measured(name)
+        if name not in self._frozen:
+            self._frozen[name] = self._measured(name)
+        return self._frozen[name]
+
+    def _measured(self, name: str) -> float:
         meter = self._meters[name]
         return _rounded(meter.read() + self._draw(meter.noise), meter.resolution)
 

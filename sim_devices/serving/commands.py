@@ -72,7 +72,8 @@ def emulate(
 
     Each instrument speaks the bytes of the real one, so that any client of its protocol can talk to it. The addresses
     are printed, and written to the file of `--json` once everything is ready. The control socket reads the true state
-    of the laboratory and injects faults. Ctrl-C and SIGTERM end it.
+    of the laboratory, injects faults such as {"do": "fault", "fault": "tec.delay", "duration": 5}, and lists them by
+    {"do": "help"}; the file of `--state` says when each began and ended. Ctrl-C and SIGTERM end it.
     """
     replaced = parse_assignments("--override", overrides or [])
     files = [load_rig(rig, replaced) for rig in rigs]

@@ -13,7 +13,7 @@ from bench.errors import ConfigurationError
 from sim_devices.laboratory import TrueValue
 from sim_devices.serving import requests
 from sim_devices.serving.endpoints import Connection, Listener, socket_address
-from sim_devices.serving.lines import Cable, Watched
+from sim_devices.serving.lines import Watched
 from sim_devices.serving.served import ServedLaboratory, one_of
 
 _LONGEST_LINE = 65_536
@@ -179,12 +179,25 @@ class ControlSocket:
                     raise ConfigurationError("advance: the clock is the wall's; serve with --clock x1, or another xN")
                 served.skip(seconds)
                 return self._time(served)
-            case requests.InjectFault(fault=fault, values=values):
-                served.laboratory.inject(fault, values)
+            case requests.InjectFault(fault=fault, values=values, duration=duration):
+                served.laboratory.inject(fault, values, duration)
+            case requests.EndFault(fault=fault):
+                served.laboratory.end(fault)
+            case requests.Schedule(faults=faults):
+                served.laboratory.schedule(faults)
+            case requests.Events(since=since):
+                events = [event.to_json() for event in served.laboratory.events[since:]]
+                return {"time": served.clock.now(), "events": events}
             case requests.Operate(task=task, value=value):
                 served.laboratory.operate(task, value)
             case requests.LineRequest(instrument=instrument):
-                _disturb(request, served, instrument)
+                if instrument not in served.lines:
+                    known = ", ".join(served.lines)
+                    raise ConfigurationError(f"rig {served.name} has no instrument {instrument!r}; it has: {known}")
+                if isinstance(request, requests.PlugIn):
+                    served.laboratory.mend(instrument)
+                else:
+                    served.laboratory.inject(f"{instrument}.{request.name}")
         return {"time": served.clock.now()}
 
     def _time(self, served: ServedLaboratory) -> dict[str, Any]:
@@ -209,33 +222,11 @@ class ControlSocket:
             "rigs": {
                 served.name: {
                     "instruments": [*served.lines],
-                    "faults": {
-                        name: {"does": fault.summary, "values": dict(fault.values)}
-                        for name, fault in served.laboratory.faults.items()
-                    },
+                    "faults": {name: fault.to_json() for name, fault in served.laboratory.faults.items()},
                 }
                 for served in self._laboratories
             },
         }
-
-
-def _disturb(request: requests.LineRequest, served: ServedLaboratory, instrument: str) -> None:
-    served.line(instrument)
-    match request:
-        case requests.PowerCycle():
-            served.power_cycle(instrument)
-        case requests.Unplug():
-            served.break_off(instrument, Cable.UNPLUGGED)
-        case requests.Cut():
-            served.break_off(instrument, Cable.CUTTING)
-        case requests.Hang():
-            served.break_off(instrument, Cable.HANGING)
-        case requests.PlugIn():
-            served.mend(instrument)
-        case requests.Corrupt():
-            served.corrupt_next_answer(instrument)
-        case requests.Drop():
-            served.drop_next_answer(instrument)
 
 
 def values_to_json(values: Mapping[str, TrueValue]) -> dict[str, dict[str, Any]]:

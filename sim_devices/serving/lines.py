@@ -1,19 +1,18 @@
-"""The line of one served instrument: its clients, the time that bytes take, and the faults of a cable."""
+"""The line of one served instrument: its clients, and the time that bytes take."""
 
 from __future__ import annotations
 
 import math
 import selectors
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
-from enum import Enum
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Protocol
 
 from bench.clock import Stopwatch
 from sim_devices.serving.clock import ServedClock
 from sim_devices.serving.endpoints import Connection, End, Listener, PseudoTerminal, socket_address
-from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument
+from sim_devices.wire import Stream, TcpServer, WireServer
+from sim_devices.wire.modbus_tcp import FramingError
 
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
 _SLICE = 64  # bytes that are served at once, so that a flood of bursts moves the clock no further than a few of them
@@ -26,26 +25,6 @@ class Watched(Protocol):
 
     def fileno(self) -> int:
         """Return the descriptor."""
-
-
-class Stream(Protocol):
-    """The instrument's end of a line or connection."""
-
-    def receive(self, data: bytes) -> bytes:
-        """Take bytes from the client, in pieces of any size; return what the instrument sends."""
-
-
-class Cable(Enum):
-    """The state of a line."""
-
-    WHOLE = "whole"
-    UNPLUGGED = "unplugged"
-    """What is sent either way is lost; connections stay, as with a cable that was pulled."""
-    CUTTING = "cut at the next answer"
-    CUT = "cut"
-    """As unplugged; TCP connections are reset, and new ones are closed at once."""
-    HANGING = "hanging"
-    """Nothing is served; what was asked is answered, late, once the line is whole again."""
 
 
 class Channel:
@@ -67,6 +46,8 @@ class Channel:
         self.end = end
         self.stream = stream
         self.is_over = False
+        self.is_ended = False
+        """Whether the instrument has ended it; what it had sent is still delivered."""
         self._clock = clock
         self._baudrate = baudrate
         self._arriving: deque[tuple[float, bytes]] = deque()
@@ -98,7 +79,8 @@ class Channel:
         """Return the laboratory time (s) at which bytes arrive or leave next; infinity if none are on their way."""
         arriving = max(self._arriving[0][0], self._clock.now()) if self._arriving and self.has_room else math.inf
         leaving = self._leaving[0][0] if self._leaving and self._blocked is None else math.inf
-        return min(arriving, leaving)
+        by_itself = self.stream.next_unsolicited() if self.has_room else math.inf
+        return min(arriving, leaving, by_itself)
 
     def read(self) -> None:
         """Take what the client has sent."""
@@ -113,7 +95,7 @@ class Channel:
 
     def serve(self) -> Iterator[bytes]:
         """Hand over what has arrived, piece by piece, and yield each answer; stop while the clock is ahead."""
-        while self._arriving and self.has_room and not self._clock.is_ahead:
+        while self._arriving and self.has_room and not (self._clock.is_ahead or self.is_ended):
             instant, data = self._arriving[0]
             if instant > self._clock.now():
                 break
@@ -125,21 +107,27 @@ class Channel:
             try:
                 answer = self.stream.receive(piece)
             except (FramingError, ConnectionResetError):
-                self.is_over = True
+                self.is_ended = True
                 break
             if answer:
                 yield answer
+
+    def hear(self) -> None:
+        """Put what the instrument sends without a request on its way."""
+        if self.is_ended or not self.has_room:
+            return
+        try:
+            sent = self.stream.unsolicited()
+        except (FramingError, ConnectionResetError):
+            self.is_ended = True
+        else:
+            if sent:
+                self.send(sent)
 
     def send(self, data: bytes) -> None:
         """Put bytes on their way to the client."""
         self._left_at = max(self._clock.now(), self._left_at) + self._duration(data)
         self._leaving.append((self._left_at, data))
-
-    def lose(self) -> None:
-        """Lose all that is on its way."""
-        self._arriving.clear()
-        self._leaving.clear()
-        self._blocked = None
 
     def flush(self) -> None:
         """Deliver what is due; what a terminal's client does not read for a second is lost."""
@@ -183,7 +171,7 @@ class Line:
     ----------
     name : str
         Name of the instrument in the laboratory.
-    server : WireServer or ModbusTcpInstrument
+    server : WireServer or TcpServer
         The instrument's side: of a serial line, or of one on TCP.
     end : PseudoTerminal or Listener
         Where clients come in.
@@ -191,27 +179,24 @@ class Line:
         The clock of the laboratory.
     baudrate : float
         Speed of a serial line where the client sets none, Bd; inf for bytes that take no time.
-
-    Attributes
-    ----------
-    cable : Cable
-        The state of the line.
+    is_cut : callable
+        Whether the line is dead, so that connections to a serial one on TCP are ended and refused.
     """
 
     def __init__(
         self,
         name: str,
-        server: WireServer | ModbusTcpInstrument,
+        server: WireServer | TcpServer,
         end: PseudoTerminal | Listener,
         clock: ServedClock,
         baudrate: float,
+        is_cut: Callable[[], bool],
     ) -> None:
         self.name = name
-        self.cable = Cable.WHOLE
         self._server = server
         self._clock = clock
         self._baudrate = baudrate
-        self._corrupt_next = self._drop_next = False
+        self._is_cut = is_cut
         self._listener = end if isinstance(end, Listener) else None
         self._channels: list[Channel] = []
         if isinstance(end, PseudoTerminal):
@@ -222,8 +207,6 @@ class Line:
 
     def watched(self) -> Iterator[tuple[Watched, int]]:
         """Yield what to wait on, and for what."""
-        if self.cable is Cable.HANGING:
-            return
         if self._listener is not None:
             yield self._listener, selectors.EVENT_READ
         for channel in self._channels:
@@ -233,60 +216,28 @@ class Line:
 
     def next_due(self) -> float:
         """Return the laboratory time (s) at which there is something to do; infinity if nothing is known."""
-        if self.cable is Cable.HANGING:
-            return math.inf
-        by_itself = self._server.next_unsolicited() if isinstance(self._server, WireServer) else math.inf
-        return min((by_itself, *(channel.next_due() for channel in self._channels)))
+        return min((channel.next_due() for channel in self._channels), default=math.inf)
 
     def serve(self, ready: Collection[Watched]) -> None:
         """Take what has arrived, let the instrument answer, and deliver what is due; never waits."""
-        if self.cable is Cable.HANGING:
-            return
         for channel in self._channels:
             if channel.end in ready:
                 channel.read()
             for answer in channel.serve():
-                self._send(channel, answer)
-        # Without a client, or with one that does not read, nobody hears it.
-        if isinstance(self._server, WireServer) and (unsolicited := self._server.unsolicited()):
-            for channel in self._channels:
-                if channel.has_room:
-                    self._send(channel, unsolicited)
+                channel.send(answer)
+            channel.hear()
+        if not self._channels and isinstance(self._server, WireServer):
+            # Without a client nobody hears it.
+            self._server.unsolicited()
         for channel in self._channels:
             channel.flush()
-        if self.cable is Cable.CUT and not any(channel.is_leaving for channel in self._channels):
-            self._lose_connections()
+            ended = channel.is_ended or (isinstance(self._server, WireServer) and self._is_cut())
+            if ended and isinstance(channel.end, Connection) and not channel.is_leaving:
+                channel.end.reset()
+                channel.is_over = True
         self._drop(channel for channel in self._channels if channel.is_over)
         if self._listener is not None and self._listener in ready:
             self._accept(self._listener)
-
-    def break_off(self, cable: Cable) -> None:
-        """Bring the line into another state; what is on its way is lost unless it only hangs."""
-        self.cable = cable
-        if cable is Cable.UNPLUGGED:
-            for channel in self._channels:
-                channel.lose()
-
-    def mend(self) -> None:
-        """Make the line whole; answers that a hanging one owes are given now."""
-        self.cable = Cable.WHOLE
-        self._corrupt_next = self._drop_next = False
-
-    def corrupt_next_answer(self) -> None:
-        """Flip a bit of the next answer."""
-        self._corrupt_next = True
-
-    def drop_next_answer(self) -> None:
-        """Lose the next answer; the instrument has acted all the same."""
-        self._drop_next = True
-
-    def restart(self) -> None:
-        """Lose what is on its way, and connections on TCP: the instrument has lost its power."""
-        if isinstance(self._server, WireServer):
-            for channel in self._channels:
-                channel.lose()
-        else:
-            self._lose_connections()
 
     def close(self) -> None:
         """Close every end; ports and paths are free again."""
@@ -301,21 +252,6 @@ class Line:
             return Channel(end, self._server, self._clock, self._baudrate)
         return Channel(end, self._server.connect(), self._clock, math.inf)
 
-    def _send(self, channel: Channel, answer: bytes) -> None:
-        if self.cable in (Cable.UNPLUGGED, Cable.CUT):
-            return
-        if self._drop_next:
-            self._drop_next = False
-            return
-        if self._corrupt_next:
-            self._corrupt_next = False
-            middle = len(answer) // 2
-            answer = answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
-        if self.cable is Cable.CUTTING:
-            self.cable = Cable.CUT
-            answer = answer[: len(answer) // 2]
-        channel.send(answer)
-
     def _accept(self, listener: Listener) -> None:
         """Let the next client in, or turn it away if there are as many as the instrument takes."""
         accepted = listener.accept()
@@ -326,7 +262,7 @@ class Line:
             channel for channel in self._channels if isinstance(channel.end, Connection) and channel.end.is_over
         )
         try:
-            if self.cable is Cable.CUT or (isinstance(self._server, WireServer) and self._channels):
+            if isinstance(self._server, WireServer) and (self._channels or self._is_cut()):
                 raise ConnectionRefusedError
             self._channels.append(self._channel(accepted))
         except ConnectionRefusedError:
@@ -336,9 +272,3 @@ class Line:
         for channel in [*channels]:
             self._channels.remove(channel)
             channel.close()
-
-    def _lose_connections(self) -> None:
-        for channel in self._channels:
-            if isinstance(channel.end, Connection):
-                channel.end.reset()
-        self._drop(channel for channel in self._channels if isinstance(channel.end, Connection))

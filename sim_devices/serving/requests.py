@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
+from bench.faults import ScheduledFault
 
 _LONGEST_SKIP = 3600.0
 _RIG = Field(default=None, description="which rig is meant, where several are served")
@@ -33,7 +34,7 @@ class RigRequest(Request):
 
 
 class LineRequest(RigRequest):
-    """Base of what happens to the line of an instrument."""
+    """Base of what happens to the line of an instrument: a short form of its fault of the same name."""
 
     instrument: str = _INSTRUMENT
 
@@ -74,8 +75,30 @@ class InjectFault(RigRequest):
     """Make a fault happen, now."""
 
     name = "fault"
-    fault: str = Field(description="name of a fault of the laboratory")
+    fault: str = Field(description="name of a fault of the laboratory, such as tec.delay")
     values: dict[str, float] = Field(default_factory=dict, description="what can be chosen of it, by name")
+    duration: float | None = Field(default=None, description="laboratory time after which it ends, s")
+
+
+class EndFault(RigRequest):
+    """End a fault that goes on."""
+
+    name = "end-fault"
+    fault: str = Field(description="name of a fault of the laboratory")
+
+
+class Schedule(RigRequest):
+    """Let faults happen at instants that count from now."""
+
+    name = "schedule"
+    faults: tuple[ScheduledFault, ...] = Field(strict=False, description="as in a file of `bench run --faults`")
+
+
+class Events(RigRequest):
+    """Return the faults that have begun and ended."""
+
+    name = "events"
+    since: int = Field(default=0, ge=0, description="how many of the first to leave out")
 
 
 class Operate(RigRequest):
@@ -87,7 +110,7 @@ class Operate(RigRequest):
 
 
 class PowerCycle(LineRequest):
-    """Switch an instrument off and on again."""
+    """Switch an instrument off and on again; connections on TCP are reset."""
 
     name = "power-cycle"
 
@@ -111,7 +134,7 @@ class Hang(LineRequest):
 
 
 class PlugIn(LineRequest):
-    """Undo unplug, cut and hang."""
+    """End all faults of the line of an instrument."""
 
     name = "plug-in"
 
@@ -143,8 +166,8 @@ class Stop(Request):
 REQUESTS: dict[str, type[Request]] = {
     each.name: each
     for each in (
-        Help, State, Time, Wait, Advance, InjectFault, Operate, PowerCycle, Unplug, Cut, Hang, PlugIn, Corrupt, Drop,
-        EndWithConnection, Stop,
+        Help, State, Time, Wait, Advance, InjectFault, EndFault, Schedule, Events, Operate, PowerCycle, Unplug, Cut,
+        Hang, PlugIn, Corrupt, Drop, EndWithConnection, Stop,
     )
 }  # fmt: skip
 

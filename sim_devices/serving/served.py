@@ -10,12 +10,12 @@ from typing import Any
 
 from bench.errors import ConfigurationError
 from bench.rig_file import RigFile
+from sim_devices.faults.line import Cable
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock
 from sim_devices.serving.endpoints import HAS_PSEUDO_TERMINALS, Listener, PseudoTerminal
-from sim_devices.serving.lines import Cable, Line, Watched
-from sim_devices.wire import WireServer
-from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
+from sim_devices.serving.lines import Line, Watched
+from sim_devices.wire import TcpServer, WireServer
 
 _SCHEME = "emulated://"
 
@@ -125,63 +125,21 @@ class ServedLaboratory:
         self._advance()
         return self.laboratory.truth()
 
-    def line(self, instrument: str) -> Line:
-        """Return the line of an instrument.
-
-        Raises ConfigurationError if there is no such instrument.
-        """
-        if instrument not in self.lines:
-            raise ConfigurationError(
-                f"rig {self.name} has no instrument {instrument!r}; it has: {', '.join(self.lines)}"
-            )
-        return self.lines[instrument]
-
-    def power_cycle(self, instrument: str) -> None:
-        """Switch an instrument off and on again.
-
-        Raises ConfigurationError if there is no such instrument, or it cannot be restarted.
-        """
-        line = self.line(instrument)
-        restart = getattr(self.laboratory.instruments.get(instrument), "power_cycle", None)
-        if restart is None:
-            able = [name for name, each in self.laboratory.instruments.items() if hasattr(each, "power_cycle")]
-            raise ConfigurationError(f"{instrument} cannot be restarted; these can: {', '.join(able) or 'none'}")
-        self._advance()
-        restart()
-        line.restart()
-
-    def corrupt_next_answer(self, instrument: str) -> None:
-        """Damage the next answer of an instrument, in the way of its protocol if it knows one."""
-        damage = getattr(self.laboratory.instruments.get(instrument), "corrupt_next_answer", None)
-        (damage or self.line(instrument).corrupt_next_answer)()
-
-    def drop_next_answer(self, instrument: str) -> None:
-        """Lose the next answer of an instrument; of an adapter only what comes from behind it."""
-        lose = getattr(self.laboratory.instruments.get(instrument), "drop_next_answer", None)
-        (lose or self.line(instrument).drop_next_answer)()
-
-    def mend(self, instrument: str) -> None:
-        """Make the line of an instrument whole."""
-        self.line(instrument).mend()
-
-    def break_off(self, instrument: str, cable: Cable) -> None:
-        """Bring the line of an instrument into another state."""
-        self.line(instrument).break_off(cable)
-
     def _advance(self) -> None:
         if self.laboratory.world is not None:
             self.laboratory.world.advance()
 
-    def _open(self, name: str, server: WireServer | ModbusTcpInstrument, speed: float, serving: Serving) -> Line:
+    def _open(self, name: str, server: WireServer | TcpServer, speed: float, serving: Serving) -> Line:
         port = serving.ports.get(f"{self.name}.{name}")
-        self._protocols[name] = server.protocol if isinstance(server, WireServer) else "Modbus TCP"
+        self._protocols[name] = server.protocol
         on_tcp = not isinstance(server, WireServer) or serving.tcp or not HAS_PSEUDO_TERMINALS or port is not None
         try:
             end = Listener((serving.host, port or 0)) if on_tcp else PseudoTerminal()
         except OSError as error:
             where = f"port {port} of {serving.host}" if port else serving.host if on_tcp else "a pseudo-terminal"
             raise ConfigurationError(f"{self.name}: {name} cannot be served at {where}: {error.strerror}") from None
-        return Line(name, server, end, self.clock, speed)
+        faults = self.laboratory.lines[name]
+        return Line(name, server, end, self.clock, speed, lambda: faults.cable is Cable.CUT)
 
 
 def one_of(laboratories: Sequence[ServedLaboratory], rig: str | None) -> ServedLaboratory:

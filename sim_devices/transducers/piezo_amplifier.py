@@ -79,6 +79,7 @@ class PiezoAmplifier:
         self._noise = noise_volts
         self._normals = normals(rng)
         self._input = offset_volts
+        self._saturation = self.SATURATION
         self._enabled = False
         self._tripped = False
         self._start = self._target = self._applied = 0.0
@@ -114,6 +115,12 @@ class PiezoAmplifier:
             self._tripped = self._enabled
             self._follow()
 
+    def clip(self, volts: float) -> None:
+        """Clip the output at ±`volts` from now on."""
+        with self._world.at_present():
+            self._saturation = volts
+            self._follow()
+
     def voltage_monitor(self) -> float:
         """Return the voltage in V of the voltage monitor at this instant."""
         return self.voltage / self._volts_per_volt + self._noise * next(self._normals)
@@ -140,7 +147,7 @@ class PiezoAmplifier:
 
     def _follow(self) -> None:
         output = self._gain * (self._input - self._offset) if self.on else 0.0
-        target = min(max(output, -self.SATURATION), self.SATURATION)
+        target = min(max(output, -self._saturation), self._saturation)
         if target == self._target:
             return
         self._start = self.voltage

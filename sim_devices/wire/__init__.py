@@ -4,19 +4,65 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Protocol
+
+import numpy as np
 
 
-class WireServer(ABC):
-    """The serial side of an emulated instrument.
+class Stream(Protocol):
+    """The instrument's end of a serial line, or of one connection on TCP."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the client, in pieces of any size; return what the instrument sends."""
+
+    def unsolicited(self) -> bytes:
+        """Return what the client gets without a request since the last call, up to the clock's present time."""
+
+    def next_unsolicited(self) -> float:
+        """Return the laboratory time (s) at which that next is something; infinity if never."""
+
+
+class Connection(Stream, Protocol):
+    """The instrument's end of a connection on TCP."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the instrument has not ended it."""
+
+    def close(self) -> None:
+        """End it; may be called again."""
+
+
+class Answering:
+    """What a fault of a line has to know of the answers of an instrument.
 
     Attributes
     ----------
     protocol : str
         Name of what is spoken on the line, for people.
+    has_addresses : bool
+        Whether an answer says whose it is, or which request it belongs to.
     """
 
-    protocol: ClassVar[str] = "serial"
+    protocol: str = "serial"
+    has_addresses: bool = False
+
+    def answer_begins(self, sent: bytes) -> int:  # noqa: ARG002
+        """Return where, in what is sent upon a request, the instrument's own answer begins: after an adapter's."""
+        return 0
+
+    def corrupted(self, answer: bytes, rng: np.random.Generator) -> bytes:
+        """Return an answer with a wrong bit."""
+        place, bit = int(rng.integers(len(answer))), int(rng.integers(8))
+        return answer[:place] + bytes((answer[place] ^ 1 << bit,)) + answer[place + 1 :]
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return an answer as it comes from another address, whole in all else; what is no answer stays as it is."""
+        return answer
+
+
+class WireServer(Answering, ABC):
+    """The serial side of an emulated instrument."""
 
     @abstractmethod
     def receive(self, data: bytes) -> bytes:
@@ -29,3 +75,11 @@ class WireServer(ABC):
     def next_unsolicited(self) -> float:
         """Return the laboratory time (s) at which it will next send something by itself; infinity if never."""
         return math.inf
+
+
+class TcpServer(Answering, ABC):
+    """The side of an instrument on TCP."""
+
+    @abstractmethod
+    def connect(self) -> Connection:
+        """Open a connection; raises `ConnectionRefusedError` if the instrument takes no more."""

@@ -55,6 +55,8 @@ _FRAMES = frozenset((b"t", b"T", b"r", b"R"))
 class CanopenSlcanServer(WireServer):
     """The serial side of an slcan adapter with one emulated controller on its bus."""
 
+    has_addresses = True
+
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
         self._node = SdoServer(device)
@@ -64,6 +66,15 @@ class CanopenSlcanServer(WireServer):
         self._bitrate = 0
         self._open = False
         self._listening = False
+
+    def answer_begins(self, sent: bytes) -> int:
+        """Return where the frames of the node begin: before them the adapter has obeyed."""
+        begin = sent.find(b"t")
+        return len(sent) if begin < 0 else begin
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return frames of the next node."""
+        return b"t%03X" % (int(answer[1:4], 16) + 1) + answer[4:]
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the adapter sends."""

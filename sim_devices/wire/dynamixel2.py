@@ -136,6 +136,7 @@ class Dynamixel2Server(WireServer):
     """
 
     protocol = "Dynamixel 2.0"
+    has_addresses = True
 
     def __init__(self, servos: Iterable[EmulatedMX28]) -> None:
         self._servos = tuple(servos)
@@ -147,6 +148,11 @@ class Dynamixel2Server(WireServer):
         if len({servo.bus_id for servo in self._servos}) < len(self._servos):
             raise ValueError("servos: expected an id of its own for each")
         self._received = b""
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return a status packet of the next servo."""
+        packet = answer[:4] + bytes(((answer[4] + 1) % BROADCAST,)) + answer[5:-2]
+        return packet + crc16(packet).to_bytes(2, "little")
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the servos send."""

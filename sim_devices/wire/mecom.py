@@ -63,6 +63,7 @@ class MeComServer(WireServer):
     """
 
     protocol = "MeCom"
+    has_addresses = True
 
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
@@ -81,6 +82,13 @@ class MeComServer(WireServer):
             "SP": self._order(device.save),
             "CS": self._change_speed,
         }
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return an answer of the next address; the CRC of an acknowledge, which is its request's, stays."""
+        if answer[:1] != b"!" or len(answer) <= _SHORTEST_FRAME:
+            return answer
+        body = b"!%02X" % (int(answer[1:3], 16) % 254 + 1) + answer[3:-5]
+        return body + (answer[-5:] if len(body) == 7 else b"%04X\r" % crc_hqx(body, 0))
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the device sends."""

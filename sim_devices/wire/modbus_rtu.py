@@ -76,6 +76,7 @@ class ModbusRtuServer(WireServer):
     """
 
     protocol = "Modbus RTU"
+    has_addresses = True
 
     def __init__(self, bank: RegisterBank, address: int = 1) -> None:
         if not 1 <= address <= 247:
@@ -89,6 +90,11 @@ class ModbusRtuServer(WireServer):
     def address(self) -> int:
         """Address of the instrument on its line."""
         return self._address
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return a reply of the next address."""
+        body = bytes((answer[0] % 247 + 1,)) + answer[1:-2]
+        return body + crc16(body)
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the line, in pieces of any size; return the replies to whole requests."""

@@ -11,10 +11,14 @@ V1.0b, section 3.1 (MBAP header).
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
+from sim_devices.wire import TcpServer
 from sim_devices.wire.modbus import FEEDBACK, Feedback, Packet, RegisterBank, answer, prepare, refusal
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
@@ -55,7 +59,7 @@ class OnLine(Protocol):
         """Return what the host receives of an answer."""
 
 
-class ModbusTcpInstrument:
+class ModbusTcpInstrument(TcpServer):
     """An instrument on TCP that accepts a few connections at a time.
 
     Parameters
@@ -66,6 +70,9 @@ class ModbusTcpInstrument:
         How many connections it accepts: a T7 two on port 502 (T-series datasheet, 6.0 Ethernet). That it refuses one
         more, and does not end the oldest instead, is an assumption.
     """
+
+    protocol = "Modbus TCP"
+    has_addresses = True
 
     def __init__(self, bank: RegisterBank, *, connections: int = 2) -> None:
         self.bank = bank
@@ -84,6 +91,15 @@ class ModbusTcpInstrument:
         stream = ModbusTcpStream(self.bank, self._open.remove)
         self._open.append(stream)
         return stream
+
+    def corrupted(self, answer: bytes, rng: np.random.Generator) -> bytes:
+        """Return a reply with a wrong bit in its header: TCP has a check of its own, so that no value is wrong."""
+        bit = int(rng.integers(16))
+        return (int.from_bytes(answer[:2], "big") ^ 1 << bit).to_bytes(2, "big") + answer[2:]
+
+    def readdressed(self, answer: bytes) -> bytes:
+        """Return a reply that belongs to the transaction after its own."""
+        return ((int.from_bytes(answer[:2], "big") + 1) & 0xFFFF).to_bytes(2, "big") + answer[2:]
 
     def end_connections(self) -> None:
         """End all connections, as a power cycle of the instrument does."""
@@ -110,6 +126,11 @@ class ModbusTcpStream:
         self._known: dict[bytes, _Known | None] = {}
         self._received = b""
         self._is_open = True
+
+    @property
+    def is_open(self) -> bool:
+        """Whether neither end has closed it."""
+        return self._is_open
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the client, in pieces of any size; return the replies to whole frames.
@@ -153,6 +174,14 @@ class ModbusTcpStream:
             begin = end
         self._received = received[begin:]
         return replies
+
+    def unsolicited(self) -> bytes:
+        """Return nothing: a Modbus instrument speaks when it is asked."""
+        return b""
+
+    def next_unsolicited(self) -> float:
+        """Return infinity."""
+        return math.inf
 
     def _learn(self, frame: bytes) -> None:
         """Prepare for a request that may come again."""

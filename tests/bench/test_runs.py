@@ -44,6 +44,12 @@ def make(tmp_path, rig_file):
 
 
 class TestCarryOut:
+    def test_refuses_faults_where_the_laboratory_has_none(self, make, console, tmp_path):
+        (tmp_path / "faults.toml").write_text("[[fault]]\nat = 1\nfault = 'x'\n")
+        with pytest.raises(ConfigurationError, match=r"faults\.toml: the rig has no emulated laboratory with faults"):
+            carry_out(make(faults=tmp_path / "faults.toml"), console)
+        assert not (tmp_path / "runs").exists()
+
     def test_leaves_a_folder_with_everything(self, make, console):
         run = make(overrides={"telemetry.period": "1"}, seed=7)
         result = carry_out(run, console)

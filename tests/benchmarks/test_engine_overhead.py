@@ -216,8 +216,8 @@ def test_a_request(tmp_path):
         served = stack.enter_context(serve("vo2", clock="x1"))
         attachment = attach(served.endpoints_file, "vo2")
         stack.callback(attachment.close)
-        guarded = GuardedRig(load_rig("vo2"), "vo2", {}, served.endpoints_file, 0)
-        station = RemoteStation(guarded, attachment.clock, dict)
+        guarded = GuardedRig(load_rig("vo2"), "vo2", {}, served.endpoints_file, 0, "a benchmark")
+        station = RemoteStation(guarded, attachment.clock)
         stack.callback(station.close)
         stack.callback(station.end)
         requests = {

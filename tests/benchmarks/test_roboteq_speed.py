@@ -129,7 +129,7 @@ def test_round_trips_beside_the_stock_client(terminal, capsys):
 
 @pytest.mark.benchmark
 def test_cpu_in_process_beside_the_stock_client(capsys):
-    """A glance is six requests; the stock client reads its frames in a thread of its own."""
+    """A glance is a SYNC, process data and a command; the stock client reads its frames in a thread of its own."""
     canopen = pytest.importorskip("canopen")
     clock = VirtualClock()
     device = EmulatedRoboteq("supply", World(Nothing(), clock), Nothing(), watchdog=0.0)
@@ -146,7 +146,7 @@ def test_cpu_in_process_beside_the_stock_client(capsys):
         unregister(address)
     with capsys.disabled():
         print(
-            f"\nCPU in process: a request {one:.1f} µs, a glance of six {glance:.1f} µs; "
+            f"\nCPU in process: a request {one:.1f} µs, a glance {glance:.1f} µs; "
             f"a request by canopen and python-can {stock:.1f} µs"
         )
 

@@ -20,13 +20,15 @@ over_the_wire = pytest.mark.parametrize("kind", ["driver"], indirect=True)
 
 @dataclass(kw_only=True)
 class Bench:
-    """One device under test; `connect` and `requests` are those of a driver on its wire."""
+    """One device under test; the last four are those of a driver on its wire."""
 
     clock: VirtualClock
     device: Device
     instrument: Any
     plant: Any
     connect: Callable[..., Device] | None = None
+    port: str = ""
+    server: Any = None
     requests: list = field(default_factory=list)
 
 
@@ -51,6 +53,12 @@ class RecordingServer(WireServer):
     def receive(self, data):
         self.requests.append(data)
         return self.server.receive(data)
+
+    def unsolicited(self):
+        return self.server.unsolicited()
+
+    def next_unsolicited(self):
+        return self.server.next_unsolicited()
 
 
 def serial_port(stack, server, clock):
@@ -92,6 +100,34 @@ class OnABench:
         return bench.instrument.unplug
 
 
+class OnALine(OnABench):
+    """The fixtures of the contracts of a line that is lost, over the wire; `exchange` needs `another_server`."""
+
+    @pytest.fixture
+    def cut(self, bench):
+        return lambda: unregister(bench.port)
+
+    @pytest.fixture
+    def mend(self, bench):
+        return lambda: register(bench.port.removeprefix("emulated://"), bench.server, bench.clock)
+
+    @pytest.fixture
+    def exchange(self, bench, another_server):
+        def exchange():
+            bench.server = another_server
+
+        return exchange
+
+    @pytest.fixture
+    def restart(self, bench):
+        def restart():
+            bench.instrument.power_cycle()
+            # The longest that an instrument takes to start.
+            bench.clock.sleep(0.5)
+
+        return restart
+
+
 class OnAServo(OnABench):
     """The fixtures of the contracts that an MX-28 keeps."""
 
@@ -102,6 +138,18 @@ class OnAServo(OnABench):
     @pytest.fixture
     def sent(self, bench):
         return lambda: (len(bench.requests), bench.instrument.read_item(116))
+
+
+class OnATorque:
+    """The fixtures of the contracts of an output that is the torque of a servo."""
+
+    @pytest.fixture
+    def output(self, bench):
+        return lambda: bench.instrument.read_item(64)
+
+    @pytest.fixture
+    def output_limits(self):
+        return 0, 1
 
 
 class Spoilt(OnABench):

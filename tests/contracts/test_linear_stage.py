@@ -4,10 +4,15 @@ import math
 from dataclasses import dataclass
 
 import pytest
-from emulated_bench import Bench, OnABench, OnAServo, over_the_wire, serial_port
+from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
-from bench.contracts.faults import SilentInstrumentContract
+from bench.contracts.faults import (
+    ActuatorLineLostContract,
+    RestartedActuatorContract,
+    SafeOverAFreshLineContract,
+    SilentInstrumentContract,
+)
 from bench.contracts.roles import LinearStageContract
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.dynamixel import DynamixelDrum
@@ -57,7 +62,8 @@ def connected(kind, stack):
         for address, value in ((11, 4), (108, 10), (112, 42), (98, 125)):
             servo.write_item(address, value)
         return StageBench(clock=clock, device=drum, instrument=servo, plant=plant, drum=drum)
-    port, requests = serial_port(stack, Dynamixel2Server([servo]), clock)
+    server = Dynamixel2Server([servo])
+    port, requests = serial_port(stack, server, clock)
 
     def connect(kind=DynamixelDrum.connect):
         settings = DynamixelDrum.Settings(
@@ -75,8 +81,9 @@ def connected(kind, stack):
     device = connect()
     stack.callback(device.close)
     return StageBench(
-        clock=clock, device=device, instrument=servo, plant=plant, drum=drum, connect=connect, requests=requests
-    )
+        clock=clock, device=device, instrument=servo, plant=plant, drum=drum, connect=connect, requests=requests,
+        port=port, server=server,
+    )  # fmt: skip
 
 
 class OnADrum(OnABench):
@@ -235,6 +242,36 @@ def test_drum_that_is_blocked_ends_in_an_overload(bench):
 
 
 # What only a wire can do.
+
+
+class OnADrumLine(OnATorque, OnALine, OnADrum):
+    @pytest.fixture
+    def another_server(self, bench):
+        plant = Wall()
+        return Dynamixel2Server([EmulatedMX28("another", World(plant, bench.clock), plant)])
+
+    @pytest.fixture
+    def truth(self, bench):
+        return lambda: {"stage_position": bench.where()}
+
+    @pytest.fixture
+    def tolerance(self):
+        return 0.51 * RESOLUTION
+
+
+@over_the_wire
+class TestRestart(OnADrumLine, RestartedActuatorContract):
+    pass
+
+
+@over_the_wire
+class TestLineLost(OnADrumLine, ActuatorLineLostContract):
+    pass
+
+
+@over_the_wire
+class TestSafeOverAFreshLine(OnADrumLine, SafeOverAFreshLineContract):
+    pass
 
 
 @over_the_wire

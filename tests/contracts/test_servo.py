@@ -5,12 +5,18 @@ import math
 import sys
 
 import pytest
-from emulated_bench import Bench, OnABench, OnAServo, Spoilt, over_the_wire, serial_port
+from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, Spoilt, over_the_wire, serial_port
 
 from bench.clock import VirtualClock, WallClock
-from bench.contracts.faults import SilentInstrumentContract, SpoiltAnswerContract
+from bench.contracts.faults import (
+    ActuatorLineLostContract,
+    RestartedActuatorContract,
+    SafeOverAFreshLineContract,
+    SilentInstrumentContract,
+    SpoiltAnswerContract,
+)
 from bench.contracts.roles import ServoContract
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.dynamixel import DynamixelMX28
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_table import (
@@ -67,7 +73,8 @@ def connected(kind, stack, loaded=False):
         for address, value in ((11, 4), (108, 10), (112, 42), (98, 125)):
             instrument.write_item(address, value)
         return ServoBench(clock=clock, device=instrument, instrument=instrument, plant=plant)
-    port, requests = serial_port(stack, Dynamixel2Server([instrument]), clock)
+    server = Dynamixel2Server([instrument])
+    port, requests = serial_port(stack, server, clock)
 
     def connect(kind=DynamixelMX28.connect, **changes):
         keys = {
@@ -82,8 +89,9 @@ def connected(kind, stack, loaded=False):
     device = connect()
     stack.callback(device.close)
     return ServoBench(
-        clock=clock, device=device, instrument=instrument, plant=plant, connect=connect, requests=requests
-    )
+        clock=clock, device=device, instrument=instrument, plant=plant, connect=connect, requests=requests,
+        port=port, server=server,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -303,6 +311,72 @@ def test_torque_that_goes_off_lets_the_weight_fall(loaded):
 
 
 # What only a wire can do.
+
+
+class OnAServoLine(OnATorque, OnALine, OnAShaft):
+    @pytest.fixture
+    def another_server(self, bench):
+        return Dynamixel2Server([EmulatedMX28("another", World(Pendulum(), bench.clock))])
+
+    @pytest.fixture
+    def truth(self, bench):
+        return lambda: {"servo_position": bench.where()}
+
+    @pytest.fixture
+    def tolerance(self):
+        return 0.51 * COUNT
+
+
+@over_the_wire
+class TestRestart(OnAServoLine, RestartedActuatorContract):
+    pass
+
+
+@over_the_wire
+class TestLineLost(OnAServoLine, ActuatorLineLostContract):
+    pass
+
+
+@over_the_wire
+class TestSafeOverAFreshLine(OnAServoLine, SafeOverAFreshLineContract):
+    pass
+
+
+@over_the_wire
+def test_position_one_turn_off_is_never_reported(bench):
+    bench.device.set(math.pi + 2 * TURN).wait()
+    bench.instrument.power_cycle()
+    bench.clock.sleep(0.5)
+    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(8.0)):
+        with pytest.raises(DeviceRestartedError, match=r"servo: the servo has restarted: .*zero_counts"):
+            call()
+    assert bench.where() == pytest.approx(math.pi + 2 * TURN, abs=COUNT)
+
+
+@over_the_wire
+def test_motion_during_which_it_restarts_does_not_arrive_one_turn_off(bench):
+    status = bench.device.set(1.0)
+    bench.clock.sleep(1.0)
+    bench.device.set(1.0 + 2 * TURN)
+    bench.clock.sleep(8.0)
+    bench.instrument.power_cycle()
+    bench.clock.sleep(0.5)
+    with pytest.raises(DeviceRestartedError):
+        bench.device.glance()
+    with pytest.raises(DeviceError):
+        status.wait()
+
+
+@over_the_wire
+@pytest.mark.parametrize(
+    ("address", "value", "text"),
+    [(116, 100, "goal was changed to .* by another host"), (64, 0, "torque was switched")],
+)
+def test_what_another_host_changed_is_an_error_of_the_next_reading(bench, address, value, text):
+    bench.device.set(5.0).wait()
+    bench.instrument.write_item(address, value)
+    with pytest.raises(DeviceError, match=f"servo: its {text}"):
+        bench.device.glance()
 
 
 @over_the_wire

@@ -7,12 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from emulated_bench import Bench, OnABench, serial_port, tcp_port
+from emulated_bench import Bench, OnABench, OnALine, serial_port, tcp_port
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.clock import VirtualClock
-from bench.contracts.faults import SilentInstrumentContract
+from bench.contracts.faults import (
+    ActuatorLineLostContract,
+    RestartedActuatorContract,
+    SafeOverAFreshLineContract,
+    SilentInstrumentContract,
+    WatchdogContract,
+)
 from bench.contracts.roles import VoltageSupplyContract
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.labjack_t7 import T7HighVoltageSupply
@@ -58,10 +64,16 @@ class LosingServer(WireServer):
         self.lose_next = b""
 
     def receive(self, data):
-        if self.lose_next and data.startswith(self.lose_next):
+        if self.lose_next and self.lose_next in data:
             self.lose_next = b""
             return b"z\r"
         return self.server.receive(data)
+
+    def unsolicited(self):
+        return self.server.unsolicited()
+
+    def next_unsolicited(self):
+        return self.server.next_unsolicited()
 
 
 class RecordingT7(EmulatedT7):
@@ -93,7 +105,6 @@ class SupplyBench(Bench):
     """A supply, and the resistor that it heats."""
 
     facts: Facts
-    server: LosingServer | None = None
     amplifier: PiezoAmplifier | None = None
 
     def tick(self, seconds, step=0.5):
@@ -133,8 +144,8 @@ def output(kind):
 
 
 @pytest.fixture
-def bench(kind, output, stack):
-    return high_voltage(stack) if kind in LINEAR else switching("driver" in kind, output, stack)
+def bench(kind, stack):
+    return high_voltage(stack) if kind in LINEAR else switching("driver" in kind, kind.split()[-1], stack)
 
 
 def switching(driver, output, stack):
@@ -163,7 +174,7 @@ def switching(driver, output, stack):
     stack.callback(device.close)
     return SupplyBench(
         clock=clock, device=device, instrument=instrument, plant=load, facts=facts,
-        connect=connect, requests=requests, server=server,
+        connect=connect, requests=requests, port=port, server=server,
     )  # fmt: skip
 
 
@@ -470,6 +481,72 @@ def test_device_that_comes_back_resumes_nothing(bench):
 # What only a wire can do.
 
 
+class OnASupplyLine(OnALine):
+    @pytest.fixture
+    def set_points(self):
+        return 6.0, 5.0
+
+    @pytest.fixture
+    def output(self, bench):
+        def output():
+            bench.instrument.world.advance()
+            return bench.plant.voltage
+
+        return output
+
+    @pytest.fixture
+    def another_server(self, bench):
+        load = Resistor()
+        world = load.world = World(load, bench.clock)
+        return CanopenSlcanServer(EmulatedRoboteq("another", world, load))
+
+    @pytest.fixture
+    def truth(self, output):
+        return lambda: {"supply_voltage": output()}
+
+    @pytest.fixture
+    def tolerance(self, bench):
+        return bench.facts.measured_within
+
+
+@over_the_wire
+class TestRestart(OnASupplyLine, RestartedActuatorContract):
+    pass
+
+
+@over_the_wire
+class TestLineLost(OnASupplyLine, ActuatorLineLostContract):
+    pass
+
+
+@over_the_wire
+class TestSafeOverAFreshLine(OnASupplyLine, SafeOverAFreshLineContract):
+    pass
+
+
+@over_the_wire
+class TestWatchdog(OnASupplyLine, WatchdogContract):
+    pass
+
+
+@over_the_wire
+def test_command_of_another_host_is_an_error_of_the_next_reading(bench):
+    for volts in (6.0, 0.0):
+        bench.device.set(volts).wait()
+        bench.device.glance()
+        bench.instrument.write_object(0x2000, 300, 1)
+        with pytest.raises(DeviceError, match=r"supply: its command was changed to 300 by another host"):
+            bench.device.glance()
+        bench.device.safe()
+
+
+@over_the_wire
+def test_rescue_of_a_voltage_that_a_dead_host_left(bench):
+    bench.device.set(6.0).wait()
+    RoboteqSupply.rescue("supply", bench.device._settings, bench.clock)
+    assert bench.plant.voltage == 0.0
+
+
 @over_the_wire
 @pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
 def test_spoilt_answer_is_asked_for_again(bench, output, fault):
@@ -621,17 +698,6 @@ def test_heartbeat_that_stays_away_is_told(bench):
     bench.device.safe()
     assert bench.plant.voltage == 0.0
     assert bench.instrument.read_object(0x2112) == 0
-
-
-@over_the_wire
-def test_restart_of_the_device_is_told_once(bench):
-    bench.device.set(6.0)
-    bench.instrument.power_cycle()
-    with pytest.raises(DeviceError, match="supply: the device has restarted"):
-        bench.device.measure()
-    assert bench.device.setpoint == 0.0
-    assert bench.device.measure()["supply_voltage"] == 0.0
-    bench.device.set(5.0).wait()
 
 
 @over_the_wire

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
 from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
 from drivers.roboteq.canopen import NodeLine
 from drivers.roboteq.supply import _POWER, _VOLTS
@@ -28,6 +28,8 @@ def line(identifier, data):
 
 class Script(WireServer):
     """An adapter and a node of a few lines: objects, what was received, and answers put into its mouth.
+
+    It refuses to configure process data.
 
     `objects` holds (value, size) by index and subindex; `instead`, request by request, lines to send in place
     of the right one (None for the right one); `aborts` abort codes by index and subindex.
@@ -94,6 +96,8 @@ class Script(WireServer):
             value, size = self.objects[key]
             raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
             return bytes((0x43 | (4 - size) << 2,)) + data[1:4] + raw.ljust(4, b"\0")
+        if 0x1400 <= key[0] < 0x1C00:
+            return b"\x80" + data[1:4] + (0x06010000).to_bytes(4, "little")
         if key[0] == 0x2000 and (0x2102, key[1]) not in self.objects:
             return b"\x80" + data[1:4] + (0x06090011).to_bytes(4, "little")
         if key[0] == 0x2000 and self.follow:
@@ -103,11 +107,11 @@ class Script(WireServer):
         return b"\x60" + data[1:4] + bytes(4)
 
     def orders(self):
-        """Return all that was written: index, subindex and value."""
+        """Return all that was written but the process data's configuration: index, subindex and value."""
         return [
             (int.from_bytes(data[1:3], "little"), data[3], int.from_bytes(data[4:], "little", signed=True))
             for _, data in self.received
-            if data[0] >> 5 == 1
+            if data[0] >> 5 == 1 and not 0x1400 <= int.from_bytes(data[1:3], "little") < 0x1C00
         ]
 
 
@@ -163,6 +167,8 @@ def test_bytes_of_a_set_point_and_a_measurement(script, supply):
     script.received.clear()
     assert supply.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
     assert [data.hex(" ").upper() for _, data in script.received] == [
+        # A value that is new has to come twice.
+        "40 02 21 01 00 00 00 00",
         "40 02 21 01 00 00 00 00",
         "40 0D 21 02 00 00 00 00",
         "40 00 21 01 00 00 00 00",
@@ -383,7 +389,7 @@ def test_command_that_would_arrive_too_late_is_not_sent_again(script, supply, cl
     supply.set(6.0)
     clock.sleep(0.9)
     script.received.clear()
-    script.instead = [None] * 5 + [b"z\r"]
+    script.instead = [None] * 6 + [b"z\r"]
     with pytest.raises(DeviceError, match="output was dropped"):
         supply.measure()
     assert script.orders() == [(0x2000, 1, 250), (0x2000, 1, 0)]
@@ -562,7 +568,7 @@ def test_answers_to_a_request_that_was_sent_again_are_waited_for(script, supply,
     assert supply._read(_POWER, 1) == 0
     before = clock.now()
     assert supply._read(_POWER, 1) == 0
-    assert clock.now() - before == pytest.approx(0.1, abs=0.01)
+    assert clock.now() - before == pytest.approx(0.3, abs=0.01)
     before = clock.now()
     assert supply._read(_POWER, 1) == 0
     assert clock.now() - before < 0.01
@@ -574,8 +580,7 @@ def test_answers_to_a_request_that_was_sent_again_are_waited_for(script, supply,
 def test_acknowledgements_and_line_ends_of_all_adapters(script, supply, ends):
     acknowledgement, end = ends
     script.instead = [lambda right: acknowledgement + right[:-1] + end] * 5
-    script.objects[0x2102, 1] = (500, 2)
-    assert supply.measure() == {"supply_voltage": 12.0, "supply_current": 1.2}
+    assert supply.measure() == {"supply_voltage": 0.0, "supply_current": 1.2}
     assert len(script.received) == 5
 
 
@@ -586,10 +591,10 @@ def test_answer_that_came_too_late_for_an_earlier_reading_is_not_taken_for_the_n
 
 def test_simplified_answers_of_the_manual_are_understood(script, supply):
     simplified = line(0x581, bytes.fromhex("480D210290010000"))
-    script.instead = [None, simplified]
+    script.instead = [None, None, simplified, simplified]
     script.objects[0x2102, 1] = (1000, 2)
     assert supply.measure()["supply_voltage"] == 40.0
-    script.instead = [line(0x581, bytes.fromhex("40022101F4010000"))]
+    script.instead = [line(0x581, bytes.fromhex("40022101F4010000"))] * 2
     assert supply.measure()["supply_voltage"] == 12.0
 
 
@@ -606,7 +611,7 @@ def test_answers_that_are_no_number(script, supply, answer):
 
 
 def test_write_that_is_answered_like_a_query(script, supply):
-    script.instead = [None, None, None, line(0x581, bytes.fromhex("4300200100000000"))]
+    script.instead = [None] * 5 + [line(0x581, bytes.fromhex("4300200100000000"))]
     with pytest.raises(DeviceError, match=r"answered 43 00 20 01 .* for its motor command"):
         supply.set(6.0)
 
@@ -718,14 +723,26 @@ def test_start_before_connecting_is_no_restart(script, connect):
     connect().measure()
 
 
-def test_restart_is_told_once_and_zero_is_sent(script, supply):
+def test_after_a_restart_nothing_is_sent_but_the_safe_state(script, supply):
     supply.set(6.0)
     script.received.clear()
     script.before = line(0x701, b"\x00")
-    with pytest.raises(DeviceError, match="has restarted and its output dropped"):
-        supply.measure()
-    assert script.orders() == [(0x2000, 1, 0)]
-    supply.measure()
+    for call in (supply.measure, supply.glance, lambda: supply.set(3.0)):
+        with pytest.raises(DeviceRestartedError, match="has restarted and its output dropped"):
+            call()
+    assert script.orders() == []
+    supply.safe()
+    assert script.orders() == [(0x2000, 1, 0), (0x200E, 0, 1)]
+    with pytest.raises(DeviceRestartedError):
+        supply.set(3.0)
+
+
+def test_damaged_digit_is_no_reading(script, supply):
+    for number in range(5):
+        spoilt = [None] * 5
+        spoilt[number] = lambda right: right[:14] + b"1" + right[15:]
+        script.instead = spoilt
+        assert supply.measure() == {"supply_voltage": 0.0, "supply_current": 1.2}
 
 
 @pytest.mark.parametrize("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
 from bench.attachment import attach
@@ -21,17 +21,15 @@ IN_TIME = 10.0
 
 
 @contextmanager
-def connected(
-    rig: EmulatedRig, rescue: Callable[[], Mapping[str, str]] = dict, file: str | None = None, **overrides: str
-) -> Iterator[RemoteStation]:
+def connected(rig: EmulatedRig, file: str | None = None, **overrides: str) -> Iterator[RemoteStation]:
     """Open a served rig by a guardian, which is gone after the block."""
     values = {key.replace("__", "."): value for key, value in overrides.items()}
     name = file or rig.name
     with ExitStack() as stack:
         attachment = attach(rig.endpoints_file, rig.name)
         stack.callback(attachment.close)
-        guarded = GuardedRig(load_rig(name, values), name, values, rig.endpoints_file, 0)
-        station = RemoteStation(guarded, attachment.clock, rescue)
+        guarded = GuardedRig(load_rig(name, values), name, values, rig.endpoints_file, 0, "a test")
+        station = RemoteStation(guarded, attachment.clock)
         stack.callback(_leave, station)
         yield station
 

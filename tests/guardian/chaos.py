@@ -138,8 +138,8 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
 
     remote.start_guardian = lambda log: _start(*METHODS[title], note, log)
     attachment = attach(endpoints, "vo2")
-    guarded = remote.GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0)
-    station = remote.RemoteStation(guarded, attachment.clock, lambda: {"tec": "lost", "psd": "lost"})
+    guarded = remote.GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
+    station = remote.RemoteStation(guarded, attachment.clock)
     station._answer_within = 2.0
     found: dict = {"method": title, "error": None}
     try:

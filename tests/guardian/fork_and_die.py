@@ -11,8 +11,8 @@ from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.rig_file import load_rig
 
 endpoints = Path(sys.argv[1])
-guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0)
-station = RemoteStation(guarded, attach(endpoints, "vo2").clock, dict)
+guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
+station = RemoteStation(guarded, attach(endpoints, "vo2").clock)
 station.promise(600.0, "a child lives on")
 station.apply({"tec": 40.0})
 child = os.fork()

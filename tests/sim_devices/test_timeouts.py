@@ -6,7 +6,7 @@ import bench
 from bench.clock import Stopwatch
 from bench.errors import DeviceError
 from sim_devices import protocol_emulated
-from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
+from sim_devices.wire import TcpServer
 
 INSTRUMENTS = [("vo2", "tec"), ("vo2", "psd"), ("sma", "supply"), ("sma", "load_cell"), ("sma", "stage")]
 
@@ -18,7 +18,7 @@ class Line:
         self.silent = False
         self.stopped = 0.0
         self.requests = 0
-        if isinstance(server, ModbusTcpInstrument):
+        if isinstance(server, TcpServer):
             connect = server.connect
             server.connect = lambda: self._tap(connect())
         else:

@@ -25,10 +25,10 @@ class RodLaboratory(EmulatedLaboratory):
         # One stream an instrument: how often one is read must not change the readings of the other.
         coil_stream, bridge_stream = np.random.default_rng(seed).spawn(2)
         self.rod = MagnetostrictiveRod(RodParameters())
-        self.world = World(self.rod, clock)
-        self.coil = EmulatedCoilSource(self.world, self.rod, coil_stream)
-        self.bridge = EmulatedStrainBridge(self.world, self.rod, settings.noise, bridge_stream)
-        super().__init__("rod laboratory", {"coil": self.coil, "bridge": self.bridge}, clock)
+        world = World(self.rod, clock)
+        self.coil = EmulatedCoilSource(world, self.rod, coil_stream)
+        self.bridge = EmulatedStrainBridge(world, self.rod, settings.noise, bridge_stream)
+        super().__init__("rod laboratory", {"coil": self.coil, "bridge": self.bridge}, clock, world=world, seed=seed)
 
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of the rod and of the coil source, for `bench emulate`."""

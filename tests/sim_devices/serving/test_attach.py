@@ -56,6 +56,33 @@ def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_schedule_of_faults_happens_in_the_server_and_stands_in_its_log(bench, emulate, tmp_path):
+    faults, log = tmp_path / "faults.jsonl", tmp_path / "state.jsonl"
+    faults.write_text(
+        '{"at": 6.0, "fault": "displaced-spot", "values": {"metres": 5e-6}, "duration": 4.0}\n'
+        '{"at": 8.0, "fault": "tec-over-current"}\n'
+    )
+    with emulate("vo2", "--clock", "x5", "--state", log) as (_, endpoints):
+        code, _, err = bench(
+            "run", "creep", "--rig", "vo2", "--attach", tmp_path / "endpoints.json", *CREEP, *PATIENT,
+            "--faults", faults, "--out", tmp_path / "runs",
+        )  # fmt: skip
+        assert code not in (0, 7)
+        assert "tec: " in err
+        with ControlClient(endpoints["control"]) as control:
+            control.wait(control.time() + 6.0)
+            events = control.events()
+            assert control.state()["tec_output"] == 0.0
+    assert [(each["fault"], each["what"]) for each in events] == [
+        ("displaced-spot", "begins"), ("tec-over-current", "begins"), ("displaced-spot", "ends"),
+    ]  # fmt: skip
+    assert events[1]["time"] - events[0]["time"] == pytest.approx(2.0)
+    assert events[2]["time"] - events[0]["time"] == pytest.approx(4.0)
+    logged = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [{key: each[key] for key in events[0]} for each in logged if "fault" in each] == events
+
+
+@pytest.mark.slow
 def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
     with emulate("vo2", "--clock", "x10") as (server, endpoints):
         command = [sys.executable, "-P", "-m", "bench", "run", "creep", "--rig", "vo2", "--set", "duration=3000",

@@ -124,6 +124,67 @@ def test_a_hanging_instrument_answers_late(vo2, opened):
     assert line.read_until(b"\r").startswith(IDENTITY)
 
 
+def test_an_answer_is_delayed_doubled_and_readdressed_on_a_served_line(vo2, tec, opened):
+    assert answered(tec)
+    right = tec()
+    line = opened(vo2.port("tec"), timeout=60.0)
+    vo2.control.fault("tec.delay", seconds=1.5)
+    begun = vo2.control.time()
+    line.write(IDENTIFY)
+    assert line.read_until(b"\r") == right
+    assert vo2.control.time() >= begun + 1.5
+    vo2.control.fault("tec.double")
+    line.write(IDENTIFY)
+    assert line.read(2 * len(right)) == 2 * right
+    vo2.control.fault("tec.readdress")
+    line.write(IDENTIFY)
+    assert line.read_until(b"\r")[1:3] == b"02"
+    last = vo2.control.events()[-6:]
+    assert [(each["fault"], each["what"]) for each in last] == [
+        (f"tec.{kind}", what) for kind in ("delay", "double", "readdress") for what in ("begins", "ends")
+    ]
+
+
+def test_a_late_reply_on_tcp_comes_by_itself(vo2, connect):
+    connection = connect(vo2.port("psd"))
+    vo2.control.fault("psd.delay", seconds=1.0)
+    connection.sendall(bytes.fromhex("000100000006 01 03 ea60 0002"))
+    assert connection.recv(100)[:2] == b"\x00\x01"
+    ended = [each for each in vo2.control.events() if each["fault"] == "psd.delay"][-1]
+    assert ended["values"] == {"disturbed": 1.0}
+
+
+def test_a_fault_ends_after_its_duration_or_when_it_is_ended(vo2, tec):
+    assert answered(tec)
+    vo2.control.fault("tec.unplug", duration=0.5)
+    assert answered(tec)
+    vo2.control.fault("tec.unplug")
+    assert tec() == b""
+    vo2.control.end_fault("tec.unplug")
+    assert answered(tec)
+    with pytest.raises(ConfigurationError, match="takes no duration"):
+        vo2.control.fault("tec-over-current", duration=1.0)
+    with pytest.raises(ConfigurationError, match="allowed are 0 to 3600 s"):
+        vo2.control.fault("tec.delay", seconds=-1.0)
+
+
+def test_a_cut_line_on_raw_tcp_is_reset_and_taken_again_when_it_is_back(emulate, opened, connect):
+    with emulate("vo2", "--tcp") as (_, endpoints), ControlClient(endpoints["control"]) as control:
+        address = endpoints["instruments"]["tec"]["port"]
+        connection = connect(address)
+        control.cut("tec")
+        connection.sendall(IDENTIFY)
+        with suppress(ConnectionError):
+            while connection.recv(100):
+                pass
+        with suppress(ConnectionError):
+            assert connect(address).recv(1) == b""
+        control.plug_in("tec")
+        line = opened(address)
+        line.write(IDENTIFY)
+        assert line.read_until(b"\r").startswith(IDENTITY)
+
+
 def test_a_restarted_supply_says_so(sma, opened):
     line = opened(sma.port("supply"))
     line.write(b"\rC\rS4\rO\r")
@@ -181,7 +242,9 @@ def test_help_names_everything(vo2):
     assert set(found["requests"]) == set(REQUESTS)
     assert all(each["does"] for each in found["requests"].values())
     assert found["rigs"]["vo2"]["instruments"] == ["psd", "tec"]
-    assert found["rigs"]["vo2"]["faults"]["displaced-spot"]["values"] == {"metres": 20e-6}
+    metres = found["rigs"]["vo2"]["faults"]["displaced-spot"]["values"]["metres"]
+    assert (metres["default"], metres["unit"]) == (20e-6, "m")
+    assert metres["low"] < 0.0 < metres["high"]
 
 
 def test_control_clients_do_not_disturb_each_other(vo2):

@@ -1,0 +1,229 @@
+"""Locks of lines and instruments: one bench each, whatever name it uses; freed by the death of the holder."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from bench.devices import Identity
+from bench.errors import ConfigurationError
+from bench.locks import Holder, Locks, line_names
+
+HOLDER = """
+import subprocess, sys
+from bench.locks import Holder, Locks
+locks = Locks(Holder.of_this_process("other", "recordings/other-creep"))
+locks.take_lines(sys.argv[1:])
+child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=sys.stdin, close_fds=False)
+print(child.pid, flush=True)
+child.wait()
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A folder for locks of this test's own."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    return tmp_path / "actuator-bench-locks"
+
+
+@pytest.fixture
+def locks():
+    """Make locks of a rig; all are freed at the end."""
+    made = []
+
+    def make(rig):
+        made.append(Locks(Holder.of_this_process(rig, "bench test")))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def holding():
+    """Hold lines in another process, which has started a program; give both."""
+    processes = []
+
+    def hold(*ports):
+        command = [sys.executable, "-P", "-c", HOLDER, *map(str, ports)]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process, int(process.stdout.readline())
+
+    yield hold
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def port(path):
+    path.touch()
+    return str(path)
+
+
+class TestNames:
+    def test_a_link_is_the_node_behind_it(self, tmp_path):
+        node = port(tmp_path / "ttyUSB0")
+        (tmp_path / "by-id").symlink_to(node)
+        (tmp_path / "further").symlink_to(tmp_path / "by-id")
+        assert line_names(node) == line_names(str(tmp_path / "further")) != line_names(port(tmp_path / "ttyUSB1"))
+
+    def test_a_relative_path_is_the_absolute_one(self, tmp_path, monkeypatch):
+        node = port(tmp_path / "ttyUSB0")
+        monkeypatch.chdir(tmp_path)
+        assert line_names("./ttyUSB0") == line_names("ttyUSB0") == line_names(node)
+
+    @pytest.mark.parametrize(
+        "other",
+        [
+            "socket://127.0.0.1:502",
+            "tcp://localhost:502",
+            "tcp://LOCALHOST:502/",
+            "tcp://[::1]:502",
+            "tcp://localhost",
+            "tcp://[::ffff:127.0.0.1]:502",
+            "rfc2217://localhost:502?ign_set_control",
+            "visa://TCPIP0::127.0.0.1::502::SOCKET",
+        ],
+    )
+    def test_a_host_name_is_its_address(self, other):
+        assert set(line_names("tcp://127.0.0.1:502")) & set(line_names(other))
+
+    def test_names_and_addresses_of_this_computer_are_one(self):
+        try:
+            socket.getaddrinfo(socket.gethostname(), 502)
+        except OSError:
+            pytest.skip("the name of this computer has no address")
+        assert set(line_names(f"tcp://{socket.gethostname()}:502")) & set(line_names("tcp://127.0.0.1:502"))
+
+    @pytest.mark.parametrize("other", ["tcp://127.0.0.1:503", "tcp://192.0.2.7:502", "/dev/ttyUSB0", "COM3"])
+    def test_other_lines_have_other_names(self, other):
+        assert not set(line_names("tcp://127.0.0.1:502")) & set(line_names(other))
+
+    def test_visa_names_a_serial_port(self, tmp_path):
+        node = port(tmp_path / "ttyUSB0")
+        assert line_names(f"ASRL{node}::INSTR") == line_names(node)
+        assert line_names("visa://ASRL3::INSTR") == line_names("com3") == line_names("COM3")
+        assert line_names("GPIB0::24::INSTR") == line_names("visa://gpib0::24::instr")
+
+    def test_an_instrument_in_this_process_has_no_line(self):
+        assert line_names("emulated://tec") == line_names("") == ()
+
+
+class TestOneHolder:
+    def test_another_bench_is_refused_until_the_lock_is_freed(self, locks, tmp_path):
+        one, other = locks("one"), locks("other")
+        node = port(tmp_path / "ttyUSB0")
+        one.take_lines([node])
+        one.take_lines([node])
+        with pytest.raises(ConfigurationError, match=r"^rig other is in use: line .*ttyUSB0 is held by .*rig one"):
+            other.take_lines([node])
+        one.close()
+        other.take_lines([node])
+
+    def test_all_lines_or_none(self, locks, tmp_path):
+        nodes = [port(tmp_path / name) for name in "abc"]
+        locks("one").take_lines([nodes[2]])
+        with pytest.raises(ConfigurationError, match="in use"):
+            locks("other").take_lines(nodes)
+        locks("third").take_lines(nodes[:2])
+
+    def test_devices_on_one_line_take_it_once(self, locks):
+        locks("one").take_lines(["tcp://127.0.0.1:502", "tcp://localhost:502", "emulated://x"])
+
+    def test_an_instrument_on_another_line_is_found(self, locks):
+        tec = Identity("Meerstetter Engineering", "TEC-1091", "12", "4.10")
+        locks("one").take_instrument(tec)
+        with pytest.raises(ConfigurationError, match="in use: Meerstetter Engineering TEC-1091, serial number 12 is"):
+            locks("other").take_instrument(tec)
+        locks("other").take_instrument(Identity("Meerstetter Engineering", "TEC-1091", "13", "4.10"))
+
+    @pytest.mark.parametrize("number", ["unknown", "", "id 1", "0"])
+    def test_what_has_no_serial_number_is_not_mistaken(self, locks, number):
+        for rig in ("one", "other"):
+            locks(rig).take_instrument(Identity("Roboteq", "SDC2160", number, "2.0"))
+
+    def test_nothing_is_left_behind(self, locks, tmp_path, folder):
+        one = locks("one")
+        one.take_lines([port(tmp_path / "a"), "tcp://127.0.0.1:502"])
+        assert len(list(folder.iterdir())) == 2
+        one.close()
+        assert list(folder.iterdir()) == []
+
+
+class TestProcesses:
+    def test_the_refused_one_learns_who_it_is(self, holding, locks, tmp_path):
+        node = port(tmp_path / "ttyUSB0")
+        process, _ = holding(node)
+        with pytest.raises(ConfigurationError) as caught:
+            locks("mine").take_lines([node])
+        for word in (f"process {process.pid}", "recordings/other-creep", "rig other", " on ", "since 20", "end it"):
+            assert word in str(caught.value)
+
+    def test_a_killed_holder_holds_nothing_although_its_program_lives_on(self, holding, locks, tmp_path):
+        node = port(tmp_path / "ttyUSB0")
+        process, child = holding(node)
+        process.kill()
+        process.wait()
+        os.kill(child, 0)
+        locks("mine").take_lines([node])
+        os.kill(child, signal.SIGKILL)
+
+    def test_a_stopped_holder_still_holds(self, holding, locks, tmp_path):
+        node = port(tmp_path / "ttyUSB0")
+        process, _ = holding(node)
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(ConfigurationError, match="in use"):
+            locks("mine").take_lines([node])
+
+    def test_what_a_dead_holder_wrote_is_replaced(self, holding, locks, tmp_path, folder):
+        node = port(tmp_path / "ttyUSB0")
+        process, _ = holding(node)
+        process.kill()
+        process.wait()
+        locks("mine").take_lines([node])
+        (file,) = folder.iterdir()
+        assert json.loads(file.read_text())["rig"] == "mine"
+
+    def test_one_of_many_that_ask_at_once_has_all_lines(self, tmp_path):
+        ports = [port(tmp_path / name) for name in "abcde"]
+        code = HOLDER.replace("child = ", "input(); sys.exit(print('has'))\nchild = ")
+        # Each in an order of its own.
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-P", "-c", code, *ports[i:], *ports[:i]],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )
+            for i in range(5)
+        ]  # fmt: skip
+        refused = 0
+        holders = list(processes)
+        while len(holders) > 1:
+            for process in list(holders):
+                try:
+                    process.wait(0.2)
+                except subprocess.TimeoutExpired:
+                    continue
+                assert "in use" in process.stderr.read()
+                refused += 1
+                holders.remove(process)
+        out, _ = holders[0].communicate("\n", timeout=60)
+        assert (refused, out) == (4, "has\n")
+        for process in processes:
+            process.stdin.close()
+            process.stdout.close()
+            process.stderr.close()
+
+
+def test_the_folder_is_for_all_users(locks, tmp_path, folder):
+    locks("one").take_lines([port(tmp_path / "a")])
+    assert folder.stat().st_mode & 0o7777 == 0o1777
+    (file,) = folder.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o666

@@ -1,0 +1,374 @@
+"""`bench safe`, `bench recover` and `bench doctor` on served rigs; what is safe is read from the instruments."""
+
+import json
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from bench.clock import Stopwatch
+from bench.upkeep.rescue import rescue_by_another_process
+from sim_devices.serving.process import serve
+
+CLIENT = """
+import sys
+from pathlib import Path
+from bench.upkeep.opening import opened
+rig, file, *settings = sys.argv[1:]
+with opened(rig, {"devices.tec.watchdog": "300"} if rig in ("vo2", "hybrid") else {}, Path(file), "a run") as place:
+    devices = {}
+    for entry in place.entries:
+        devices[entry.name] = entry.driver.connect(entry.name, entry.settings, place.clock)
+    for setting in settings:
+        name, value = setting.split("=")
+        devices[name].set(float(value))
+    print("on", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def client(rig, *settings, file=None):
+    """Switch devices on from another process, which holds them until it is killed."""
+    command = [sys.executable, "-P", "-c", CLIENT, rig.name, str(file or rig.endpoints_file), *settings]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "on\n", process.stderr.read()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def served():
+    """Serve a rig for all tests of the module, each once."""
+    with ExitStack() as stack:
+        rigs = {}
+
+        def get(name):
+            if name not in rigs:
+                rigs[name] = stack.enter_context(serve(name, clock="x1"))
+            return rigs[name]
+
+        yield get
+
+
+def attached(rig):
+    return rig.name, "--attach", rig.endpoints_file
+
+
+def renamed(rig, tmp_path):
+    """Write an endpoints file with other names of the same lines: a link, and a host name."""
+    content = json.loads(rig.endpoints_file.read_text())
+    for name, endpoint in content["instruments"].items():
+        if endpoint["port"].startswith("/"):
+            (tmp_path / name).symlink_to(endpoint["port"])
+            endpoint["port"] = str(tmp_path / name)
+        else:
+            endpoint["port"] = endpoint["port"].replace("127.0.0.1", "localhost")
+    file = tmp_path / "renamed.json"
+    file.write_text(json.dumps(content))
+    return file
+
+
+class TestSafe:
+    @pytest.mark.slow
+    @pytest.mark.parametrize(
+        ("name", "settings", "outputs"),
+        [
+            ("vo2", ["tec=30"], ["tec_output"]),
+            ("hybrid", ["tec=0.1", "piezo=20"], ["tec_output", "amplifier_enable", "amplifier_command"]),
+            ("sma", ["stage=0.005", "fan=1"], ["stage_torque", "fan", "supply_voltage"]),
+        ],
+    )
+    def test_what_a_killed_process_left_on_is_switched_off(self, bench, served, name, settings, outputs):
+        rig = served(name)
+        with client(rig, *settings):
+            before = rig.control.state()
+        assert sum(bool(before[output]) for output in outputs) >= len(settings)
+        code, out, err = bench("safe", *attached(rig))
+        assert (code, err) == (0, "")
+        assert "NOT" not in out
+        after = rig.control.state()
+        assert {output: after[output] for output in outputs} == dict.fromkeys(outputs, 0.0)
+
+    @pytest.mark.slow
+    def test_beside_an_instrument_in_error(self, bench, served):
+        rig = served("hybrid")
+        with client(rig, "tec=0.1", "piezo=20"):
+            rig.control.fault("tec-over-current")
+        assert rig.control.state()["amplifier_enable"] == 1.0
+        code, _, err = bench("safe", *attached(rig))
+        assert (code, err) == (0, "")
+        state = rig.control.state()
+        assert (state["amplifier_enable"], state["tec_output"]) == (0.0, 0.0)
+        # It stays in its error until that is cleared.
+        assert bench("recover", *attached(rig), "--yes")[0] == 0
+
+    @pytest.mark.slow
+    def test_a_line_that_is_dead_delays_no_other_and_is_named(self, bench, served, tmp_path):
+        rig = served("hybrid")
+        file = tmp_path / "safe.json"
+        with client(rig, "tec=0.1", "piezo=20"):
+            rig.control.unplug("t7")
+        try:
+            watch = Stopwatch()
+            code, out, _ = bench("safe", *attached(rig), "--json", file)
+            took = watch.seconds()
+        finally:
+            rig.control.plug_in("t7")
+        assert code == 7
+        assert "unplug what piezo drives" in " ".join(out.split())
+        result = json.loads(file.read_text())
+        assert {name: each["is_safe"] for name, each in result.items()} == {
+            "tec": True, "displacement": True, "base": True, "tip": True, "piezo": False,
+        }  # fmt: skip
+        assert rig.control.state()["tec_output"] == 0.0
+        assert took < 30.0
+        assert bench("safe", *attached(rig))[0] == 0
+        assert rig.control.state()["amplifier_enable"] == 0.0
+
+    def test_an_emulated_rig_in_process(self, bench):
+        assert bench("safe", "hybrid")[0] == 0
+
+    @pytest.mark.slow
+    def test_by_a_process_of_its_own_for_one_that_opens_no_line(self, served):
+        rig = served("hybrid")
+        with client(rig, "tec=0.1", "piezo=20"):
+            names = ["tec", "displacement", "base", "tip", "piezo"]
+            states = rescue_by_another_process(rig.name, {}, rig.endpoints_file, names)
+            assert rig.control.state()["amplifier_enable"] == 0.0
+        assert states["piezo"] == "safe"
+        assert list(states) == names
+        failed = rescue_by_another_process("nowhere", {}, None, ["tec"])
+        assert list(failed) == ["tec"]
+        assert "there is no rig 'nowhere'" in failed["tec"]
+
+
+class TestOneBench:
+    """Nothing reaches an instrument that another process holds, under whatever name."""
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("command", ["safe", "recover", "doctor"])
+    @pytest.mark.parametrize("names", ["same", "other"])
+    def test_the_second_is_refused_before_it_sends_a_byte(self, bench, served, tmp_path, command, names):
+        rig = served("vo2")
+        file = rig.endpoints_file if names == "same" else renamed(rig, tmp_path)
+        with client(rig, "tec=30") as process:
+            code, _, err = bench(command, "vo2", "--attach", file)
+            assert code == 2
+            assert len(err.splitlines()) == 1
+            assert "rig vo2 is in use: line " in err
+            assert f"process {process.pid}, a run (rig vo2), since" in err
+            # Each of them would have switched it off.
+            assert rig.control.state()["tec_output"] == 1.0
+        assert bench("safe", "vo2", "--attach", file)[0] == 0
+
+    @pytest.mark.slow
+    def test_force_names_the_holder_and_goes_on(self, bench, served):
+        rig = served("hybrid")
+        with client(rig, "piezo=20") as process:
+            _, _, err = bench("safe", *attached(rig), "--force")
+            assert "warning: rig hybrid is in use" in err
+            assert f"process {process.pid}" in err
+            assert rig.control.state()["amplifier_enable"] == 0.0
+
+    @pytest.mark.slow
+    def test_of_one_line_name_by_name(self, bench, served, tmp_path):
+        rig = served("vo2")
+        file = renamed(rig, tmp_path)
+        content = json.loads(file.read_text())
+        original = json.loads(rig.endpoints_file.read_text())
+        for name in ("tec", "psd"):
+            # Only one line is the same, by another name.
+            changed = json.loads(json.dumps(content))
+            other = {"tec": "psd", "psd": "tec"}[name]
+            number = original["instruments"]["psd"]["port"].rpartition(":")[2]
+            elsewhere = f"tcp://192.0.2.1:{number}" if other == "psd" else str(tmp_path / "no-port")
+            changed["instruments"][other]["port"] = elsewhere
+            file.write_text(json.dumps(changed))
+            with client(rig):
+                code, _, err = bench("doctor", "vo2", "--attach", file)
+            assert code == 2
+            assert changed["instruments"][name]["port"] in err
+            assert original["instruments"][name]["port"] != changed["instruments"][name]["port"]
+
+
+class TestRecover:
+    def trip(self, rig):
+        """Let the watchdog of the TEC controller run out under a host that stopped."""
+        with client(rig, "tec=30") as process:
+            process.send_signal(signal.SIGSTOP)
+            rig.control.advance(301.0)
+        assert rig.control.state()["tec_output"] == 0.0
+
+    @pytest.mark.slow
+    def test_a_watchdog_that_tripped(self, bench, served, tmp_path):
+        rig = served("vo2")
+        self.trip(rig)
+        code, _, err = bench("doctor", *attached(rig))
+        assert code == 4
+        code, out, err = bench("recover", *attached(rig))
+        assert code == 2
+        assert "--yes" in err
+        assert "error 183" in out
+        assert "in error" in out
+        file = tmp_path / "recovered.json"
+        code, out, err = bench("recover", *attached(rig), "tec", "--yes", "--json", file)
+        assert (code, err) == (0, "")
+        assert json.loads(file.read_text())["tec"]["state"] == "ready"
+        assert rig.control.state()["tec_output"] == 0.0
+        with client(rig, "tec=30"):
+            assert rig.control.state()["tec_output"] == 1.0
+        assert bench("safe", *attached(rig))[0] == 0
+
+    def test_its_message_names_the_command(self, bench, served):
+        rig = served("vo2")
+        rig.control.fault("tec-over-temperature")
+        code, out, _ = bench("recover", *attached(rig))
+        assert code == 2
+        text = " ".join(out.split())
+        assert "error 138" in text
+        assert "bench recover RIG tec" in text
+        assert bench("recover", *attached(rig), "--yes")[0] == 0
+
+    @pytest.mark.slow
+    def test_a_servo_that_let_go(self, bench, served):
+        rig = served("sma")
+        rig.control.fault("servo-overload")
+        code, out, _ = bench("recover", *attached(rig), "--yes")
+        assert code == 0
+        assert "overload" in out
+        assert bench("recover", *attached(rig))[0] == 0
+
+    def test_what_cannot_be_reached_is_no_error_to_clear(self, bench, served):
+        rig = served("vo2")
+        rig.control.unplug("tec")
+        try:
+            code, out, err = bench("recover", *attached(rig), "--yes")
+        finally:
+            rig.control.plug_in("tec")
+        assert code == 4
+        assert "not reached" in out
+        assert "error: tec: is not reached" in err
+
+    def test_of_a_device_that_is_none(self, bench):
+        code, _, err = bench("recover", "vo2", "plate")
+        assert code == 2
+        assert "has no device 'plate'; it has: tec, psd" in err
+
+
+WATCHED = """
+from drivers.meerstetter import MeerstetterTEC
+
+class Watched(MeerstetterTEC):
+    heats = True
+    watchdog = None
+"""
+
+
+class TestDoctor:
+    def findings(self, bench, tmp_path, rig, *options):
+        """Give the exit code, and the findings with an advice by device and subject."""
+        file = tmp_path / "check.json"
+        code, _, err = bench("doctor", rig, *options, "--json", file)
+        assert err == ""
+        result = json.loads(file.read_text())
+        assert result["exit_code"] == code
+        return code, {
+            (check["device"], finding["subject"]): finding
+            for check in result["devices"]
+            for finding in check["findings"]
+            if finding["advice"]
+        }
+
+    @pytest.mark.parametrize("rig", ["vo2", "hybrid"])
+    def test_identifies_each_instrument(self, bench, tmp_path, rig):
+        file = tmp_path / "check.json"
+        bench("doctor", rig, "--json", file)
+        for check in json.loads(file.read_text())["devices"][:-1]:
+            assert "serial number" in check["identity"]
+            assert "firmware" in check["identity"]
+
+    def test_a_healthy_rig(self, bench, tmp_path):
+        assert self.findings(bench, tmp_path, "vo2", "--exercise") == (0, {})
+
+    @pytest.mark.parametrize(
+        ("override", "place", "words"),
+        [
+            ("roles.drive.range=[0.0,120.0]", ("tec", "limits"), "0 and 120 beyond 15 to 95 °C"),
+            ("roles.drive.reset.noise=1e-6", ("tec", "tec_temperature"), "typical 1e-06"),
+            ("devices.tec.temperature_limits=[-10,95]", ("tec", "error thresholds"), "0 to 105 °C of the object"),
+            (
+                "interlocks=[{signal='tec_temperature', high=10.0}]",
+                ("tec", "tec_temperature"),
+                "outside of its interlock",
+            ),
+            ("telemetry.period=0.01", ("", "time"), "every 0.01 s"),
+        ],
+    )
+    def test_what_should_be_mended(self, bench, tmp_path, override, place, words):
+        code, findings = self.findings(bench, tmp_path, "vo2", "--override", override)
+        assert code == 1
+        assert words in findings[place]["text"]
+
+    @pytest.mark.parametrize(
+        ("watchdog", "words"), [("None", "its output heats"), ("2.0", "2 s between two readings")]
+    )
+    def test_a_watchdog_that_does_not_fit(self, bench, tmp_path, monkeypatch, watchdog, words):
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        module = f"watched_{watchdog[0].lower()}"
+        (tmp_path / f"{module}.py").write_text(WATCHED.replace("watchdog = None", f"watchdog = {watchdog}"))
+        rig = tmp_path / "watched.toml"
+        rig.write_text(f'extends = "vo2"\n[devices.tec]\ndriver = "{module}:Watched"\n')
+        code, findings = self.findings(bench, tmp_path, rig)
+        assert code == 1
+        assert words in findings["tec", "watchdog"]["text"]
+
+    def test_an_actuator_that_does_not_follow(self, bench, tmp_path):
+        options = ["--exercise", "--override", "roles.drive.reading=tec_sink_temperature"]
+        code, findings = self.findings(bench, tmp_path, "vo2", *options)
+        assert code == 1
+        assert "does not follow" in findings["tec", "exercise"]["text"]
+
+    @pytest.mark.slow
+    def test_a_device_that_is_gone_keeps_no_other_from_being_checked(self, bench, served, tmp_path):
+        rig = served("vo2")
+        rig.control.unplug("tec")
+        try:
+            code, findings = self.findings(bench, tmp_path, *attached(rig))
+        finally:
+            rig.control.plug_in("tec")
+        assert code == 4
+        assert list(findings) == [("tec", "connection")]
+
+    @pytest.mark.slow
+    def test_moves_nothing_but_when_it_is_asked_to(self, bench, tmp_path):
+        log = tmp_path / "state.jsonl"
+        command = [sys.executable, "-P", "-m", "bench", "emulate", "vo2", "--clock", "x1",
+                   "--json", str(tmp_path / "ports.json"), "--state", str(log)]  # fmt: skip
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
+            try:
+                watch = Stopwatch()
+                while not (tmp_path / "ports.json").exists():
+                    assert watch.seconds() < 240.0
+                    with pytest.raises(subprocess.TimeoutExpired):
+                        server.wait(0.05)
+                attach = ("vo2", "--attach", tmp_path / "ports.json")
+                assert self.findings(bench, tmp_path, *attach)[0] in (0, 1)
+                assert outputs(log) == {0.0}
+                assert self.findings(bench, tmp_path, *attach, "--exercise")[0] in (0, 1)
+            finally:
+                server.terminate()
+                server.wait(60)
+        assert outputs(log) == {0.0, 1.0}
+        assert json.loads(log.read_text().splitlines()[-1])["values"]["tec_output"]["value"] == 0.0
+
+
+def outputs(log):
+    return {json.loads(line)["values"]["tec_output"]["value"] for line in log.read_text().splitlines()}

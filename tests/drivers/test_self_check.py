@@ -1,0 +1,82 @@
+"""What the drivers find when they compare their instrument with the rig file: `self_check`, for `bench doctor`."""
+
+import pytest
+
+from bench.clock import VirtualClock
+from bench.rig import Rig
+from bench.rig_file import load_rig
+
+
+@pytest.fixture
+def opened():
+    """Open a rig on the virtual clock."""
+    rigs = []
+
+    def open_rig(name):
+        rigs.append(Rig(load_rig(name), VirtualClock(), seed=0))
+        return rigs[-1]
+
+    yield open_rig
+    for rig in rigs:
+        rig.close()
+
+
+def advised(device):
+    return {finding.subject: finding.text for finding in device.self_check() if finding.advice}
+
+
+def connect_again(rig, name, **changed):
+    """Connect to the instrument of a device once more, as another program does."""
+    device = rig.devices[name]
+    settings = device._settings.model_copy(update=changed)
+    return type(device).connect(name, settings, rig.clock)
+
+
+@pytest.mark.parametrize("name", ["vo2", "hybrid", "sma"])
+def test_a_healthy_rig_and_nothing_moves(opened, name):
+    rig = opened(name)
+    before = rig.laboratory.truth()
+    for device in rig.devices.values():
+        assert advised(device) == {}
+    after = rig.laboratory.truth()
+    outputs = [key for key, value in before.items() if value.is_output]
+    assert outputs
+    assert [after[key].value for key in outputs] == [before[key].value for key in outputs]
+
+
+def test_a_limit_that_another_program_changed(opened):
+    rig = opened("vo2")
+    connect_again(rig, "tec", current_limit=1.0)
+    assert advised(rig.devices["tec"]) == {"current_limit": "1 A in the device"}
+
+
+def test_a_watchdog_that_another_program_switched_off(opened):
+    rig = opened("sma")
+    connect_again(rig, "fan").close()
+    assert advised(rig.devices["fan"]) == {"watchdog read back": "DIO0: does not switch it off"}
+
+
+def test_a_watchdog_of_another_time(opened):
+    rig = opened("sma")
+    fan = rig.devices["fan"]
+    fan._output.unguard()
+    connect_again(rig, "fan", watchdog=60)
+    assert advised(fan) == {"watchdog read back": "DIO0: 60 s"}
+
+
+def test_a_battery_that_is_too_low(opened):
+    rig = opened("sma")
+    rig.laboratory.inject("low-battery", {"volts": 3.0})
+    assert advised(rig.devices["supply"]) == {"power supply": "3.0 V"}
+
+
+def test_a_converter_that_stands_still(opened):
+    rig = opened("sma")
+    rig.laboratory.inject("frozen-load-cell")
+    assert list(advised(rig.devices["load_cell"])) == ["converter"]
+
+
+def test_a_filter_that_another_program_changed(opened):
+    rig = opened("sma")
+    connect_again(rig, "load_cell", filter=6)
+    assert advised(rig.devices["load_cell"]) == {"filter": "6 in the instrument"}
