@@ -529,9 +529,11 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         if self._tared and abs(block.tare - self._tare) > _SAME_TARE * (abs(block.gross) + abs(block.net)):
             raise self._untrusted_tare(f"has another tare than the bench set, {block.tare:.6g} not {self._tare:.6g};")
         gross = settings.newtons_per_unit * block.gross + settings.zero_newtons
-        text = f"force {gross:.6g} N is outside of its calibrated range"
-        advice = "take load off, or extend the calibration and `force_limits`"
-        self._check_range(text, gross, settings.force_limits, "N", advice)
+        low, high = settings.force_limits
+        if not low <= gross <= high:
+            text = f"force {gross:.6g} N is outside of its calibrated range"
+            advice = "take load off, or extend the calibration and `force_limits`"
+            self._check_range(text, gross, settings.force_limits, "N", advice)
         self._check_fresh(block.gross)
         return settings.newtons_per_unit * block.net if self._tared else gross
 

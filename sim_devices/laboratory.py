@@ -192,7 +192,7 @@ class EmulatedLaboratory:
             except ConfigurationError as error:
                 raise ConfigurationError(f"fault {number} of the schedule: {error}") from None
         for line in self.lines.values():
-            line.is_watched = True
+            line.watch()
         begun = self._present()
         for number, each in enumerate(faults):
             if each.at is not None:
@@ -263,7 +263,7 @@ class EmulatedLaboratory:
             self._ends[name] = take_out
         if duration is not None:
             for line in self.lines.values():
-                line.is_watched = True
+                line.watch()
         self.events.append(FaultEvent(self._present(), name, "begins", chosen))
         fault.begin(**chosen)
 

@@ -113,7 +113,8 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
     @property
     def in_waiting(self) -> int:
         """Number of bytes that can be read at once."""
-        self._check()
+        if not self.is_open or not self._socket.taken:
+            self._check()
         self._hear()
         return len(self._received)
 
@@ -123,9 +124,12 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         Raises `serial.SerialException` if bytes are missing, there is no timeout, and the instrument will send
         nothing by itself: a real port would wait for ever.
         """
-        self._check()
+        if not self.is_open or not self._socket.taken:
+            self._check()
         received = self._received
-        if self._connection is None or len(received) < size:
+        if self._connection is None:
+            self._hear()
+        if len(received) < size:
             self._wait_for(size)
         data = bytes(received[:size])
         del received[:size]
@@ -164,7 +168,9 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def _hear(self) -> None:
         try:
-            self._received += self._stream.unsolicited()
+            heard = self._stream.unsolicited()
+            if heard:
+                self._received += heard
         except (FramingError, ConnectionError) as error:
             raise self._ended(error) from None
 
@@ -229,7 +235,8 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def reset_input_buffer(self) -> None:
         """Forget what was received and not read."""
-        self._check()
+        if not self.is_open or not self._socket.taken:
+            self._check()
         self._hear()
         self._received.clear()
 

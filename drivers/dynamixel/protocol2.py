@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 
 import serial
 from pydantic import Field
@@ -226,30 +226,32 @@ class ServoLine:
         return b""
 
 
-def _crc_step(value: int) -> int:
+def _crc_of_byte(index: int) -> int:
+    value = index << 8
     for _ in range(8):
         value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
     return value & 0xFFFF
 
 
-def _table() -> tuple[int, ...]:
-    """Return the CRC of every two bytes: a table of words halves the steps of one of bytes."""
-    by_high = [_crc_step(_crc_step(high << 8)) for high in range(256)]
-    by_low = [_crc_step(low << 8) for low in range(256)]
-    return tuple(high ^ low for high in by_high for low in by_low)
-
-
-_CRC_TABLE = _table()
+_CRC_OF_BYTE = tuple(_crc_of_byte(index) for index in range(256))
+_BEGINNING = (
+    17  # bytes that seldom change from one answer to the next: head, error, and what comes first in a reading
+)
 
 
 def crc(data: bytes) -> int:
     """Return the CRC-16 of a packet: polynomial 0x8005, initial value 0, highest bit first."""
-    if len(data) % 2:
-        # A zero in front does not change it.
-        data = b"\0" + data
-    value = 0
-    for word in struct.unpack(f">{len(data) // 2}H", data):
-        value = _CRC_TABLE[value ^ word]
+    return _crc_from(_crc_of_beginning(data[:_BEGINNING]), data[_BEGINNING:])
+
+
+@lru_cache(maxsize=256)
+def _crc_of_beginning(data: bytes) -> int:
+    return _crc_from(0, data)
+
+
+def _crc_from(value: int, data: bytes) -> int:
+    for byte in data:
+        value = (value << 8 & 0xFF00) ^ _CRC_OF_BYTE[value >> 8 ^ byte]
     return value
 
 

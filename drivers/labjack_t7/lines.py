@@ -33,6 +33,7 @@ from drivers.labjack_t7.registers import (
     WATCHDOG_STRICT_ENABLE,
     WATCHDOG_TIMEOUT_S,
     LabJackT7,
+    Packet,
     Span,
 )
 
@@ -89,6 +90,7 @@ _WATCHDOG_REGISTERS = (
 
 _SETTINGS = tuple(Span.of(register) for register in _WATCHDOG_REGISTERS)
 _DIRECTION, _STATE = Span.of(DIO_DIRECTION), Span.of(DIO_STATE)
+_STATE_PACKET = Packet.of((_STATE,))
 
 
 class DigitalOutput:
@@ -126,7 +128,10 @@ class DigitalOutput:
     @property
     def is_on(self) -> bool:
         """Whether the level of the line is the one that is on, as the instrument reports now."""
-        ((state,),) = self._instrument.read_spans((_STATE,))
+        if self._instrument.checks_owner:
+            (state,) = self._instrument.read_packet(_STATE_PACKET)
+        else:
+            ((state,),) = self._instrument.read_spans((_STATE,))
         return self._level(state)
 
     def switch(self, on: bool) -> None:

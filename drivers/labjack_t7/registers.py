@@ -406,6 +406,11 @@ class LabJackT7:
             self._connected = False
             self._connection.close()
 
+    @property
+    def checks_owner(self) -> bool:
+        """Whether every packet asks for the owner number as well."""
+        return self._owner != 0 and not self._unchecked
+
     def read_words(self, address: int, count: int) -> list[int]:
         """Get `count` 16-bit registers from `address` on, each 0 to 65535."""
         return [int(word) for word in self.read(Register(str(address), address, "U16", "R"), count)]
@@ -444,7 +449,7 @@ class LabJackT7:
         """
         if self._connection.ended or not self._connected:
             self.reopen()
-        checks = self._owner != 0 and not self._unchecked
+        checks = self.checks_owner
         if checks:
             spans = (*spans, _OWNER_SPAN)
         frames = b"".join((*(write_frame(*write) for write in writes), *(span.frame for span in spans)))

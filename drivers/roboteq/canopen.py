@@ -8,11 +8,13 @@ understood.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from binascii import unhexlify
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import serial
@@ -24,6 +26,7 @@ from bench.errors import DeviceConnectionError, DeviceError
 from drivers.roboteq.slcan import SlcanAdapter
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
+_MOST_DOWNLOADS = 64  # that are kept; a voltage that is held is commanded again and again
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
 _LONGEST_TEXT = 256
 _LATEST = 3.0  # time-outs after its request until which an answer may come
@@ -140,6 +143,7 @@ class NodeLine:
         answer_head = b"t%03X8" % (_SDO_ANSWER + settings.node)
         self._answer_heads = frozenset((answer_head, answer_head.lower()))
         self._queries: dict[tuple[int, int], tuple[bytes, bytes]] = {}
+        self._downloads: dict[tuple[int, int, int], tuple[bytes, bytes]] = {}
         self._heard: set[int] = set()
         self._quiet_at = -math.inf
         self.round_trip = 0.0
@@ -228,19 +232,19 @@ class NodeLine:
         except (CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
 
-    def synchronize(self, heads: Sequence[bytes], before: bytes = b"") -> list[bytes]:
+    def synchronize(self, heads: tuple[bytes, ...], before: bytes = b"") -> Sequence[bytes]:
         """Send a SYNC; return the process data that follow it, back to back, in hexadecimal digits.
 
         Parameters
         ----------
-        heads : sequence of bytes
+        heads : tuple of bytes
             Beginning of the line of each PDO, up to its length, in the order in which they come.
         before : bytes
             What is sent in front of the SYNC.
 
         Returns
         -------
-        list of bytes
+        sequence of bytes
             The data of each; none if not all of them come within the timeout.
 
         Raises
@@ -253,6 +257,11 @@ class NodeLine:
         try:
             self._hear()
             adapter.transmit(before + _SYNC)
+            # As a rule they come at once, and nothing else does.
+            matched = adapter.matched(_set_of(heads))
+            if matched:
+                self.answered = True
+                return matched
             end = clock.now() + self._settings.timeout
             for _ in range(_MOST_FRAMES):
                 line = adapter.line()
@@ -278,9 +287,15 @@ class NodeLine:
 
     def _download(self, item: Entry, value: int, sub: int) -> tuple[bytes, bytes]:
         """Return the line of a request that writes a number, and the object that its answer names."""
-        multiplexer = struct.pack("<HB", item.index, sub)
-        data = value.to_bytes(item.size, "little", signed=item.signed)
-        return self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data), multiplexer
+        known = self._downloads.get((item.index, sub, value))
+        if known is None:
+            multiplexer = struct.pack("<HB", item.index, sub)
+            data = value.to_bytes(item.size, "little", signed=item.signed)
+            known = self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data), multiplexer
+            if len(self._downloads) >= _MOST_DOWNLOADS:
+                self._downloads.clear()
+            self._downloads[item.index, sub, value] = known
+        return known
 
     def _read_segments(self, item: Entry, multiplexer: bytes) -> bytes:
         text, toggle, last = b"", 0, False
@@ -335,7 +350,7 @@ class NodeLine:
 
     def _hear(self) -> None:
         """Take note of what has come, which answers nothing."""
-        while (line := self._adapter.line(wait=False)) is not None:
+        for line in self._adapter.lines():
             self._notice(line)
 
     def _answer(self, multiplexer: bytes, sent_at: float) -> bytes | None:
@@ -386,6 +401,13 @@ class NodeLine:
             found += f"; the adapter reports an error ({refusals} BEL)"
         problem, speed = f"no answer within {settings.timeout:g} s", f"{settings.bitrate} bit/s"
         return no_answer(self._device, settings, problem, "node", settings.node, found, speed)
+
+
+@lru_cache(maxsize=16)
+def _set_of(heads: tuple[bytes, ...]) -> re.Pattern[bytes]:
+    """Return the form of process data as they come back to back, behind the adapter's acknowledgements."""
+    lines = (rb"%s([^\r\n\a]{%d})\r" % (head, 2 * int(head[4:])) for head in heads)
+    return re.compile(rb"(?:z?\r)*" + b"".join(lines))
 
 
 def described(item: Entry, sub: int) -> str:

@@ -17,7 +17,7 @@ import struct
 from binascii import unhexlify
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from bench.errors import DeviceConnectionError, DeviceError
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine
@@ -38,8 +38,7 @@ _Mapping = tuple[tuple[int, int, int], ...]
 """Index, subindex and bits of what a PDO carries."""
 
 
-@dataclass(frozen=True)
-class Report:
+class Report(NamedTuple):
     """What a controller reports: power (‰), battery voltage (0.1 V), current (0.1 A), flags, command (‰)."""
 
     power: int

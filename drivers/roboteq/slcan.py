@@ -5,6 +5,7 @@ Source: LAWICEL CAN232 manual V3.
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from contextlib import suppress
 
@@ -16,6 +17,7 @@ from drivers.serial_line import SerialSettings
 
 _MOST_READS = 4096
 _LONGEST_LINE = 64
+_ACKNOWLEDGEMENTS = frozenset((b"z\r", b"z\rz\r", b"\r"))
 
 
 class SlcanAdapter(slcanBus):
@@ -53,20 +55,39 @@ class SlcanAdapter(slcanBus):
         """Send a line, which has its end."""
         self._port.write(line)
 
-    def line(self, *, wait: bool = True) -> bytes | None:
-        """Return the next line with a standard data frame, without its end.
-
-        None after the silence of the port's timeout; without `wait`, if none has arrived.
-        """
+    def line(self) -> bytes | None:
+        """Return the next line with a standard data frame, without its end; None after silence for the timeout."""
         lines = self._lines
         for _ in range(_MOST_READS):
             if lines:
                 return lines.popleft()
-            received = self._port.read_all() or (self._port.read(1) if wait else b"")
+            received = self._port.read_all() or self._port.read(1)
             if not received:
                 return None
             self._take(received)
         return None
+
+    def lines(self) -> list[bytes]:
+        """Return the lines with a standard data frame that have arrived, without their ends."""
+        received = self._port.read_all()
+        if received and (self._rest or received not in _ACKNOWLEDGEMENTS):
+            self._take(received)
+        if not self._lines:
+            return []
+        lines = [*self._lines]
+        self._lines.clear()
+        return lines
+
+    def matched(self, pattern: re.Pattern[bytes]) -> tuple[bytes, ...]:
+        """Return the groups of all that has arrived, if it has this form; none otherwise, and `line` returns it."""
+        if self._lines or self._rest:
+            return ()
+        received = self._port.read_all()
+        found = pattern.fullmatch(received)
+        if found is not None:
+            return found.groups()
+        self._take(received)
+        return ()
 
     def release(self) -> None:
         """Close the channel and the port, in any state."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -169,9 +169,15 @@ class FaultyLine:
             )
         return found
 
+    def watch(self) -> None:
+        """Look at all bytes from now on."""
+        self.is_watched = True
+        for stream in self.streams:
+            stream.step_between()
+
     def break_off(self, cable: Cable) -> None:
         """Bring the line into another state; what is on its way is lost unless it only hangs."""
-        self.is_watched = True
+        self.watch()
         self.cable = cable
         if cable in _DEAD:
             self._lose(ends=cable is Cable.CUT)
@@ -187,7 +193,7 @@ class FaultyLine:
 
     def disturb(self, kind: str, count: float, probability: float, seconds: float = 0.0) -> None:
         """Disturb answers: `count` of them (0 for no limit), each with a probability."""
-        self.is_watched = True
+        self.watch()
         self._disturbances[kind] = _Disturbance(seconds, probability, count or math.inf)
 
     def leave_alone(self, kind: str) -> None:
@@ -205,7 +211,7 @@ class FaultyLine:
     def restart(self) -> None:
         """Lose what is on its way, and connections on TCP: the instrument has lost its power."""
         self._lose(ends=True)
-        self.is_watched = True
+        self.watch()
 
     def _lose(self, *, ends: bool) -> None:
         for stream in [*self.streams]:
@@ -256,11 +262,24 @@ class FaultyStream:
         The instrument's end.
     """
 
+    _PASSED: ClassVar[tuple[str, ...]] = ("receive", "unsolicited", "next_unsolicited")
+
     def __init__(self, stream: Stream, line: FaultyLine) -> None:
         self._inner = stream
         self._line = line
         self._asked = b""
         self._leaving: deque[tuple[float, bytes]] = deque()
+        if not line.is_watched:
+            self._step_aside()
+
+    def _step_aside(self) -> None:
+        """Let bytes pass without a look at them: what is called is the instrument's own."""
+        vars(self).update({name: getattr(self._inner, name) for name in self._PASSED})
+
+    def step_between(self) -> None:
+        """Undo `_step_aside`; may be called again."""
+        for name in self._PASSED:
+            vars(self).pop(name, None)
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the client, in pieces of any size; return what it gets at once.
@@ -268,8 +287,6 @@ class FaultyStream:
         Raises what the instrument's end raises.
         """
         line = self._line
-        if not line.is_watched:
-            return self._inner.receive(data)
         line.schedule.catch_up()
         if line.cable is Cable.HANGING:
             self._asked = (self._asked + data)[:_MOST_QUEUED]
@@ -282,8 +299,6 @@ class FaultyStream:
     def unsolicited(self) -> bytes:
         """Return what the client gets without a request, up to the clock's present time."""
         line = self._line
-        if not line.is_watched:
-            return self._inner.unsolicited()
         line.schedule.catch_up()
         if line.cable is not Cable.HANGING:
             by_itself = self._inner.unsolicited()
@@ -296,12 +311,8 @@ class FaultyStream:
 
     def next_unsolicited(self) -> float:
         """Return when the client next gets something without a request, or a fault begins or ends, s."""
-        due = self._inner.next_unsolicited()
-        if self._line.is_watched:
-            due = min(due, self._line.schedule.next_change())
-            if self._leaving:
-                due = min(due, self._leaving[0][0])
-        return due
+        due = min(self._inner.next_unsolicited(), self._line.schedule.next_change())
+        return min(due, self._leaving[0][0]) if self._leaving else due
 
     def lose(self) -> None:
         """Lose what is on its way."""
@@ -343,6 +354,8 @@ class FaultyConnection(FaultyStream):
     Each call but `close` raises `ConnectionResetError` once the instrument has ended it and what it sent is read.
     """
 
+    _PASSED = ("receive",)
+
     def __init__(self, connection: Connection, line: FaultyLine) -> None:
         super().__init__(connection, line)
         self._connection = connection
@@ -355,15 +368,17 @@ class FaultyConnection(FaultyStream):
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the client, in pieces of any size; return what it gets at once."""
-        if not self._line.is_watched:
-            return self._connection.receive(data)
         self._check()
         return super().receive(data)
 
     def unsolicited(self) -> bytes:
         """Return what comes late, up to the clock's present time."""
         self._check()
-        return super().unsolicited()
+        return super().unsolicited() if self._line.is_watched else self._inner.unsolicited()
+
+    def next_unsolicited(self) -> float:
+        """Return when the client next gets something late, or a fault begins or ends, s."""
+        return super().next_unsolicited() if self._line.is_watched else self._inner.next_unsolicited()
 
     def close(self) -> None:
         """End it; may be called again."""

@@ -204,6 +204,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
             raise ValueError(f"noise: expected zero or a positive number, got {noise}")
         if samples < 1:
             raise ValueError(f"samples: expected 1 or more, got {samples}")
+        self._now = world.clock.now
         self.serial_number = serial_number
         self.firmware = firmware
         self.frozen = False
@@ -266,23 +267,19 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
             return math.inf
         if self._tracking:
             return self._converted + _TRACKING_LOOK
-        now = self.world.clock.now()
-        waiting = now - self._converted
-        tau = self._lag
+        now = self._now()
+        converted = self._converted
+        waiting = now - converted
         # The margins of one coarse step keep a clock that runs on from drawing these instants along with it.
-        if waiting > self._memory() + _COARSE:
-            return now - self._memory()
-        if waiting > _MEMORY_LAGS * tau + _COARSE:
-            return self._converted + _COARSE
-        return self._converted + _FINE_LAGS * tau
+        if waiting <= self._fine_until:
+            return converted + self._fine
+        if waiting > self._memory + _COARSE:
+            return now - self._memory
+        return converted + _COARSE
 
     def expire(self) -> None:
         """Look at the force."""
         self._convert()
-
-    def _memory(self) -> float:
-        """Return how long before a reading the force matters to it, s."""
-        return _MEMORY_LAGS * self._lag + self._motion_time + 2 * _COARSE
 
     def _signal(self) -> float:
         """Return the weight at this instant, in units, as far as the converter goes."""
@@ -295,6 +292,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         self._lag = time_constant(set_up.filter)
         self._spread = self._noise * math.sqrt(time_constant(0) / self._lag)
         self._motion_time = set_up.motion_time / 1000
+        # How long before a reading the force matters to it.
+        self._memory = _MEMORY_LAGS * self._lag + self._motion_time + 2 * _COARSE
+        self._fine, self._fine_until = _FINE_LAGS * self._lag, _MEMORY_LAGS * self._lag + _COARSE
 
     def _settle(self) -> None:
         """Begin with a filter that has settled, at this instant."""

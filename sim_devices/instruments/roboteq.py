@@ -32,8 +32,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import Any, Literal, Protocol
+from itertools import accumulate
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -54,7 +54,7 @@ from sim_devices.instruments.roboteq_objects import (
     Fault,
     NodeState,
 )
-from sim_devices.instruments.roboteq_pdo import Objects, ProcessDataObjects, is_configuration
+from sim_devices.instruments.roboteq_pdo import Objects, ProcessDataObjects
 from sim_devices.world import World
 
 DEVICE_TYPE = 0x000F0191
@@ -72,11 +72,25 @@ LOWEST_BATTERY_VOLTAGE = 5.0
 HIGHEST_BATTERY_VOLTAGE = 60.0
 """Battery voltage above which the device reports over-voltage, V."""
 
+_FIRST_COMMAND = 0x2000
 _FULL = 1000  # command and power of a duty cycle of 1
 _INTERNAL_VOLTAGE = 118  # 0.1 V
 _FIVE_VOLTS = 5000  # mV
 _TEMPERATURES = (32, 30)  # °C: processor, power stage
 _LONGEST_HEARTBEAT_BACKLOG = 4
+
+
+class _Report(NamedTuple):
+    """What the frames that follow a SYNC carry."""
+
+    sources: list[tuple[Callable[..., Any], int]]
+    """Each reading, with its subindex."""
+    places: list[int]
+    """Which of the readings the frames carry, in their order."""
+    form: struct.Struct
+    """Form of the data of all frames."""
+    frames: list[tuple[int, int, int]]
+    """Identifier of each frame, and beginning and end of its data."""
 
 
 class HeatingLoad(Protocol):
@@ -153,6 +167,8 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         self._counters = [0] * CHANNELS
         self._variables = [0] * VARIABLES
         self._forms: dict[Objects, struct.Struct] = {}
+        self._reported: Sequence[tuple[int, Objects]] = ()
+        self._report: _Report
         self._pdos = ProcessDataObjects(node, send_rates, world.clock.now())
         self._held = False
         self._trips = Fault(0)
@@ -165,7 +181,8 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         self._heartbeat_milliseconds = 100
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = False
-        self._quiet_until = -math.inf
+        self.quiet_until = -math.inf
+        """When it next says something by itself, s; minus infinity if that is not known."""
         self._heartbeat_since = world.clock.now()
         self._battery_used = math.nan
         self._readings: dict[int, Callable[..., Any]] = {
@@ -243,21 +260,22 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self.world.advance()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
-            self._quiet_until = -math.inf
+            if index >= _FIRST_COMMAND:
+                self._command(index, sub, value)
+                return
+            self.quiet_until = -math.inf
             if index == 0x1016:
                 self._consumer_heartbeats[sub - 1] = value
             elif index == 0x1017:
                 self._heartbeat_milliseconds = value
                 self._heartbeat_since = self.world.time
-            elif is_configuration(index):
-                self._pdos.write(index, sub, value)
             else:
-                self._command(index, sub, value)
+                self._pdos.write(index, sub, value)
 
     def manage(self, command: int) -> None:
         """Obey a network management command (CiA 301): 1 start, 2 stop, 128, 129 and 130; others are ignored."""
         with self.world.at_present():
-            self._quiet_until = -math.inf
+            self.quiet_until = -math.inf
             if command == 1:
                 self._state = NodeState.OPERATIONAL
             elif command == 2:
@@ -266,11 +284,6 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
                 self._state = NodeState.PRE_OPERATIONAL
             elif command in (129, 130):
                 self._restart(power=command == 129)
-
-    @property
-    def quiet(self) -> bool:
-        """Whether it has nothing to say by itself at the clock's present time."""
-        return self._clock.now() < self._quiet_until
 
     def heartbeats(self) -> list[NodeState]:
         """Take the heartbeats that are due since they were last asked for, the newest four at most.
@@ -306,24 +319,28 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         objects = self._pdos.received(identifier)
         if not objects:
             return
-        forms = [FORMATS[DICTIONARY[key].kind] for key in objects]
-        if self._state is not NodeState.OPERATIONAL or len(data) < sum(form.size for form in forms):
+        form = self._form(objects)
+        if self._state is not NodeState.OPERATIONAL or len(data) < form.size:
             return
-        for (index, sub), form in zip(objects, forms, strict=True):
-            with suppress(RequestRefusedError):
-                self.write_object(index, form.unpack(data[: form.size])[0], sub)
-            data = data[form.size :]
+        for (index, sub), value in zip(objects, form.unpack_from(data), strict=True):
+            try:
+                self.write_object(index, value, sub)
+            except RequestRefusedError:
+                continue
 
     def process_data(self, *, synchronous: bool) -> list[tuple[int, bytes]]:
         """Take identifier and data of the TPDOs that a SYNC asks for, or that are due by their send rates."""
         pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
         if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
             return []
+        if pdos is not self._reported:
+            self._reported, self._report = pdos, self._report_of(pdos)
+        report = self._report
         with self.world.lock:
-            self.world.advance()
-            # Each object is measured once, however many of the frames carry it.
-            values: dict[tuple[int, int], int] = {}
-            return [(identifier, self._encoded(objects, values)) for identifier, objects in pdos]
+            self.world.advance_locked()
+            values = [read(sub) for read, sub in report.sources]
+        data = report.form.pack(*[values[place] for place in report.places])
+        return [(identifier, data[begin:end]) for identifier, begin, end in report.frames]
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -333,19 +350,31 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """Return when it next says something by itself, s; until then it is quiet, unless it is disturbed."""
         instant = min(self.next_heartbeat(), self.next_process_data())
         # A sum of periods may be short of the instant by its rounding.
-        self._quiet_until = instant - 1e-6
+        self.quiet_until = instant - 1e-6
         return instant
 
-    def _encoded(self, objects: Objects, values: dict[tuple[int, int], int]) -> bytes:
-        """Return objects as a frame carries them; those that are missing in `values` are measured."""
+    def _form(self, objects: Objects) -> struct.Struct:
+        """Return how a frame carries some objects."""
         form = self._forms.get(objects)
         if form is None:
             codes = (FORMATS[DICTIONARY[key].kind].format[1:] for key in objects)
             form = self._forms[objects] = struct.Struct("<" + "".join(codes))
-        for key in objects:
-            if key not in values:
-                values[key] = self._readings[key[0]](key[1])
-        return form.pack(*[values[key] for key in objects])
+        return form
+
+    def _report_of(self, pdos: Sequence[tuple[int, Objects]]) -> _Report:
+        """Return what frames carry; each object is measured once, however many of them carry it."""
+        carried = tuple(key for _, objects in pdos for key in objects)
+        keys = [*dict.fromkeys(carried)]
+        ends = [*accumulate(self._form(objects).size for _, objects in pdos)]
+        return _Report(
+            [(self._readings[index], sub) for index, sub in keys],
+            [keys.index(key) for key in carried],
+            self._form(carried),
+            [(identifier, begin, end) for (identifier, _), begin, end in zip(pdos, [0, *ends], ends, strict=False)],
+        )
+
+    def _readings_changed(self) -> None:
+        self._reported = ()
 
     # Faults.
 
@@ -385,7 +414,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         with self.world.at_present():
             self.heartbeats()
             self.plugged_in = True
-            self._quiet_until = -math.inf
+            self.quiet_until = -math.inf
 
     def _corrupted(self, answer: bytes) -> bytes:
         """Cut the adapter's line in its middle."""
@@ -497,7 +526,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self._watchdog_due = math.inf
             self._apply()
         self._pdos.reset(self.world.time)
-        self._quiet_until = -math.inf
+        self.quiet_until = -math.inf
         self._state = NodeState.OPERATIONAL
         self._boot_up_due = True
         self._heartbeat_since = self.world.time
@@ -511,7 +540,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         return faults
 
     def _channel_flags(self) -> ChannelFlag:
-        return self._channel_trips | (ChannelFlag.AMPS_LIMIT if self._limiting else ChannelFlag(0))
+        return self._channel_trips | ChannelFlag.AMPS_LIMIT if self._limiting else self._channel_trips
 
     def _apply(self) -> None:
         """Bring the output to what command, watchdog, limits and faults make of it."""

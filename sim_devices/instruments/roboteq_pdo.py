@@ -21,7 +21,6 @@ from sim_devices.instruments.roboteq_objects import (
     MOST_MAPPED,
     PDOS,
     RECEIVE_MAPPING,
-    RECEIVE_PARAMETERS,
     TRANSMIT_MAPPING,
     TRANSMIT_PARAMETERS,
     AbortCode,
@@ -92,6 +91,8 @@ class ProcessDataObjects:
     def __init__(self, node: int, send_rates: Sequence[int], now: float) -> None:
         self._node = node
         self._intervals = [1e-3 * milliseconds for milliseconds in send_rates]
+        self._asked_always: tuple[tuple[int, Objects], ...] | None = None
+        self._received: dict[int, Objects] = {}
         self.reset(now)
 
     def reset(self, now: float) -> None:
@@ -99,6 +100,7 @@ class ProcessDataObjects:
         self._transmit = [_pdo(True, number, self._node, 0x2106, 0x180) for number in range(PDOS)]
         self._receive = [_pdo(False, number, self._node, 0x2005, 0x200) for number in range(PDOS)]
         self._scheduled = []
+        self._changed()
         for pdo, interval in zip(self._transmit, self._intervals, strict=True):
             if interval:
                 pdo.interval, pdo.due = interval, now + interval
@@ -116,6 +118,7 @@ class ProcessDataObjects:
 
         Raises `RequestRefusedError` if the value makes no sense, or the PDO must be destroyed first.
         """
+        self._changed()
         pdo, mapping = self._at(index)
         if mapping:
             if pdo.exists or (sub and pdo.count):
@@ -150,8 +153,10 @@ class ProcessDataObjects:
             (pdo.due for pdo in self._scheduled if pdo.exists and pdo.kind >= _FIRST_BY_TIME), default=math.inf
         )
 
-    def take_synchronous(self) -> list[tuple[int, Objects]]:
+    def take_synchronous(self) -> tuple[tuple[int, Objects], ...]:
         """Count a SYNC; return identifier and objects of each TPDO that it asks for."""
+        if self._asked_always is not None:
+            return self._asked_always
         asked = []
         for pdo in self._transmit:
             if pdo.kind <= _LAST_SYNCHRONOUS and pdo.exists:
@@ -159,25 +164,30 @@ class ProcessDataObjects:
                 if pdo.syncs >= pdo.kind:
                     pdo.syncs = 0
                     asked.append((pdo.identifier, pdo.objects))
-        return asked
+        answer = tuple(asked)
+        if all(pdo.kind <= 1 or pdo.kind > _LAST_SYNCHRONOUS for pdo in self._transmit):
+            self._asked_always = answer
+        return answer
 
     def received(self, identifier: int) -> Objects:
         """Return the objects that a frame with an identifier writes, none if it is no RPDO."""
-        for pdo in self._receive:
-            if pdo.exists and pdo.identifier == identifier:
-                return pdo.objects
-        return ()
+        known = self._received.get(identifier)
+        if known is None:
+            existing = (pdo for pdo in self._receive if pdo.exists)
+            known = next((pdo.objects for pdo in existing if pdo.identifier == identifier), ())
+            self._received[identifier] = known
+        return known
+
+    def _changed(self) -> None:
+        """Forget what is kept of the configuration."""
+        self._asked_always = None
+        self._received.clear()
 
     def _at(self, index: int) -> tuple[_Pdo, bool]:
         """Return the PDO that an object configures, and whether the object is its mapping."""
         base, number = index & ~0xFF, index & 0xFF
         pdos = self._transmit if base in (TRANSMIT_PARAMETERS, TRANSMIT_MAPPING) else self._receive
         return pdos[number], base in (TRANSMIT_MAPPING, RECEIVE_MAPPING)
-
-
-def is_configuration(index: int) -> bool:
-    """Return whether an object of the dictionary configures a PDO."""
-    return index & ~0xFF in (TRANSMIT_PARAMETERS, TRANSMIT_MAPPING, RECEIVE_PARAMETERS, RECEIVE_MAPPING)
 
 
 def _pdo(transmitted: bool, number: int, node: int, index: int, identifier: int) -> _Pdo:

@@ -109,6 +109,9 @@ class GridPlant(ABC, Generic[P]):
         if not 0.0 <= dt < math.inf:
             raise ValueError(f"dt must be finite and not negative, not {dt} s")
         pending = self._pending + dt
+        if pending + GRID_TOLERANCE < self._step:
+            self._pending = pending
+            return
         due = math.floor((pending + GRID_TOLERANCE) / self._step)
         self._pending = pending - due * self._step
         while due > 0:

@@ -7,6 +7,8 @@ from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
+from sim_devices.noise import normals
+
 
 @dataclass(eq=False)
 class RatiometricSensor:
@@ -28,16 +30,17 @@ class RatiometricSensor:
     """Deviation of the supply of one instance from 5 V, V rms; drawn once."""
     _: KW_ONLY
     rng: np.random.Generator
-    """Source of the noise and of the error of the supply."""
+    """Source of the noise and of the error of the supply; nothing else may draw from it."""
     supply_volts: float = field(init=False)
     """Voltage of the supply in V; for faults and drift."""
 
     def __post_init__(self) -> None:
         self.supply_volts = 5.0 + self.supply_error * self.rng.standard_normal()
+        self._normals = normals(self.rng)
 
     def output(self) -> float:
         """Return the output voltage in V at this instant."""
-        noisy = self.position() + self.noise * self.rng.standard_normal()
+        noisy = self.position() + self.noise * next(self._normals)
         step = round(noisy / self.resolution) * self.resolution
         share = min(max(step / self.stroke, 0.0), 1.0)
         return self.supply_volts * (0.1 + 0.8 * share)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from binascii import hexlify
 from functools import lru_cache
 
 from sim_devices.instruments.emulated import RequestRefusedError
@@ -61,6 +62,7 @@ class CanopenSlcanServer(WireServer):
         self._device = device
         self._node = SdoServer(device)
         self._answer_head = _line(_SDO_ANSWER + device.node, bytes(8))[:5]
+        self._now = device.world.clock.now
         self._received = b""
         self._overrun = False
         self._bitrate = 0
@@ -85,7 +87,7 @@ class CanopenSlcanServer(WireServer):
             *lines, rest = received.split(b"\r")
             sent = self._sent_by_itself()
             for line in lines:
-                sent += _REFUSED if self._overrun or len(line) > LONGEST_LINE else self._obey(line)
+                sent += self._obey(line) if not self._overrun and len(line) <= LONGEST_LINE else _REFUSED
                 self._overrun = False
             # A line that is too long is refused up to its end.
             self._overrun = self._overrun or len(rest) > LONGEST_LINE
@@ -94,9 +96,10 @@ class CanopenSlcanServer(WireServer):
 
     def unsolicited(self) -> bytes:
         """Return heartbeats, boot-up message and TPDOs since the last call, which pass while the channel is open."""
-        if self._device.quiet:
+        device = self._device
+        if self._now() < device.quiet_until:
             return b""
-        with self._device.world.lock:
+        with device.world.lock:
             return self._sent_by_itself()
 
     def next_unsolicited(self) -> float:
@@ -109,7 +112,7 @@ class CanopenSlcanServer(WireServer):
 
     def _sent_by_itself(self) -> bytes:
         device = self._device
-        if device.quiet:
+        if self._now() < device.quiet_until:
             return b""
         states = device.heartbeats()
         frames = device.process_data(synchronous=False)
@@ -130,8 +133,9 @@ class CanopenSlcanServer(WireServer):
                 return _REFUSED
             identifier, data = frame
             sent = b"z\r" if kind in b"tr" else b"Z\r"
-            if data is not None and self._device.plugged_in and self._on_the_bus():
-                sent += self._answer(identifier, data)
+            device = self._device
+            if data is not None and device.plugged_in and self._bitrate == device.bitrate:
+                return sent + self._answer(identifier, data)
             return sent
         if line == b"":
             return _OK
@@ -162,7 +166,7 @@ class CanopenSlcanServer(WireServer):
             if len(data) == 8 and device.state is not NodeState.STOPPED:
                 answer = self._node.answer(data)
                 if answer:
-                    return device.transmit(b"%s%s\r" % (self._answer_head, answer.hex().upper().encode("ascii")))
+                    return device.transmit(b"%s%s\r" % (self._answer_head, hexlify(answer).upper()))
         elif identifier == _SYNC:
             return b"".join(_line(*frame) for frame in device.process_data(synchronous=True))
         elif identifier != _NMT:
@@ -180,6 +184,8 @@ class SdoServer:
         self._device = device
         self._numbers: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
         """Index, subindex, form, and beginning of the answer, by the first four bytes of a query for a number."""
+        self._writes: dict[bytes, tuple[int, int, struct.Struct, bytes]] = {}
+        """Index, subindex, form, and answer, by the first four bytes of a download in one piece."""
         self._multiplexer = bytes(3)
         self._text: bytes | None = None
         self._incoming: bytes | None = None
@@ -189,6 +195,16 @@ class SdoServer:
         """Return the eight bytes that answer eight bytes; none answer an abort."""
         command = request[0]
         specifier = command >> 5
+        known = self._writes.get(request[:4])
+        if known is not None:
+            self._text = self._incoming = None
+            self._multiplexer = request[1:4]
+            index, sub, written, answer = known
+            try:
+                self._device.write_object(index, written.unpack_from(request, 4)[0], sub)
+            except RequestRefusedError as error:
+                return self._abort(error)
+            return answer
         if specifier not in (0, 3):
             # What was under way has ended.
             self._text = self._incoming = None
@@ -206,8 +222,12 @@ class SdoServer:
                 return self._upload_segment(command)
             raise RequestRefusedError(AbortCode.COMMAND)
         except RequestRefusedError as error:
-            self._text = self._incoming = None
-            return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
+            return self._abort(error)
+
+    def _abort(self, error: RequestRefusedError) -> bytes:
+        """End what is under way; return the answer that says so."""
+        self._text = self._incoming = None
+        return b"\x80" + self._multiplexer + struct.pack("<I", error.reason)
 
     def _object(self) -> tuple[int, int]:
         multiplexer = self._multiplexer
@@ -229,6 +249,9 @@ class SdoServer:
             if (sized or not expedited) and 4 - (command >> 2 & 3) != size:
                 raise RequestRefusedError(AbortCode.LENGTH)
             self._write(data[:size])
+            answer = b"\x60" + self._multiplexer + bytes(4)
+            self._writes[bytes((command,)) + self._multiplexer] = index, sub, FORMATS[row.kind], answer
+            return answer
         return b"\x60" + self._multiplexer + bytes(4)
 
     def _download_segment(self, command: int, data: bytes) -> bytes:
@@ -296,4 +319,10 @@ def _frame(line: bytes) -> tuple[int, bytes | None] | None:
 
 
 def _line(identifier: int, data: bytes) -> bytes:
-    return b"t%03X%d%s\r" % (identifier, len(data), data.hex().upper().encode("ascii"))
+    return b"%s%s\r" % (_head(identifier, len(data)), hexlify(data).upper())
+
+
+@lru_cache(maxsize=256)
+def _head(identifier: int, size: int) -> bytes:
+    """Return the beginning of a line."""
+    return b"t%03X%d" % (identifier, size)

@@ -32,6 +32,7 @@ LONGEST_FRAME = 1024
 
 BROADCAST = 254
 
+_READ = struct.Struct("<HH")  # address and length
 _HEADER = b"\xff\xff\xfd\x00"
 _HEAD = 7  # header, id and length
 _LOWEST_LENGTH = 3  # instruction and CRC
@@ -82,19 +83,22 @@ def _crc_of_byte(index: int) -> int:
 
 _CRC_OF_BYTE = [_crc_of_byte(index) for index in range(256)]
 
-_CRC_OF_WORD = tuple(
-    _CRC_OF_BYTE[first >> 8] ^ (first << 8 & 0xFF00) ^ second for first in _CRC_OF_BYTE for second in _CRC_OF_BYTE
-)
-"""CRC of two bytes, by both of them: half the steps of a table of bytes."""
+_BEGINNING = 17  # bytes of a packet that seldom change from one to the next
 
 
 def crc16(data: bytes) -> int:
     """Return the CRC of a packet: polynomial 0x8005, initial value 0, highest bit first."""
-    # With the initial value 0, zeros in front change nothing.
-    words = data if len(data) % 2 == 0 else b"\0" + data
-    crc = 0
-    for word in struct.unpack(f">{len(words) // 2}H", words):
-        crc = _CRC_OF_WORD[crc ^ word]
+    return _crc_from(_crc_of_beginning(data[:_BEGINNING]), data[_BEGINNING:])
+
+
+@lru_cache(maxsize=256)
+def _crc_of_beginning(data: bytes) -> int:
+    return _crc_from(0, data)
+
+
+def _crc_from(crc: int, data: bytes) -> int:
+    for byte in data:
+        crc = (crc << 8 & 0xFF00) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
     return crc
 
 
@@ -201,6 +205,11 @@ class Dynamixel2Server(WireServer):
         if instruction == Instruction.STATUS:
             return b""
         # Every instruction packet feeds the bus watchdogs of all (e-Manual, Bus Watchdog).
+        if len(self._servos) == 1 and number == self._servos[0].bus_id:
+            # As a rule, the one servo is asked by its own id.
+            (servo,) = self._servos
+            heard = servo.hear()
+            return self._serve_one(servo, instruction, parameters) if heard and instruction not in _FOR_ALL else b""
         present = {servo.bus_id: servo for servo in self._servos if servo.hear()}
         if instruction in _FOR_ALL:
             if number != BROADCAST:
@@ -244,12 +253,12 @@ class Dynamixel2Server(WireServer):
 def _act(servo: EmulatedMX28, instruction: int, parameters: bytes, *, to_all: bool) -> bytes:
     """Have one servo carry an instruction out; return the parameters of its answer."""
     match instruction:
+        case Instruction.READ:
+            _expect(parameters, 4)
+            return servo.read_bytes(*_READ.unpack(parameters))
         case Instruction.PING:
             _expect(parameters, 0)
             return struct.pack("<HB", servo.model_number, servo.firmware)
-        case Instruction.READ:
-            _expect(parameters, 4)
-            return servo.read_bytes(*struct.unpack("<HH", parameters))
         case Instruction.WRITE | Instruction.REG_WRITE:
             if len(parameters) < 3:
                 raise RequestRefusedError(ErrorNumber.DATA_LENGTH)

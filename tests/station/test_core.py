@@ -285,6 +285,26 @@ def test_the_instant_at_which_an_interlock_acts_is_due_between_two_looks():
     assert it.state is State.TRIPPED
 
 
+def test_a_look_at_another_line_does_not_put_off_the_instant_at_which_an_interlock_acts():
+    it = core(interval=10.0)
+    it.begin(0.0)
+    it.judge(1.0, {"after": 2.0})
+    it.judge(1.0 + SECONDS, {"at_once": 0.5})
+    assert it.look_due(1.0 + SECONDS)
+    # Now it is on its way.
+    it.judge(1.0 + SECONDS, {"at_once": 0.5})
+    assert it.due() == pytest.approx(10.0)
+
+
+def test_an_interlock_whose_signal_is_out_of_reach_does_not_put_off_another():
+    it = core(interval=10.0, interlocks=(*INTERLOCKS, Interlock(signal="beside", high=1.0, seconds=2.0 * SECONDS)))
+    it.begin(0.0)
+    it.judge(1.0, {"after": 2.0, "beside": 2.0})
+    assert it.look_due(1.0 + SECONDS)
+    it.judge(1.5 + SECONDS, {"beside": 2.0})
+    assert it.due() == pytest.approx(1.0 + 2.0 * SECONDS)
+
+
 def test_an_instant_is_due_by_the_clock_of_the_caller():
     it = core(interval=100.0)
     it.begin(50.0)
