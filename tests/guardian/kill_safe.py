@@ -113,31 +113,6 @@ def started(rig: EmulatedRig, protocol: str, *, stalled: bool = False) -> Guarde
     return GuardedRun(rig, protocol, {"safety.patience": "3"}, parameters, stalled=stalled)
 
 
-<<<<<<< HEAD
-def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Found:
-    """Carry a trial out, and leave the laboratory as it was."""
-    command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{trial.protocol}", "--rig", rig.name]
-    command += ["--attach", str(rig.endpoints_file), "--out", str(folder), "--override", "safety.patience=3"]
-    # Not all rigs have a watchdog and an interlock for each output that heats.
-    command += ["--override", "safety.unattended=false"]
-    command += ["--set", f"setpoints={json.dumps(SETPOINTS[rig.name])}"]
-    with ExitStack() as stack:
-        if trial.stalled:
-            reading, writing = os.pipe()
-            stack.callback(os.close, reading)
-            out: int = writing
-        else:
-            out = stack.enter_context((folder.parent / f"{folder.name}.txt").open("wb")).fileno()
-        # In a session of its own, as its own terminal's would be.
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
-        )
-        if trial.stalled:
-            os.close(writing)
-        stack.callback(_end, process)
-        _await_on(rig.control, process, len(SETPOINTS[rig.name]), folder)
-        guardians = find_guardians(process.pid)
-=======
 def watch(rig: EmulatedRig, names: Collection[str], longest: float) -> tuple[dict[str, float], set[str]]:
     """Watch outputs until all are off; return for how long each was on (s), and those that are still on."""
     start = time.monotonic()
@@ -155,7 +130,6 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
     """Carry a trial out on the bench."""
     with started(rig, trial.protocol, stalled=trial.stalled) as run:
         run.await_on(len(SETPOINTS[rig.name]))
->>>>>>> main
         if trial.sent is None:
             run.await_note("computing")
         else:
@@ -167,27 +141,6 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
         found = Found.judged(max(seconds.values()), trial.within, left)
         problem = found.problem
         if trial.sent is signal.SIGSTOP:
-<<<<<<< HEAD
-            process.send_signal(signal.SIGCONT)
-            if process.wait(120) != 7:
-                problem = problem or f"exit code {process.returncode} after SIGCONT"
-            if outputs(rig.control):
-                problem = "switched on again after SIGCONT"
-        elif trial.sent not in (None, signal.SIGKILL) and process.wait(120) != 130:
-            problem = problem or f"exit code {process.returncode}"
-    _await_gone(guardians)
-    return Found(seconds, problem)
-
-
-def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: int, folder: Path) -> None:
-    since = time.monotonic()
-    while len(found := outputs(control)) < count:
-        if process.poll() is not None or time.monotonic() - since > 120:
-            said = (folder.parent / f"{folder.name}.txt").read_text()[-500:]
-            raise AssertionError(f"the outputs did not all go on: {found}, exit code {process.poll()}: {said}")
-        time.sleep(0.01)
-    _await_note(folder, "everything is on")
-=======
             run.process.send_signal(signal.SIGCONT)
             if run.process.wait(60) != 7:
                 problem = problem or f"exit code {run.process.returncode} after SIGCONT"
@@ -257,7 +210,6 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
         found["mended"] = Found(mended.seconds, mended.within, mended.problem or problem)
     restart(rig)
     return found
->>>>>>> main
 
 
 def restart(rig: EmulatedRig) -> None:
@@ -267,41 +219,6 @@ def restart(rig: EmulatedRig) -> None:
             rig.control.power_cycle(name)
 
 
-<<<<<<< HEAD
-def find_guardians(bench: int) -> list[int]:
-    """Return the guardians that a bench has started."""
-    return [number for number in _processes(b"bench.guardian") if _parent(number) == bench]
-
-
-def _processes(word: bytes) -> list[int]:
-    found = []
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError):
-            if entry.name.isdigit() and word in (entry / "cmdline").read_bytes():
-                found.append(int(entry.name))
-    return found
-
-
-def _parent(number: int) -> int:
-    try:
-        # After the name in brackets: state and parent.
-        return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return 0
-
-
-def _await_gone(processes: list[int]) -> None:
-    """Wait until guardians have left the lines."""
-    since = time.monotonic()
-    while time.monotonic() - since < 30 and any(Path(f"/proc/{number}").exists() for number in processes):
-        time.sleep(0.02)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-=======
 def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[str, Found]]]]:
     """Return the trials of a rig by name; each takes how long to wait before it goes wrong, s."""
     for title, trial in TRIALS.items():
@@ -312,7 +229,6 @@ def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[st
         for name, instrument in rig.instruments.items():
             if instrument.devices:
                 yield f"{title} {name}", lambda wait, name=name, lose=lose: cut_line(rig, name, lose, wait)
->>>>>>> main
 
 
 def main() -> int:
