@@ -5,12 +5,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
-# mypy keeps one core busy: it runs beside the tests.
+# mypy keeps one core busy: it runs beside the compilation of the kernels and the tests.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types tests all-tests benchmark busy fault-matrix clean
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
+.PHONY: kernels tests all-tests benchmark busy kill-safe fault-matrix clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -41,10 +42,14 @@ lint: $(SETUP)
 types: lint
 	$(BIN)/mypy
 
-tests: lint
+# Compiled once, before the workers of the tests would each do it.
+kernels: lint
+	$(BIN)/python tests/compile_kernels.py
+
+tests: kernels
 	$(PYTEST)
 
-all-tests: lint
+all-tests: kernels
 	$(PYTEST) -m 'not benchmark'
 
 # Side-by-side speed comparisons; run them on an idle machine.
@@ -58,6 +63,10 @@ busy: $(SETUP)
 # Each fault of each rig with five seeds, and a table of what passed.
 fault-matrix: $(SETUP)
 	$(BIN)/python tests/faults/matrix.py
+
+# SIGKILL, SIGSTOP, endless loops and stalled readers on each rig: when every output is off, read in the instruments.
+kill-safe: $(SETUP)
+	$(BIN)/python tests/guardian/kill_safe.py --times 10
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

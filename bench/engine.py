@@ -81,21 +81,7 @@ class Outcome:
 
 
 class Engine:
-    """Carries protocols out at a station.
-
-    Parameters
-    ----------
-    station : Station
-        Connected devices.
-    journal : Journal
-        Written before any observer is notified.
-    observers : iterable of Observer
-        Notified after the journal.
-    interrupts : Interrupts
-        What the operator and the system ask for.
-    ask : callable, optional
-        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
-    """
+    """Carries protocols out at a station; its parameters are those of `RunAtHand`."""
 
     def __init__(
         self,

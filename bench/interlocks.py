@@ -237,7 +237,11 @@ class InterlockWatch:
 
         A look at this instant makes the time until it acts independent of the rate of the looks.
         """
-        return min((course.due() for course in self._courses), default=math.inf)
+        return self.due_after(-math.inf)
+
+    def due_after(self, t: float) -> float:
+        """Return the first such time after `t`, s; one before it waits for a signal that was not read last."""
+        return min((due for course in self._courses if (due := course.due()) > t), default=math.inf)
 
     def look(
         self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None = None

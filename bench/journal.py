@@ -10,11 +10,12 @@ Schema, version 2
 `meta(key, value)`
     Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
     extends and the overrides), `overrides`, `protocol`, `parameters`, `slots` (device and signal by name), `seed`,
-    `clock`, `epoch` (time of day at t = 0), `devices` (identity by name), `calibration`, `operator`, `command`,
-    `packages` (versions), `git` (commit and whether it was clean), `host` (with the wall-clock time at the start),
-    `controls` (the signal under control), `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`,
-    `failed`), `reason`, `finished` (laboratory s), `safe_state` (outcome by device). A file without `status` is of a
-    run that is going on or whose process died.
+    `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
+    0), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
+    whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),
+    `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished`
+    (laboratory s), `safe_state` (outcome by device). A file without `status` is of a run that is going on or whose
+    process died.
 `signals(position, name, unit, description, precision)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …)`
@@ -173,6 +174,8 @@ class Journal:
             )
             for key, value in {"schema": SCHEMA, **meta}.items():
                 self._put_meta(key, value)
+        made = path.stat()
+        self._file = made.st_dev, made.st_ino
         marks = ", ?" * len(self.signals)
         self._waiting: list[tuple[float, ...]] = []
         self._since_write = Stopwatch()
@@ -238,6 +241,19 @@ class Journal:
                 self._db.execute(statement, values)
             self._waiting.clear()
         self._since_write = Stopwatch()
+        self._check_file()
+
+    def _check_file(self) -> None:
+        """Raise `DataError` if the file is no longer where it was made: SQLite goes on with one that is removed."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            found = None
+        if found is None or (found.st_dev, found.st_ino) != self._file:
+            raise DataError(
+                f"{self.path} was {'removed' if found is None else 'replaced'} while the run went on; what is "
+                "recorded would be lost, so the run ends here"
+            )
 
     def _write_waiting(self) -> None:
         if self._waiting:

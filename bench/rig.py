@@ -13,10 +13,10 @@ from bench.binding import check_roles
 from bench.clock import Clock, make_clock
 from bench.derived import Derived
 from bench.description import RigDescription
-from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Signal
+from bench.devices import Actuator, Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
-from bench.rig_file import DeviceEntry, Laboratory, RigFile
+from bench.rig_file import Laboratory, RigFile
 from bench.roles import BlockPlayer, Floats, JointReader
 from bench.safety import SAFE, make_safe
 
@@ -67,7 +67,7 @@ class Rig:
                 ports = self.laboratory.open()
                 stack.callback(self.laboratory.close)
             for entry in file.devices:
-                settings = _wired(entry, ports, file.path)
+                settings = entry.wired(ports, file.path)
                 device = entry.driver.connect(entry.name, settings, clock)
                 stack.callback(_close, device)
                 self.devices[entry.name] = device
@@ -285,17 +285,3 @@ def _close(device: Device) -> None:
     # A line that is gone cannot be closed either; that must not hide how the run ended.
     with suppress(Exception):
         device.close()
-
-
-def _wired(entry: DeviceEntry, ports: Mapping[str, str], path: str) -> DriverSettings:
-    port = getattr(entry.settings, "port", "")
-    scheme = "emulated://"
-    if not isinstance(port, str) or not port.startswith(scheme):
-        return entry.settings
-    name = port.removeprefix(scheme)
-    if name not in ports:
-        known = ", ".join(scheme + other for other in ports) or "none: the rig has no [emulation]"
-        raise ConfigurationError(
-            f"{path}: devices.{entry.name}.port = {port!r}: the laboratory has no such instrument; there are: {known}"
-        )
-    return entry.settings.model_copy(update={"port": ports[name]})

@@ -87,6 +87,7 @@ class RunAtHand:
         self._observers = tuple(observers)
         self._interrupts = interrupts
         self._pause_reason = ""
+        self._is_demanded = False
 
     def expect_ticks(self, what: str) -> None:
         """Promise the station a request with each tick."""
@@ -115,6 +116,9 @@ class RunAtHand:
             self.station.judge(t, values)
         finally:
             self.take_news()
+        self._pause_reason = self.station.take_pause() or self._pause_reason
+        # Asked for here only, as a fast loop looks at it with each sample.
+        self._is_demanded = bool(self._pause_reason) or self.station.is_holding
 
     def take_news(self) -> None:
         """Record what happened at the station since the last call."""
@@ -199,12 +203,7 @@ class RunAtHand:
     @property
     def pause_requested(self) -> bool:
         """Whether the operator or an interlock has asked for a pause, or an interlock holds the set-points."""
-        return self._interrupts.pause_requested or self._held()
-
-    def _held(self) -> bool:
-        if why := self.station.take_pause():
-            self._pause_reason = why
-        return bool(self._pause_reason) or self.station.is_holding
+        return self._interrupts.pause_requested or self._is_demanded
 
     def pause_if_asked(self) -> float:
         """Pause if the operator or an interlock has asked for it; return for how long, s.
@@ -219,6 +218,7 @@ class RunAtHand:
         while self.station.is_holding:
             self.sleep_until(self.clock.now() + self.period)
             self.tick()
+        self._is_demanded = False
         if self._interrupts.pause_requested or self._pause_reason:
             self._pause()
         return self.clock.now() - since

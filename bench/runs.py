@@ -76,6 +76,9 @@ class Run:
         Whether to write the .rrd beside the journal while the run goes on.
     attach : Path, optional
         Endpoints file of `bench emulate`: the emulated laboratory is served there, on its own clock and seed.
+    interlock_rate : float, optional
+        Looks at the interlocks of an emulated rig in a laboratory second, Hz, beside each reading and tick; on
+        hardware the rig file says it, `[safety] rate`.
     faults : Path, optional
         Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
     """
@@ -90,6 +93,7 @@ class Run:
     live: bool = False
     recording: bool = True
     attach: Path | None = None
+    interlock_rate: float | None = None
     faults: Path | None = None
 
 
@@ -156,7 +160,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         if run.attach is None and rig_file.in_process:
             rig = Rig(rig_file, clock, run.seed)
             laboratory: object = rig.laboratory
-            station: Station = LocalStation(rig)
+            station: Station = LocalStation(rig, run.interlock_rate)
         else:
             doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
             guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
@@ -282,6 +286,7 @@ def _metadata(
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
         "seed": run.seed,
+        "interlock_rate": run.interlock_rate if file.in_process and run.attach is None else file.safety.rate,
         "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
         "epoch": clock.epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in station.description.devices.items()},

@@ -3,6 +3,7 @@
 import json
 import os
 import select
+import shutil
 import subprocess
 import threading
 from contextlib import contextmanager
@@ -11,8 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import main
-from bench.compilation_display import MESSAGE
+# Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
+# wait for one another, and a product of small matrices takes ten times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A journal is flushed to the disk at each step: in memory that takes no time. A container may have too little of it.
+_MEMORY = Path("/dev/shm")
+if _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free > 4e9:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
 
 
 @pytest.hookimpl(trylast=True)
@@ -83,6 +91,8 @@ def bench(capsys):
 
     Without the line of a first use, which depends on what ran before on this machine.
     """
+    from bench.cli import main
+    from bench.compilation_display import MESSAGE
 
     def run(*arguments):
         with pytest.raises(SystemExit) as stopped:

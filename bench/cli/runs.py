@@ -136,6 +136,16 @@ def run(
             "docs/reference/emulate.md lists them.",
         ),
     ] = None,
+    interlock_rate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            min=0.01,
+            max=50.0,
+            help="Look at the interlocks of an emulated rig so often in a laboratory second, beside each reading; on "
+            "hardware the rig file says it ([safety] rate, 5 Hz).",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
@@ -182,6 +192,7 @@ def run(
         folder=out,
         live=live,
         attach=attach,
+        interlock_rate=interlock_rate,
         faults=faults,
     )
     # Until the result is printed: a terminal that hangs must not keep the process from being ended.

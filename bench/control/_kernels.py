@@ -72,9 +72,9 @@ def adapt(
     if not np.isnan(before):
         starts = np.empty(2, np.int64)
         none = np.empty(0, np.int32), np.empty(0)
-        count = _swept_differences(here, axis, start, starts, none, False)
+        count = _swept_differences(here, axis, start, starts, none)
         cells, changes = np.empty(count, np.int32), np.empty(count)
-        _swept_differences(here, axis, start, starts, (cells, changes), True)
+        _swept_differences(here, axis, start, starts, (cells, changes))
         areas = np.empty(count)
         on = np.zeros(density.size)
         predicted = _reversible_value(terms, value) - _reversible_value(terms, raw)

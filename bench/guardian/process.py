@@ -365,9 +365,8 @@ class Guardian:
     def _look_readers(self) -> dict[str, Callable[[], dict[str, float]]]:
         """Return what is asked at each look: what interlocks need, and what feeds the watchdogs of instruments."""
         readers = self._rig.readers(Look.PART, self._watched)
-        for name, device in self._rig.devices.items():
-            if device.watchdog:
-                readers.setdefault(name, device.glance)
+        for name, device in self._rig.actuators.items():
+            readers.setdefault(name, device.glance)
         return {name: readers[name] for name in self._rig.devices if name in readers}
 
     def _signals_of(self, name: str) -> frozenset[str]:

@@ -37,8 +37,8 @@ _ANSWER = 15.0
 _END = 5.0
 """Longest wait for the safe state of all devices, s."""
 
-_ABORT = 2.0
-"""Time that an answer may take once the run has to end, s."""
+_ABORT = 1.0
+"""Time that an answer may take once the run has to end, s; shorter than that after which the process is left."""
 
 _SLICE = 0.2
 """Longest single wait, s, so that a signal to the process is noticed soon."""

@@ -348,16 +348,19 @@ def _span(axis: Axis, low: float, high: float) -> tuple[int, int]:
 
 @njit(cache=True)
 def _rectangle(
-    axis: Axis, b0: float, b1: float, a0: float, a1: float, factor: float, entries: Entries, end: int, write: bool
+    axis: Axis, b0: float, b1: float, a0: float, a1: float, factor: float, entries: Entries, end: int
 ) -> int:
-    """Append factor * overlap with [b0, b1] x [a0, a1] (above the diagonal) for each cell touched."""
+    """Append factor * overlap with [b0, b1] x [a0, a1] (above the diagonal) for each cell touched.
+
+    Without room for any entry they are only counted.
+    """
     levels, _ = axis
     cells, changes = entries
     if b1 <= b0 or a1 <= a0:
         return end
     j0, j1 = _span(axis, b0, b1)
     i0, i1 = _span(axis, a0, a1)
-    if not write:
+    if cells.size == 0:
         return end + (i1 - i0 + 1) * (j1 - j0 + 1)
     for i in range(i0, i1 + 1):
         y = factor * (min(a1, levels[i + 1]) - max(a0, levels[i]))
@@ -370,14 +373,14 @@ def _rectangle(
 
 
 @njit(cache=True)
-def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entries, end: int, write: bool) -> int:
-    """Append factor * overlap with {low <= β <= α <= high} for each cell touched."""
+def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entries, end: int) -> int:
+    """Append factor * overlap with {low <= β <= α <= high} for each cell touched, or count them as `_rectangle`."""
     levels, _ = axis
     cells, changes = entries
     if high <= low:
         return end
     i0, i1 = _span(axis, low, high)
-    if not write:
+    if cells.size == 0:
         count = i1 - i0 + 1
         return end + count * (count + 1) // 2
     for i in range(i0, i1 + 1):
@@ -394,21 +397,26 @@ def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entri
 
 
 @njit(cache=True)
-def swept_areas(axis: Axis, start: Start, entries: Entries, write: bool) -> int:
-    """List twice the on-area of each cell that the staircase touches; return the number of entries."""
+def swept_areas(axis: Axis, start: Start, entries: Entries) -> int:
+    """List twice the on-area of each cell that the staircase touches; return the number of entries.
+
+    Without room for any entry they are only counted.
+    """
     left, height, u = start
-    end = _triangle(axis, axis[0][0], u, 2.0, entries, 0, write)
+    # Not 0: for a literal numba would compile once more.
+    end = _triangle(axis, axis[0][0], u, 2.0, entries, int(0.0))
     for p in range(left.size):
         right = left[p + 1] if p + 1 < left.size else u
-        end = _rectangle(axis, left[p], right, u, height[p], 2.0, entries, end, write)
+        end = _rectangle(axis, left[p], right, u, height[p], 2.0, entries, end)
     return end
 
 
 @njit(cache=True)
-def swept_differences(
-    inputs: Floats, axis: Axis, start: Start, starts: Integers, entries: Entries, write: bool
-) -> int:
-    """List, sample by sample, the change of 2 * on-area of the cells that the input swept."""
+def swept_differences(inputs: Floats, axis: Axis, start: Start, starts: Integers, entries: Entries) -> int:
+    """List, sample by sample, the change of 2 * on-area of the cells that the input swept.
+
+    Without room for any entry they are only counted.
+    """
     left0, height0, present = start
     left = np.empty(inputs.size + left0.size + 1)
     height = np.empty(inputs.size + left0.size + 1)
@@ -417,7 +425,7 @@ def swept_differences(
         left[p] = left0[p]
         height[p] = height0[p]
     low, high = axis[0][0], axis[0][-1]
-    end = 0
+    end = int(0.0)
     for t in range(inputs.size):
         starts[t] = end
         u = min(max(inputs[t], low), high)
@@ -427,9 +435,9 @@ def swept_differences(
             while n > 0 and height[n - 1] <= u:
                 n -= 1
                 edge = left[n]
-                end = _rectangle(axis, edge, right, height[n], u, 2.0, entries, end, write)
+                end = _rectangle(axis, edge, right, height[n], u, 2.0, entries, end)
                 right = edge
-            end = _triangle(axis, present, u, 2.0, entries, end, write)
+            end = _triangle(axis, present, u, 2.0, entries, end)
             left[n] = edge
             height[n] = u
             n += 1
@@ -438,10 +446,10 @@ def swept_differences(
             p = n - 1
             while p >= 0 and right > u:
                 edge = max(left[p], u)
-                end = _rectangle(axis, edge, right, present, height[p], -2.0, entries, end, write)
+                end = _rectangle(axis, edge, right, present, height[p], -2.0, entries, end)
                 right = edge
                 p -= 1
-            end = _triangle(axis, u, present, -2.0, entries, end, write)
+            end = _triangle(axis, u, present, -2.0, entries, end)
             while n > 0 and left[n - 1] >= u:
                 n -= 1
         present = u

@@ -285,9 +285,9 @@ class Preisach(Operator[MemoryCurve]):
         axis, start = (t.levels, t.inverse_step), self._pieces(state)
 
         def listed(sweep: Callable[..., int], *arguments: object) -> tuple[NDArray[np.int32], Floats]:
-            count = sweep(*arguments, (np.empty(0, dtype=np.int32), np.empty(0)), False)
+            count = sweep(*arguments, (np.empty(0, dtype=np.int32), np.empty(0)))
             entries = np.empty(count, dtype=np.int32), np.empty(count)
-            sweep(*arguments, entries, True)
+            sweep(*arguments, entries)
             return entries
 
         base = np.bincount(*listed(_kernels.swept_areas, axis, start), minlength=self.density.size)

@@ -71,7 +71,8 @@ class Regressor:
         result = self.extra @ weights[count:]
         if count:
             result += self.base @ weights[:count]
-            result += _kernels.difference_product(self.starts, self.cells, self.changes, weights[:count])
+            # A copy: for weights that are read-only numba would compile once more.
+            result += _kernels.difference_product(self.starts, self.cells, self.changes, weights[:count].copy())
         return result
 
     def dense(self) -> Floats:

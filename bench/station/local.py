@@ -48,7 +48,7 @@ class LocalStation(Station):
         self._statuses: list[Status] = []
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
-        self._lost = 0
+        self._lost: set[str] = set()
 
     @property
     def has_operator(self) -> bool:
@@ -72,12 +72,19 @@ class LocalStation(Station):
     def look(self, look: Look, wanted: Collection[str] = ()) -> dict[str, float]:
         """Read the devices; values by signal name."""
         readers = self._rig.readers(look, wanted)
+        lost: set[str] = set()
         for _ in range(_TRIES):
-            lost = self._lost
-            values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+            self._lost.clear()
+            try:
+                values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
+            except DeviceError as error:
+                if others := (lost | self._lost) - {error.device}:
+                    raise _blamed(error, others) from error
+                raise
             # What other devices gave before a line was back is too old to stand beside it.
-            if self._lost == lost:
+            if not self._lost:
                 break
+            lost |= self._lost
         return values
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
@@ -214,13 +221,14 @@ class LocalStation(Station):
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
         longest = self._rig.file.safety.reconnect
         seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
-        self._lost += 1
+        self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
 
     def _feed_others(self, name: str) -> bool:
         """Keep the watchdogs of other instruments from expiring; return False, as the run has not ended."""
-        for other, device in self._rig.devices.items():
-            if other != name and device.watchdog:
+        for other, device in self._rig.actuators.items():
+            # That of a servo only stops a motion, so it declares none.
+            if other != name:
                 # What is wrong with it the next reading finds.
                 with suppress(DeviceError):
                     device.glance()
@@ -233,3 +241,9 @@ class LocalStation(Station):
     def _raise_if_tripped(self) -> None:
         if self._core.cause is not None:
             raise self._core.cause
+
+
+def _blamed(error: DeviceError, lost: Collection[str]) -> DeviceError:
+    """Return an error that also names the devices that were out of reach, which may be the cause of it."""
+    text = str(error).removeprefix(f"{error.device}: ")
+    return type(error)(error.device, f"{text} ({', '.join(sorted(lost))} had been out of reach just before)")

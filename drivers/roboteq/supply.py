@@ -261,6 +261,11 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def _check_unchanged(self) -> None:
         if self._process_data is not None and not self._process_data.is_marked(self._line):
             raise self._found_restarted()
+        # A node that answers but sends no heartbeat is not as it was left.
+        opened = self._line.heartbeat_age()
+        self._line.await_heartbeat(self._settings.heartbeat)
+        if self._line.heartbeat_age() >= opened + self._settings.heartbeat:
+            raise self._no_heartbeat()
         self.glance()
 
     def _make_safe(self) -> None:
@@ -505,14 +510,16 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         if self._line.heartbeat_age() > self._settings.heartbeat:
             # After a loss of the line the next one is under way.
             self._line.await_heartbeat(_HEARTBEAT_SHARE * self._settings.heartbeat)
-        age = self._line.heartbeat_age()
-        if age > self._settings.heartbeat:
-            raise DeviceConnectionError(
-                self.name,
-                f"no heartbeat of node {self._settings.node} for {age:.3g} s, {self._settings.heartbeat:g} s are "
-                "allowed; check the bus and the heartbeat of the controller (^CHB)",
-            )
+        if self._line.heartbeat_age() > self._settings.heartbeat:
+            raise self._no_heartbeat()
         return report
+
+    def _no_heartbeat(self) -> DeviceConnectionError:
+        return DeviceConnectionError(
+            self.name,
+            f"no heartbeat of node {self._settings.node} for {self._line.heartbeat_age():.3g} s, "
+            f"{self._settings.heartbeat:g} s are allowed; check the bus and the heartbeat of the controller (^CHB)",
+        )
 
     def _by_process_data(self, process_data: ProcessData) -> Report:
         try:

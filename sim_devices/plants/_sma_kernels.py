@@ -26,6 +26,14 @@ STATE_SIZE = 6
 AUSTENITE, WIDTH, SLOPE, DETWIN, ORIENT, RETWIN = range(6)
 GRAIN_ROWS = 6
 
+# Quiet surroundings of a temperature and a stress, see `look_around`: the middle (°C, MPa), how far the temperature
+# (K, by which stress counts at the smallest slope) and the stress (MPa) may move, and that slope (MPa/K).
+MIDDLE_TEMPERATURE, MIDDLE_STRESS, KELVIN, MEGAPASCAL, LEAST_SLOPE = range(5)
+QUIET_SIZE = 5
+
+# Kept free of what quiet surroundings allow (K, MPa) and of an imposed position (mm): far more than rounding.
+GUARD = 1e-9
+
 # Halvings of the stress interval: 600 MPa come down to 3.5e-8 MPa, a nanonewton of force.
 HALVINGS = 34
 FIRST_HALVINGS = 5
@@ -46,6 +54,8 @@ class Parts(NamedTuple):
     """Committed grain states."""
     scratch: Floats
     """Two rows of stresses, MPa."""
+    quiet: Floats
+    """Quiet surroundings of the committed grain states; none while KELVIN and MEGAPASCAL are 0."""
 
 
 @njit(cache=True)
@@ -82,6 +92,44 @@ def update_grains(
 
 
 @njit(cache=True)
+def look_around(temperature: float, stress: float, parts: Parts) -> None:
+    """Find how far temperature and stress may move until the first of the committed grains switches."""
+    _, c, grains, martensite, oriented, _, quiet = parts
+    kelvin = math.inf
+    megapascal = math.inf
+    least_slope = math.inf
+    for g in range(martensite.size):
+        slope = grains[SLOPE, g]
+        least_slope = min(least_slope, slope)
+        above_cold = temperature - stress / slope - (grains[AUSTENITE, g] - grains[WIDTH, g])
+        if martensite[g]:
+            if oriented[g]:
+                share = 1.0
+                megapascal = min(megapascal, stress - grains[RETWIN, g])
+            else:
+                share = c[0].unoriented_share
+                megapascal = min(megapascal, grains[DETWIN, g] - stress)
+            # The grain stays as long as it is not hot, or is cold.
+            below_hot = grains[AUSTENITE, g] - (temperature - share * stress / slope)
+            kelvin = min(kelvin, max(below_hot, -above_cold))
+        else:
+            kelvin = min(kelvin, above_cold)
+    quiet[MIDDLE_TEMPERATURE] = temperature
+    quiet[MIDDLE_STRESS] = stress
+    quiet[KELVIN] = kelvin - GUARD
+    quiet[MEGAPASCAL] = megapascal - GUARD
+    quiet[LEAST_SLOPE] = least_slope
+
+
+@njit(cache=True)
+def quiet_stress(temperature: float, quiet: Floats) -> float:
+    """How far the stress may be from the middle of the quiet surroundings at a temperature, MPa; 0 if not at all."""
+    kelvin = quiet[KELVIN] - abs(temperature - quiet[MIDDLE_TEMPERATURE])
+    megapascal: float = max(min(quiet[MEGAPASCAL], kelvin * quiet[LEAST_SLOPE]), 0.0)
+    return megapascal
+
+
+@njit(cache=True)
 def wire_length(
     temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
 ) -> float:
@@ -108,7 +156,7 @@ def end_position(
 @njit(cache=True)
 def switching_stresses(temperature: float, parts: Parts) -> None:
     """Write the stresses above which each grain will be martensite, and oriented, to the rows of `scratch`."""
-    _, c, grains, martensite, oriented, scratch = parts
+    _, c, grains, martensite, oriented, scratch, _ = parts
     for g in range(martensite.size):
         cold = (temperature - grains[AUSTENITE, g] + grains[WIDTH, g]) * grains[SLOPE, g]
         hot = (temperature - grains[AUSTENITE, g]) * grains[SLOPE, g]
@@ -126,6 +174,37 @@ def switching_stresses(temperature: float, parts: Parts) -> None:
 
 
 @njit(cache=True)
+def solve_quietly(position: float, temperature: float, committed: float, parts: Parts) -> float:
+    """Return what `solve_stress` would if that lies where no grain switches, otherwise -1."""
+    state, c, quiet = parts.state, parts.c, parts.quiet
+    count = parts.martensite.size
+    martensites = state[MARTENSITE]
+    orienteds = state[ORIENTED]
+    limit = float(c[0].stress_limit)
+    reach = quiet_stress(temperature, quiet)
+    first = max(quiet[MIDDLE_STRESS] - reach, 0.0)
+    last = min(quiet[MIDDLE_STRESS] + reach, limit)
+    if (
+        reach == 0.0
+        or end_position(temperature, first, martensites, orienteds, count, c) > position - GUARD
+        or end_position(temperature, last, martensites, orienteds, count, c) < position + GUARD
+    ):
+        return -1.0
+    low = 0.0
+    high = limit
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        # Beyond the ends the wire is shorter, or longer, than imposed: a trial length never falls with stress.
+        if middle <= first or (
+            middle < last and end_position(temperature, middle, martensites, orienteds, count, c) <= position
+        ):
+            low = middle
+        else:
+            high = middle
+    return low if low >= committed else high
+
+
+@njit(cache=True)
 def solve_stress(position: float, temperature: float, committed: float, parts: Parts) -> float:
     """Find the stress at which the wire is as long as imposed, by bisection on trials from the committed state.
 
@@ -134,12 +213,16 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
     The trial length is non-decreasing in stress with a jump where a grain switches. Of the last
     interval the end next to the committed stress is taken, so that a grain whose switch alone would
     overshoot the imposed length waits. Grains that the interval has left behind need not be looked at
-    again, so the whole bisection costs little more than one trial.
+    again, so the whole bisection costs little more than one trial. Where no grain switches at all, none is looked at.
     """
+    quietly = solve_quietly(position, temperature, committed, parts)
+    if quietly >= 0.0:
+        return quietly
     c, scratch = parts.c, parts.scratch
     count = parts.martensite.size
     limit = float(c[0].stress_limit)
-    below = np.zeros(2, dtype=np.int64)
+    # As floats: the counts of the state are, and the lengths are compiled once.
+    below = np.zeros(2)
     inside = np.zeros(2, dtype=np.int64)
     low = 0.0
     high = limit
@@ -208,10 +291,18 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
 @njit(cache=True)
 def commit(temperature: float, stress: float, parts: Parts) -> None:
     """Take over temperature and stress and bring the grains there."""
-    state, c, grains, martensite, oriented, _ = parts
-    martensites, orienteds = update_grains(temperature, stress, c[0].unoriented_share, grains, martensite, oriented)
+    state, c, grains, martensite, oriented, _, quiet = parts
     state[TEMPERATURE] = temperature
     state[STRESS] = stress
+    if abs(stress - quiet[MIDDLE_STRESS]) < quiet_stress(temperature, quiet):
+        return
+    martensites, orienteds = update_grains(temperature, stress, c[0].unoriented_share, grains, martensite, oriented)
+    if martensites == state[MARTENSITE] and orienteds == state[ORIENTED]:
+        # Probably at rest: grains mostly come one way.
+        look_around(temperature, stress, parts)
+    else:
+        quiet[KELVIN] = 0.0
+        quiet[MEGAPASCAL] = 0.0
     state[MARTENSITE] = martensites
     state[ORIENTED] = orienteds
 

@@ -195,7 +195,8 @@ def settle(clamped: bool, target: float, parts: Parts) -> None:
         if force < 0.0 or force > c.force_limit:
             # Slack, or stretched further than can be.
             force = 0.0 if force < 0.0 else c.force_limit
-            length = solve_length(False, force, parts)
+            # Not False: for a literal numba would compile once more.
+            length = solve_length(bool(0.0), force, parts)
     yielding = backbone(length, law)[2]
     moved = length - state.length
     freed = law.free - state.freed
@@ -238,7 +239,7 @@ def load_to(load: float, parts: Parts) -> None:
     steps = math.ceil(abs(load - begin) / c.force_step)
     for k in range(1, steps + 1):
         law_at(state.drive, c, law)
-        carry(False, begin + (load - begin) * k / steps, 0.0, parts)
+        carry(bool(0.0), begin + (load - begin) * k / steps, 0.0, parts)
     # A slack end comes back to the muscle without any change of force.
     state.force = load
     state.position = state.length - c.rest + load * c.series_compliance
@@ -252,7 +253,7 @@ def stretch_to(position: float, parts: Parts) -> None:
     steps = math.ceil(abs(position - begin) / c.length_step)
     for k in range(1, steps + 1):
         law_at(state.drive, c, law)
-        carry(True, begin + (position - begin) * k / steps, 0.0, parts)
+        carry(bool(1.0), begin + (position - begin) * k / steps, 0.0, parts)
     state.position = position
 
 

@@ -178,6 +178,7 @@ class SMAWire(Muscle[SMAParameters]):
             np.zeros(parameters.grain_count, dtype=np.bool_),
             np.zeros(parameters.grain_count, dtype=np.bool_),
             np.empty((2, parameters.grain_count)),
+            np.zeros(kernels.QUIET_SIZE),
         )
         self._condition()
 

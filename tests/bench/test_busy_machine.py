@@ -88,8 +88,8 @@ class TestBusyMachine:
         assert [text.count(MESSAGE) for text in (first, second)] == [1, 0]
 
     def test_a_scaled_clock_slows_down_and_says_so(self, tmp_path):
-        with busy(2):
-            folder, out, _ = run("vo2", "x100000", tmp_path / "runs")
+        # The laboratory's hundreds of seconds in some milliseconds: no machine keeps up.
+        folder, out, _ = run("vo2", "x100000", tmp_path / "runs")
         assert "clock: x100000 asked for, x" in out.replace("1e+05", "100000")
         with Record(folder) as record:
             (event,) = (event for event in record.events() if event.kind == "clock")
@@ -97,11 +97,12 @@ class TestBusyMachine:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rig", ["vo2", "sma", "mckibben", "coiled-polymer", "hybrid"])
-def test_an_open_laboratory_has_compiled_its_loops(rig):
+@pytest.mark.parametrize("rigs", ["vo2 sma mckibben", "coiled-polymer hybrid"])
+def test_an_open_laboratory_has_compiled_its_loops(rigs):
     """Otherwise a driver would wait for an answer while its instrument compiles.
 
-    Each kernel has its versions, compiled or from the cache, when the laboratory is open; using it adds none.
+    Each kernel has its versions, compiled or from the cache, when the laboratory is open; using it adds none. The two
+    muscles that share their kernels are opened in processes of their own.
     """
     script = f"""
 import gc
@@ -112,17 +113,18 @@ def versions():
     kernels = [each for each in gc.get_objects() if isinstance(each, CPUDispatcher)]
     return {{str(each.py_func): len(each.overloads) for each in kernels if each.overloads}}
 
-with bench.open_rig({rig!r}) as rig:
-    compiled = versions()
-    assert compiled
-    for actuator in rig.actuators.values():
-        limits = actuator.limits
-        actuator.set(limits.high if limits.high == 1.0 else limits.low + 0.6 * (limits.high - limits.low))
-    for _ in range(5):
-        rig.clock.sleep(0.5)
-        rig.glance()
-    rig.measure()
-    assert versions() == compiled, set(versions().items()) - set(compiled.items())
+for name in {rigs!r}.split():
+    with bench.open_rig(name) as rig:
+        compiled = versions()
+        assert compiled
+        for actuator in rig.actuators.values():
+            limits = actuator.limits
+            actuator.set(limits.high if limits.high == 1.0 else limits.low + 0.6 * (limits.high - limits.low))
+        for _ in range(5):
+            rig.clock.sleep(0.5)
+            rig.glance()
+        rig.measure()
+        assert versions() == compiled, set(versions().items()) - set(compiled.items())
 print("done")
 """
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=280, check=False)

@@ -375,6 +375,24 @@ class TestFaults:
         with b.record() as run:
             assert (run.status, run.meta["safe_state"]) == ("aborted", {"tec": "safe", "probe": "safe"})
 
+    @pytest.mark.parametrize("how", ["removed", "replaced"])
+    def test_a_journal_that_is_gone_ends_the_run(self, bench, how):
+        b = bench()
+        path = b.folder / FILE_NAME
+
+        def go(parameters):
+            reading = yield Step({"tec": 30.0}, Dwell(1.0))
+            if reading.values:
+                path.unlink()
+                if how == "replaced":
+                    path.write_text("another file")
+            yield Step({"tec": 40.0}, Dwell(1.0))
+
+        outcome = b.run(define(go))
+        assert outcome.status == "failed"
+        assert f"{path} was {how} while the run went on" in outcome.reason
+        b.assert_safe()
+
     def test_a_protocol_that_raises(self, bench):
         def go(parameters):
             yield Step({"tec": 30.0}, Dwell(1.0))

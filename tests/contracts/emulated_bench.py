@@ -54,6 +54,12 @@ class RecordingServer(WireServer):
         self.requests.append(data)
         return self.server.receive(data)
 
+    def unsolicited(self):
+        return self.server.unsolicited()
+
+    def next_unsolicited(self):
+        return self.server.next_unsolicited()
+
 
 def serial_port(stack, server, clock):
     """Put a server at a port of its own until the stack is closed; return the port and the list of its requests."""

@@ -69,6 +69,12 @@ class LosingServer(WireServer):
             return b"z\r"
         return self.server.receive(data)
 
+    def unsolicited(self):
+        return self.server.unsolicited()
+
+    def next_unsolicited(self):
+        return self.server.next_unsolicited()
+
 
 class RecordingT7(EmulatedT7):
     """A T7 that keeps what was written to it."""

@@ -11,6 +11,16 @@ import pytest
 EXAMPLE = Path(__file__).parents[2] / "examples" / "magnetostrictive_rod"
 RIG = ("--rig", "magnetostrictive-rod")
 BENCH = ("-m", "bench")
+TRY_EACH = """
+import json, sys
+from bench.cli import main
+for command in map(json.loads, sys.argv[1:]):
+    try:
+        main(command)
+    except SystemExit as stopped:
+        print("exit code", stopped.code or 0)
+"""
+"""Several commands, each as a JSON array, in one process: most of the time of one is that of starting it."""
 
 
 @pytest.fixture(scope="module")
@@ -35,22 +45,25 @@ def python(tmp_path_factory, finished_process):
 def characterized(python, tmp_path_factory):
     """Return a folder with a characterization, and the models that were identified from it."""
     folder = tmp_path_factory.mktemp("work")
-    summary = folder / "run.json"
     python(
         *BENCH, "run", "damped-oscillation", *RIG, "--clock", "virtual", "--set", "half_cycles=16",
-        "--out", folder, "--json", summary,
+        "--out", folder, "--json", folder / "run.json",
     )  # fmt: skip
-    run = json.loads(summary.read_text())["folder"]
-    for model, options in (("quadratic-play", ()), ("preisach-signed", ("--plane", "-2.4", "2.4"))):
-        python(
-            *BENCH, "identify", run, "--input", "coil_current", "--output", "strain", "--model", model, *options,
-            "--out", folder / f"{model}.json", "--json", folder / f"{model}-fit.json",
-        )  # fmt: skip
+    run = json.loads((folder / "run.json").read_text())["folder"]
+    commands = [
+        [
+            *("identify", run, "--input", "coil_current", "--output", "strain", "--model", model, *options),
+            *("--out", f"{folder / model}.json", "--json", f"{folder / model}-fit.json"),
+        ]
+        for model, options in (("quadratic-play", ()), ("preisach-signed", ("--plane", "-2.4", "2.4")))
+    ]
+    assert python("-c", TRY_EACH, *map(json.dumps, commands)).count("exit code 0") == 2
     return folder, run
 
 
 def test_the_list_names_its_parts_and_its_package(python, tmp_path):
-    shown = python(*BENCH, "list", "--json", tmp_path / "list.json")
+    commands = [["list", "--json", str(tmp_path / "list.json")], ["list", "magnetostrictive-rod-hardware"]]
+    shown, extended, _ = python("-c", TRY_EACH, *map(json.dumps, commands)).split("exit code 0\n")
     listed = json.loads((tmp_path / "list.json").read_text())
     assert "magnetostrictive-rod" in listed["rigs"]
     assert "butterfly-loop" in listed["protocols"]
@@ -58,7 +71,6 @@ def test_the_list_names_its_parts_and_its_package(python, tmp_path):
     for part in ("magnetostrictive-rod", "magnetostrictive-rod-hardware", "butterfly-loop", "quadratic-play"):
         following = shown.split(f"  {part}  ", 1)[1]
         assert "[magnetostrictive-rod]" in following[:300], part
-    extended = python(*BENCH, "list", "magnetostrictive-rod-hardware")
     assert 'extends = "magnetostrictive-rod"' in extended
 
 
@@ -153,23 +165,14 @@ WRONG = {
 }  # fmt: skip
 """Wrong keys of a rig file, and what the message has to say."""
 
-TRY_EACH = """
-import sys
-from bench.cli import main
-for rig in sys.argv[1:]:
-    try:
-        main(["run", "butterfly-loop", "--rig", rig, "--out", "runs"])
-    except SystemExit as stopped:
-        print(stopped.code)
-"""
-
 
 def test_a_wrong_rig_file_is_one_message_before_anything_moves(python, tmp_path):
     rigs = [tmp_path / f"wrong-{i}.toml" for i in range(len(WRONG))]
     for rig, change in zip(rigs, WRONG, strict=True):
         rig.write_text(f'extends = "magnetostrictive-rod"\n{change}\n')
-    codes, errors = python("-c", TRY_EACH, *rigs, cwd=tmp_path, both=True)
-    assert codes.split() == ["2"] * len(WRONG)
+    commands = [json.dumps(["run", "butterfly-loop", "--rig", str(rig), "--out", "runs"]) for rig in rigs]
+    codes, errors = python("-c", TRY_EACH, *commands, cwd=tmp_path, both=True)
+    assert codes.splitlines() == ["exit code 2"] * len(WRONG)
     for rig, said, message in zip(rigs, WRONG.values(), errors.splitlines(), strict=True):
         assert message.startswith(f"error: {rig}: ")
         for part in said:

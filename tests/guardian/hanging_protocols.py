@@ -1,8 +1,9 @@
-"""Protocols that switch every output of a rig on, and then go wrong."""
+"""Protocols that switch outputs of a rig on, and then go wrong or are to be disturbed."""
 
 import ctypes
 import json
 from collections.abc import Generator
+from pathlib import Path
 
 from bench.protocol import Dwell, Messages, Note, ProtocolParameters, Step, parameter, protocol
 from bench.protocol.vocabulary import Message, Reading
@@ -10,7 +11,9 @@ from bench.protocol.vocabulary import Message, Reading
 
 class Parameters(ProtocolParameters):
     setpoints: str = parameter("{}", unit="", help="set-points by device, JSON")
+    then: str = parameter("{}", unit="", help="set-points by device, JSON, sent once everything is on")
     seconds: float = parameter(600.0, unit="s", low=0, high=86400, help="how long it holds")
+    before: float = parameter(1.0, unit="s", low=0, high=86400, help="how long it holds before it computes")
 
 
 def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading, Reading]:
@@ -18,7 +21,7 @@ def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading,
     for device, value in json.loads(parameters.setpoints).items():
         yield Step({device: value}, Dwell(0.2))
     yield Note("everything is on")
-    return (yield Step({}, Dwell(seconds)))
+    return (yield Step(json.loads(parameters.then), Dwell(seconds)))
 
 
 @protocol(needs=())
@@ -30,7 +33,7 @@ def hold(parameters: Parameters) -> Messages:
 @protocol(needs=())
 def spin(parameters: Parameters) -> Messages:
     """Compute for ever."""
-    reading = yield from _hold(parameters, 1.0)
+    reading = yield from _hold(parameters, parameters.before)
     yield Note("computing")
     # Not in the dry run, whose readings are empty.
     while reading.values:
@@ -56,3 +59,20 @@ def talk(parameters: Parameters) -> Messages:
         yield Note("x" * 1000)
         yield Note("x" * 1000)
         yield Step({}, Dwell(0.2))
+
+
+class CycleParameters(ProtocolParameters):
+    until: str = parameter("", unit="", help="file at which it ends, once it has cycled twice")
+
+
+@protocol(needs=())
+def cycle(parameters: CycleParameters) -> Messages:
+    """Heat and cool the plate of the VO2 rig, and read it at rest."""
+    cycles = 0
+    while cycles < 2 or not Path(parameters.until).exists():
+        yield Step({"tec": 30.0}, Dwell(4.0))
+        reading = yield Step({"tec": 34.0}, Dwell(4.0))
+        cycles += 1
+        # The dry run waits for no file.
+        if not reading.values:
+            return

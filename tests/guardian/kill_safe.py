@@ -1,10 +1,13 @@
-"""Kill, stop and hang a bench in every way, and read in the instruments when their outputs are off.
+"""Kill, stop and hang a bench or its guardian, and cut the lines: when every output is off, read in the instruments.
 
     python tests/guardian/kill_safe.py [--rig RIG]... [--trial NAME]... [--times N] [--busy N]
 
 prints a table: for each rig and trial, how often every output became safe within its declared time, and the median
 and longest time it took. The instruments are served by `bench emulate` in another process, and the bench runs as on
 hardware.
+
+The trials `cut` and `unplug` have rows for each instrument whose line is lost: for the outputs of the other ones, for
+its own, which its watchdog switches off, and for those that no watchdog does, once the line is mended.
 """
 
 from __future__ import annotations
@@ -15,30 +18,40 @@ import os
 import random
 import signal
 import statistics
-import subprocess
 import sys
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from bench.attachment import ControlClient
+from guarded_run import SETPOINTS, GuardedRun, outputs_on, start_busy
+
+from bench.rig_file import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
 
-PROTOCOLS = Path(__file__).with_name("hanging_protocols.py")
-
-SETPOINTS = {
-    "vo2": {"tec": 40.0},
-    "sma": {"supply": 2.0, "stage": 0.001, "fan": 1.0},
-    "hybrid": {"tec": 0.05, "piezo": 10.0},
-}
-"""Set-points that switch every output of a rig on."""
-
-DEATH, PROMISE, PATIENCE, CUT = 0.2, 5.0, 4.0, 8.0
+DEATH, PROMISE, PATIENCE = 0.2, 5.0, 4.0
 """Time within which every output has to be off, s: the bench died; it broke the promise of a hold (its period of 1 to
-2 s and 2 s), or of a computation (set to 3 s here, and 1 s for the last step); an instrument that cannot be reached
-switches itself off by its own watchdog."""
+2 s and 2 s), or of a computation (set to 3 s here, and 1 s for the last step)."""
+
+RESCUE = 6.0
+"""Time within which another process makes every device safe, s: it starts, and opens the lines."""
+
+SILENCE = 25.0
+"""Time after which the bench gives up a guardian that does not answer, s."""
+
+TICK = 2.0
+"""Longest time between two requests of a hold to the guardian, s."""
+
+LINES = {
+    "vo2": {"tec_output": "tec"},
+    "sma": {"supply_voltage": "supply", "stage_torque": "stage", "fan": "t7"},
+    "hybrid": {"tec_output": "tec", "amplifier_command": "t7", "amplifier_enable": "t7"},
+}
+"""Instrument that sets an output, by the name of the output."""
+
+NO_WATCHDOG = {"stage_torque", "amplifier_command"}
+"""Outputs that no watchdog switches off: that of the servo ends its motion, that of the T7 takes the amplifier's
+enable line down."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +68,12 @@ class Trial:
         Time within which every output has to be off, s.
     stalled : bool
         Whether nobody reads what the bench prints.
-    ends : bool
-        Whether the outputs have to go off at all.
     """
 
     protocol: str
     sent: signal.Signals | None
     within: float
     stalled: bool = False
-    ends: bool = True
 
 
 TRIALS = {
@@ -73,129 +83,159 @@ TRIALS = {
     "SIGSTOP": Trial("hold", signal.SIGSTOP, PROMISE),
     "endless loop": Trial("spin", None, PATIENCE),
     "endless loop, SIGTERM": Trial("spin", signal.SIGTERM, 3.0),
-    "interpreter kept": Trial("keep_interpreter", None, PATIENCE),
+    "interpreter kept": Trial("keep-interpreter", None, PATIENCE),
     "stalled reader": Trial("talk", signal.SIGTERM, 3.0, stalled=True),
 }
+
+GUARDIAN = {"guardian SIGKILL": signal.SIGKILL, "guardian SIGSTOP": signal.SIGSTOP}
+"""What the guardian is sent once everything is on."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What came of a trial: the time until every output was off, s, and what was wrong."""
+    """What came of a part of a trial: the time until its outputs were off and what was allowed, s; what was wrong."""
 
     seconds: float
-    problem: str
+    within: float
+    problem: str = ""
+
+    @classmethod
+    def judged(cls, seconds: float, within: float, left: Collection[str] = ()) -> Found:
+        """Return what is found if some outputs are left on, or were on for so long."""
+        if left:
+            return cls(seconds, within, f"still on after {seconds:.2f} s: {', '.join(left)}")
+        return cls(seconds, within, f"after {seconds:.2f} s" if seconds > within else "")
 
 
-def outputs(control: ControlClient) -> dict[str, float]:
-    """Return the true outputs of the instruments that are on."""
-    values = control.request("state")["values"]
-    return {name: each["value"] for name, each in values.items() if each["is_output"] and abs(each["value"]) > 1e-6}
+def started(rig: EmulatedRig, protocol: str, *, stalled: bool = False) -> GuardedRun:
+    """Start a run that switches everything on."""
+    parameters = {"setpoints": json.dumps(SETPOINTS[rig.name])}
+    return GuardedRun(rig, protocol, {"safety.patience": "3"}, parameters, stalled=stalled)
 
 
-def carry_out(rig: EmulatedRig, trial: Trial, folder: Path, wait: float) -> Found:
-    """Carry a trial out, and leave the laboratory as it was."""
-    command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{trial.protocol}", "--rig", rig.name]
-    command += ["--attach", str(rig.endpoints_file), "--out", str(folder), "--override", "safety.patience=3"]
-    command += ["--set", f"setpoints={json.dumps(SETPOINTS[rig.name])}"]
-    with ExitStack() as stack:
-        if trial.stalled:
-            reading, writing = os.pipe()
-            stack.callback(os.close, reading)
-            out: int = writing
-        else:
-            out = stack.enter_context((folder.parent / f"{folder.name}.txt").open("wb")).fileno()
-        # In a session of its own, as its own terminal's would be.
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
-        )
-        if trial.stalled:
-            os.close(writing)
-        stack.callback(_end, process)
-        on = _await_on(rig.control, process, len(SETPOINTS[rig.name]), folder)
+def watch(rig: EmulatedRig, names: Collection[str], longest: float) -> tuple[dict[str, float], set[str]]:
+    """Watch outputs until all are off; return for how long each was on (s), and those that are still on."""
+    start = time.monotonic()
+    seconds = dict.fromkeys(names, 0.0)
+    while True:
+        left = outputs_on(rig).keys() & names
+        now = time.monotonic() - start
+        seconds.update(dict.fromkeys(left, now))
+        if not left or now > longest:
+            return seconds, left
+        time.sleep(0.002)
+
+
+def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
+    """Carry a trial out on the bench."""
+    with started(rig, trial.protocol, stalled=trial.stalled) as run:
+        run.await_on(len(SETPOINTS[rig.name]))
         if trial.sent is None:
-            _await_note(folder, "computing")
-            start = time.monotonic()
+            run.await_note("computing")
         else:
             time.sleep(wait)
-            if not outputs(rig.control):
-                return Found(0.0, "the outputs were off before the trial")
-            start = time.monotonic()
-            process.send_signal(trial.sent)
-        while (left := outputs(rig.control)) and time.monotonic() - start < trial.within + 10.0:
-            time.sleep(0.002)
-        seconds = time.monotonic() - start
-        problem = "" if not left else f"still on: {', '.join(left)}"
-        if seconds > trial.within and not problem:
-            problem = f"after {seconds:.2f} s, {trial.within:g} s are allowed"
+            if not outputs_on(rig):
+                return {"": Found(0.0, trial.within, "the outputs were off before the trial")}
+            run.process.send_signal(trial.sent)
+        seconds, left = watch(rig, LINES[rig.name], trial.within + 10.0)
+        found = Found.judged(max(seconds.values()), trial.within, left)
+        problem = found.problem
         if trial.sent is signal.SIGSTOP:
-            process.send_signal(signal.SIGCONT)
-            if process.wait(60) != 7:
-                problem = problem or f"exit code {process.returncode} after SIGCONT"
-            if outputs(rig.control):
+            run.process.send_signal(signal.SIGCONT)
+            if run.process.wait(60) != 7:
+                problem = problem or f"exit code {run.process.returncode} after SIGCONT"
+            if outputs_on(rig):
                 problem = "switched on again after SIGCONT"
-        elif trial.sent not in (None, signal.SIGKILL) and process.wait(60) != 130:
-            problem = problem or f"exit code {process.returncode}"
-        del on
-    _await_free(rig.control)
-    return Found(seconds, problem)
+        elif trial.sent not in (None, signal.SIGKILL) and run.process.wait(60) != 130:
+            problem = problem or f"exit code {run.process.returncode}"
+        return {"": Found(found.seconds, found.within, problem)}
 
 
-def _await_on(control: ControlClient, process: subprocess.Popen[bytes], count: int, folder: Path) -> dict[str, float]:
-    since = time.monotonic()
-    while len(found := outputs(control)) < count:
-        if process.poll() is not None or time.monotonic() - since > 120:
-            said = (folder.parent / f"{folder.name}.txt").read_text()[-500:]
-            raise AssertionError(f"the outputs did not all go on: {found}, exit code {process.poll()}: {said}")
-        time.sleep(0.01)
-    _await_note(folder, "everything is on")
+def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[str, Found]:
+    """Kill or stop the guardian: the bench makes the devices safe by another process, and ends with exit code 7."""
+    within = TICK + RESCUE + (SILENCE if sent is signal.SIGSTOP else 0.0)
+    with started(rig, "hold") as run:
+        run.await_on(len(SETPOINTS[rig.name]))
+        time.sleep(wait)
+        os.kill(run.guardian, sent)
+        seconds, left = watch(rig, LINES[rig.name], within + 10.0)
+        found = Found.judged(max(seconds.values()), within, left)
+        problem = found.problem
+        if run.process.wait(60) != 7:
+            problem = problem or f"exit code {run.process.returncode}: {run.said[-300:]}"
+        if not run.has_freed_lines():
+            problem = problem or "the guardian is still there"
+        found = Found(found.seconds, within, problem)
+    restart(rig)
+    return {"": found}
+
+
+def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wait: float) -> dict[str, Found]:
+    """Lose the line of an instrument."""
+    file = load_rig(rig.name, {})
+    devices = rig.instruments[instrument].devices
+    watchdogs = [
+        watchdog
+        for each in file.devices
+        if each.name in devices and (watchdog := getattr(each.settings, "watchdog", 0))
+    ]
+    reconnect = min([file.safety.reconnect, *(0.6 * watchdog for watchdog in watchdogs)])
+    lines = LINES[rig.name]
+    own = {name for name, line in lines.items() if line == instrument}
+    # What belongs to whom, and the time that it has.
+    parts: dict[str, tuple[set[str], float]] = {}
+    if lines.keys() - own:
+        parts["others"] = lines.keys() - own, reconnect + 3.0
+    if own - NO_WATCHDOG:
+        parts["its own"] = own - NO_WATCHDOG, max(watchdogs) + 1.0
+    found: dict[str, Found] = {}
+    with started(rig, "hold") as run:
+        run.await_on(len(SETPOINTS[rig.name]))
+        time.sleep(wait)
+        lose(instrument)
+        waited = {name for names, _ in parts.values() for name in names}
+        seconds, left = watch(rig, waited, max([20.0, *(within + 10.0 for _, within in parts.values())]))
+        for title, (names, within) in parts.items():
+            found[title] = Found.judged(max(seconds[name] for name in names), within, names & left)
+        code = run.process.wait(60)
+        said = run.said
+        problem = ""
+        if code == 0 or not any(name in said for name in devices):
+            problem = f"exit code {code}, and no device of {instrument} is named: {said[-300:]}"
+        rig.control.plug_in(instrument)
+        seconds, left = watch(rig, own, 13.0)
+        mended = Found.judged(max(seconds.values(), default=0.0), 3.0, left)
+        if not run.has_freed_lines():
+            problem = problem or "the guardian is still there"
+        found["mended"] = Found(mended.seconds, mended.within, mended.problem or problem)
+    restart(rig)
     return found
 
 
-def _await_note(folder: Path, text: str) -> None:
-    """Wait until the newest run of a folder has recorded a note."""
-    import sqlite3
-
-    since = time.monotonic()
-    while time.monotonic() - since < 120:
-        runs = sorted(folder.iterdir(), key=lambda each: each.stat().st_mtime)
-        with suppress(sqlite3.Error, IndexError):
-            db = sqlite3.connect(f"file:{runs[-1] / 'journal.sqlite'}?mode=ro", uri=True)
-            found = db.execute("SELECT count(*) FROM events WHERE text = ?", (text,)).fetchone()[0]
-            db.close()
-            if found:
-                return
-        time.sleep(0.02)
-    raise AssertionError(f"{text!r} was never recorded")
+def restart(rig: EmulatedRig) -> None:
+    """Switch every instrument off and on: a watchdog that has expired keeps its output off until then."""
+    for name, instrument in rig.instruments.items():
+        if instrument.devices:
+            rig.control.power_cycle(name)
 
 
-def _await_free(control: ControlClient) -> None:
-    """Wait until the guardian has left the lines."""
-    del control
-    since = time.monotonic()
-    while time.monotonic() - since < 30 and _guardians():
-        time.sleep(0.02)
-
-
-def _guardians() -> list[int]:
-    found = []
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError):
-            if entry.name.isdigit() and b"bench.guardian" in (entry / "cmdline").read_bytes():
-                found.append(int(entry.name))
-    return found
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.wait()
+def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[str, Found]]]]:
+    """Return the trials of a rig by name; each takes how long to wait before it goes wrong, s."""
+    for title, trial in TRIALS.items():
+        yield title, lambda wait, trial=trial: harm_bench(rig, trial, wait)
+    for title, sent in GUARDIAN.items():
+        yield title, lambda wait, sent=sent: harm_guardian(rig, sent, wait)
+    for title, lose in (("cut", rig.control.cut), ("unplug", rig.control.unplug)):
+        for name, instrument in rig.instruments.items():
+            if instrument.devices:
+                yield f"{title} {name}", lambda wait, name=name, lose=lose: cut_line(rig, name, lose, wait)
 
 
 def main() -> int:
     """Print the table; return 0 if every output was safe in time in every trial."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rig", action="append", choices=list(SETPOINTS))
-    parser.add_argument("--trial", action="append", choices=list(TRIALS))
+    parser.add_argument("--trial", action="append", help="only trials of this name, or whose name begins with it")
     parser.add_argument("--times", type=int, default=10, help="trials of each kind")
     parser.add_argument("--busy", type=int, default=0, help="busy processes beside")
     parser.add_argument("--seed", type=int, default=0, help="of the instants")
@@ -203,30 +243,32 @@ def main() -> int:
     instants = random.Random(given.seed)
     bad = 0
     with ExitStack() as stack:
-        for _ in range(given.busy):
-            busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-            stack.callback(_end, busy)
-        print(f"{'rig':8} {'trial':24} {'safe':>7} {'median s':>9} {'longest s':>9} {'allowed s':>9}")
+        start_busy(given.busy, stack)
+        print(f"{'rig':8} {'trial':28} {'safe':>7} {'median s':>9} {'longest s':>9} {'allowed s':>9}")
         for name in given.rig or SETPOINTS:
             rig = stack.enter_context(serve(name, clock="x1"))
-            for title in given.trial or TRIALS:
-                found = []
-                for _ in range(given.times):
-                    folder = Path(stack.enter_context(TemporaryDirectory())) / "runs"
-                    folder.mkdir()
-                    found.append(carry_out(rig, TRIALS[title], folder, instants.uniform(0.0, 2.0)))
-                good = [each for each in found if not each.problem]
-                times = [each.seconds for each in found]
-                print(
-                    f"{name:8} {title:24} {len(good):3}/{len(found):3} {statistics.median(times):9.3f} "
-                    f"{max(times):9.3f} {TRIALS[title].within:9.1f}",
-                    flush=True,
-                )
-                for each in found:
-                    if each.problem:
-                        bad += 1
-                        print(f"         {each.problem}", flush=True)
+            for title, carry_out in trials(rig):
+                if given.trial and not any(title == text or title.startswith(f"{text} ") for text in given.trial):
+                    continue
+                found = [carry_out(instants.uniform(0.0, 2.0)) for _ in range(given.times)]
+                for part in dict.fromkeys(part for each in found for part in each):
+                    parts = [each[part] for each in found if part in each]
+                    bad += report(f"{name:8} {f'{title}: {part}' if part else title:28}", parts)
     return 1 if bad else 0
+
+
+def report(title: str, found: list[Found]) -> int:
+    """Print a row of the table; return how often something was wrong."""
+    times = [each.seconds for each in found]
+    problems = [each.problem for each in found if each.problem]
+    print(
+        f"{title} {len(found) - len(problems):3}/{len(found):3} {statistics.median(times):9.3f} "
+        f"{max(times):9.3f} {found[0].within:9.1f}",
+        *(f"         {each}" for each in problems),
+        sep="\n",
+        flush=True,
+    )
+    return len(problems)
 
 
 if __name__ == "__main__":

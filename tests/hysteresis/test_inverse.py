@@ -41,22 +41,17 @@ def random_state(rng, low, high):
 
 
 def first_crossing(operator, state, direction, target):
-    """The first input in one direction that meets the target, by a dense scan and bisection; else None."""
-    end = operator.input_range[1] if direction > 0 else operator.input_range[0]
-    inputs = np.linspace(state.input, end, 6000)
-    error = operator.evaluate(inputs, state) - target
-    hit = np.flatnonzero(error[:-1] * error[1:] <= 0.0)
-    if not hit.size:
-        return None
-    a, b = inputs[hit[0]], inputs[hit[0] + 1]
-    sign = np.sign(error[hit[0]])
-    for _ in range(60):
-        middle = 0.5 * (a + b)
-        if np.sign(operator.evaluate([middle], state)[0] - target) == sign:
-            a = middle
-        else:
-            b = middle
-    return 0.5 * (a + b)
+    """The first input in one direction that meets the target, by dense scans, each within the last; else None."""
+    start, end = state.input, operator.input_range[1] if direction > 0 else operator.input_range[0]
+    for points in (6000, 300, 300, 300):
+        inputs = np.linspace(start, end, points)
+        error = operator.evaluate(inputs, state) - target
+        hit = np.flatnonzero(error[:-1] * error[1:] <= 0.0)
+        if hit.size:
+            start, end = inputs[hit[0] : hit[0] + 2]
+        elif points == 6000:
+            return None
+    return 0.5 * (start + end)
 
 
 def targets_for(rng, operator, state):

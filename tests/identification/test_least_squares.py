@@ -280,12 +280,13 @@ def test_minimum_norm_equals_the_pseudo_inverse():
 
 
 def test_blas_is_limited_to_one_thread_only_inside():
-    from threadpoolctl import threadpool_info
+    from threadpoolctl import threadpool_info, threadpool_limits
 
     operator, inputs, outputs = problem()
-    before = [(p["filepath"], p["num_threads"]) for p in threadpool_info() if p["user_api"] == "blas"]
-    fit(operator.regressor(inputs), outputs)
-    after = {p["filepath"]: p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"}
+    with threadpool_limits(2, user_api="blas"):
+        before = [(p["filepath"], p["num_threads"]) for p in threadpool_info() if p["user_api"] == "blas"]
+        fit(operator.regressor(inputs), outputs)
+        after = {p["filepath"]: p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"}
     assert all(after[path] == threads for path, threads in before)
 
 

@@ -418,13 +418,13 @@ class TestWhatGoesWrong:
             ),
             pytest.param(
                 *LENGTH_RUN, {"fault": "forgotten-load", "fault_time": "40"},
-                4, ["load_cell_force: reads 0.2", "after the prompt to hang 4.9 N", "expected 4.652 to 5.148 N",
+                4, ["load_cell_force: reads 0.", "after the prompt to hang 4.9 N", "expected 4.652 to 5.148 N",
                     "Was it done?"],
                 7, id="weight not changed",
             ),
             pytest.param(
                 *LENGTH_RUN, {"fault": "heavy-load", "fault_time": "40"},
-                4, ["load_cell_force: reads 9.7", "after the prompt to hang 4.9 N", "Was it done?"],
+                4, ["load_cell_force: reads 9.", "after the prompt to hang 4.9 N", "Was it done?"],
                 7, id="another weight",
             ),
             pytest.param(
@@ -454,8 +454,8 @@ class TestWhatGoesWrong:
         assert np.all(np.diff(ticks["t"]) > 0)
         # A tick comes every 2 s.
         assert {*kept["step"][kept["finished"] - kept["started"] > 2.5]} <= {*ticks["step"]}
-        # Telemetry reaches to the last tick before what happened.
-        assert result["laboratory_seconds"] - ticks["t"][-1] < 8.0
+        # Telemetry reaches to the last tick before what happened; a line that is lost has time to come back.
+        assert result["laboratory_seconds"] - ticks["t"][-1] < 12.0
         assert [event.text for event in events if event.kind == "safe-state"] == [f"{name}: safe" for name in DEVICES]
         (trouble,) = (event for event in events if event.level == "ERROR")
         assert trouble.kind == ("interlock" if code == 5 else "error")

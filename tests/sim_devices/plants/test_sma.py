@@ -223,12 +223,12 @@ class TestGrains:
                 low, high = (middle, high) if place(middle) <= millimetres else (low, middle)
             expected = low if low >= committed else high
         before = martensite.copy(), oriented.copy()
-        scratch = np.empty((2, martensite.size))
+        scratch, quiet = np.empty((2, martensite.size)), np.zeros(kernels.QUIET_SIZE)
         found = kernels.solve_stress(
             millimetres,
             temperature,
             committed,
-            kernels.Parts(wire._state, wire._coefficients, grains, martensite, oriented, scratch),
+            kernels.Parts(wire._state, wire._coefficients, grains, martensite, oriented, scratch, quiet),
         )
         assert found == pytest.approx(expected, abs=1e-7)
         # A trial leaves the committed state alone.
@@ -282,6 +282,33 @@ class TestGrains:
             visited.append(wire.martensite_fraction)
         assert min(visited) < 0.05
         assert max(visited) > 0.7
+
+    @given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([0.0, 0.3, 2.0]))
+    @settings(max_examples=25, deadline=None)
+    def test_quiet_surroundings_change_no_bit(self, seed, clamped, ambient_sd):
+        """Compare with a wire that forgets its quiet surroundings and so looks at every grain in each step."""
+        parameters = SMAParameters(grain_count=200, ambient_sd=ambient_sd)
+        wire, thorough = make(parameters, seed), make(parameters, seed)
+        script = np.random.default_rng(seed)
+        used = 0
+        for _ in range(12):
+            voltage, load, place = script.uniform([0.0, 0.0, -1e-3], [3.0, 9.0, 5e-3])
+            for each in (wire, thorough):
+                each.apply(voltage)
+                if clamped:
+                    each.clamp(place)
+                else:
+                    each.hang(load)
+            for _ in range(40):
+                before = wire._parts.quiet.copy()
+                wire.advance(0.1)
+                used += before[kernels.KELVIN] > 0.0 and np.array_equal(wire._parts.quiet, before)
+                thorough._parts.quiet[:] = 0.0
+                thorough.advance(0.1)
+                assert np.array_equal(wire._state, thorough._state)
+                assert np.array_equal(wire._parts.martensite, thorough._parts.martensite)
+                assert np.array_equal(wire._parts.oriented, thorough._parts.oriented)
+        assert used > 40
 
     def test_memory_of_a_large_step_is_that_of_small_ones(self):
         once, bit_by_bit = make(), make()

@@ -1,0 +1,63 @@
+"""Compile into numba's cache what the tests use.
+
+In one process, before the tests: otherwise each of their workers compiles most of it. What is missing here is
+compiled by the test that needs it.
+"""
+
+import numpy as np
+
+import bench
+from bench.control.adaptation import Adapter
+from bench.hysteresis import Preisach, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse
+from bench.identification import identify
+from bench.identification.least_squares import fit
+from rigs.hybrid.design import Design
+from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
+from rigs.hybrid.model import identify_polynomial
+
+
+def operators() -> None:
+    """Evaluate, invert, adapt and identify operators."""
+    levels = uniform_levels(0.0, 1.0, 4)
+    density = np.ones(10)
+    inputs = np.array([0.0, 1.0, 0.2, 0.8, 0.4, 0.6, 0.1, 0.9])
+    operator = Preisach(levels, density, 0.0, None, (0.0, 1.0))
+    state = operator.initial_state().advance(inputs)
+    operator.segment(state, 1)
+    operator.segment(state, -1)
+    operator.output_range()
+    outputs = operator.evaluate(inputs)
+    regressor = operator.regressor(inputs)
+    regressor.dense()
+    regressor.product(np.ones(regressor.shape[1]))
+    fit(regressor, outputs)
+    inverse = PreisachInverse(operator)
+    inverse.invert(state, 0.1)
+    inverse.follow([0.1, 0.2])
+    Adapter(operator).update(0.5, 0.1).update(0.8, 0.3)
+    identify("preisach-nonmonotonic", inputs, outputs, input_range=(0.0, 1.0), plane=(0.0, 1.0), reference=0.0)
+    identify("prandtl-ishlinskii", inputs, outputs, input_range=(0.0, 1.0))
+
+
+def hybrid_estimate() -> None:
+    """Filter the readings of a hybrid cantilever."""
+    rises = np.linspace(-20.0, 20.0, 9)
+    bending = Bending(identify_polynomial(rises, -7e-6 * rises, 2).model)
+    estimate = UnscentedEstimate(bending, ReducedNetwork(Design().network(), 22.0), ThermalNoise(), 5e-3, 4)
+    estimate.begin(0.0, 0.0, 0.0)
+    estimate.sample(0.0)
+    estimate.correct(0.0, 0.0, 0.0)
+
+
+def laboratories() -> None:
+    """Open each: it compiles its loops."""
+    for rig in ("vo2", "sma", "mckibben", "coiled-polymer", "hybrid"):
+        with bench.open_rig(rig):
+            pass
+
+
+if __name__ == "__main__":
+    operators()
+    hybrid_estimate()
+    laboratories()

@@ -1,0 +1,184 @@
+"""A run of `bench run` on a served rig, as its own terminal would start it, for the harnesses beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Self
+
+from sim_devices.serving.process import EmulatedRig
+
+PROTOCOLS = Path(__file__).with_name("hanging_protocols.py")
+
+SETPOINTS = {
+    "vo2": {"tec": 40.0},
+    "sma": {"supply": 2.0, "stage": 0.001, "fan": 1.0},
+    "hybrid": {"tec": 0.05, "piezo": 10.0},
+}
+"""Set-points that switch every output of a rig on."""
+
+_LONGEST_START = 120.0
+"""Longest wait for what a run does at its start, s."""
+
+
+def outputs_on(rig: EmulatedRig) -> dict[str, float]:
+    """Return the true outputs of the instruments that are on."""
+    return on(rig.control.request("state")["values"])
+
+
+def on(values: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Return those of some true values that are outputs and on."""
+    return {name: each["value"] for name, each in values.items() if each["is_output"] and abs(each["value"]) > 1e-6}
+
+
+class GuardedRun:
+    """A run, its folder, and its guardian; leaving it kills the bench and mends what is broken.
+
+    Parameters
+    ----------
+    rig : EmulatedRig
+        Where the instruments are.
+    protocol : str
+        One of `hanging_protocols.py`.
+    overrides, parameters : mapping of str to str
+        Options `--override` and `--set`.
+    stalled : bool
+        Whether nobody reads what the bench prints.
+    """
+
+    def __init__(
+        self,
+        rig: EmulatedRig,
+        protocol: str,
+        overrides: Mapping[str, str],
+        parameters: Mapping[str, str],
+        *,
+        stalled: bool = False,
+    ) -> None:
+        self._rig = rig
+        command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{protocol}", "--rig", rig.name]
+        command += ["--attach", str(rig.endpoints_file)]
+        for option, values in (("--override", overrides), ("--set", parameters)):
+            for key, value in values.items():
+                command += [option, f"{key}={value}"]
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="guarded-run-")))
+            self._runs = folder / "runs"
+            self._runs.mkdir()
+            self._said = folder / "said.txt"
+            out = stack.enter_context(self._said.open("wb")).fileno()
+            if stalled:
+                reading, out = os.pipe()
+                stack.callback(os.close, reading)
+            # In a session of its own, as its own terminal's would be.
+            self.process = subprocess.Popen(
+                [*command, "--out", str(self._runs)],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            if stalled:
+                os.close(out)
+            stack.callback(self._end)
+            self.guardian = 0
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def said(self) -> str:
+        """What the bench has printed, on one line, as the display may break a line anywhere."""
+        return " ".join(self._said.read_text(errors="replace").split())
+
+    def await_on(self, count: int) -> None:
+        """Wait until everything is on, and find the guardian."""
+        self.await_note("everything is on")
+        assert len(found := outputs_on(self._rig)) >= count, f"only {found} is on"
+        self.guardian = find_guardian(self.process.pid)
+
+    def await_note(self, text: str) -> float:
+        """Wait until the run has recorded a note; return the laboratory time at which it did, s."""
+        since = time.monotonic()
+        while time.monotonic() - since < _LONGEST_START:
+            with suppress(sqlite3.Error, IndexError):
+                db = sqlite3.connect(f"file:{next(self._runs.glob('*/journal.sqlite'), '')}?mode=ro", uri=True)
+                try:
+                    found = db.execute("SELECT t FROM events WHERE text = ?", (text,)).fetchone()
+                finally:
+                    db.close()
+                if found:
+                    return float(found[0])
+            assert self.process.poll() is None, f"it ended, exit code {self.process.returncode}: {self.said[-500:]}"
+            time.sleep(0.02)
+        raise AssertionError(f"{text!r} was never recorded")
+
+    @property
+    def cause(self) -> str:
+        """What has tripped the guardian, by its own record; empty as long as nothing is recorded."""
+        for record in self._runs.glob("*/guardian.jsonl"):
+            for line in record.read_text().splitlines():
+                note = json.loads(line)
+                if note["what"] == "safe":
+                    return str(note["cause"])
+        return ""
+
+    def has_freed_lines(self) -> bool:
+        """Wait until the guardian has left the lines; return whether it has."""
+        since = time.monotonic()
+        while time.monotonic() - since < 30.0:
+            if not _is_alive(self.guardian):
+                return True
+            time.sleep(0.02)
+        return False
+
+    def _end(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        for instrument in self._rig.instruments:
+            self._rig.control.plug_in(instrument)
+        if self.guardian and not self.has_freed_lines():
+            os.kill(self.guardian, signal.SIGKILL)
+
+
+def find_guardian(process: int) -> int:
+    """Return the guardian that a bench has started."""
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            if b"bench.guardian" in (entry / "cmdline").read_bytes():
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == process:
+                    return int(entry.name)
+    raise AssertionError("the bench has no guardian")
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        return (Path("/proc") / str(process) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def start_busy(count: int, stack: ExitStack) -> None:
+    """Keep processors busy until the stack is left."""
+    for _ in range(count):
+        busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        stack.callback(busy.wait)
+        stack.callback(busy.kill)

@@ -1,0 +1,30 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+# The heater is a laboratory of the engine's tests.
+sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
+
+from heater_laboratory import RIG
+
+from bench.clock import VirtualClock
+from bench.rig import Rig
+from bench.rig_file import load_rig
+from bench.station.local import LocalStation
+
+
+@pytest.fixture
+def heater(tmp_path):
+    """A station on the heated plate in this process, with additions to its rig file."""
+    rigs = []
+
+    def make(append="", interlock_rate=None):
+        path = tmp_path / "heater.toml"
+        path.write_text(RIG + append, encoding="utf-8")
+        rigs.append(Rig(load_rig(str(path), {}), VirtualClock(), 0))
+        return LocalStation(rigs[-1], interlock_rate), rigs[-1]
+
+    yield make
+    for rig in rigs:
+        rig.close()
