@@ -11,7 +11,7 @@ MAKEFLAGS += --jobs=2
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy kill-safe fault-matrix clean
+.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -64,9 +64,14 @@ busy: $(SETUP)
 fault-matrix: $(SETUP)
 	$(BIN)/python tests/faults/matrix.py
 
-# SIGKILL, SIGSTOP, endless loops and stalled readers on each rig: when every output is off, read in the instruments.
+# Benches and guardians killed, stopped or hanging, and lines cut, on each rig: when every output is off, read in the
+# instruments.
 kill-safe: $(SETUP)
 	$(BIN)/python tests/guardian/kill_safe.py --times 10
+
+# The time from when each interlock of each rig has to act until every output is off, likewise.
+interlock-times: $(SETUP)
+	$(BIN)/python tests/guardian/interlock_times.py --times 5
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

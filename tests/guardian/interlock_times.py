@@ -214,8 +214,10 @@ def cases(rig: EmulatedRig) -> list[Case]:
             3.0,
             {"stuck": {"moved": 5.0, "follows": 1.0, "within": 3.0}},
             Crossing("amplifier_command", 5.0),
-            then={"piezo": 25.0},
-            fault="t7.freeze",
+            {**SETPOINTS[name], "piezo": 0.0},
+            {"piezo": 25.0},
+            fault="amplifier-clipped",
+            values={"volts": 0.5},
             fault_first=True,
         ),
     ]

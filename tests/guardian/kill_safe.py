@@ -174,14 +174,13 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
     """Lose the line of an instrument."""
     file = load_rig(rig.name, {})
     devices = rig.instruments[instrument].devices
-    watchdogs = [
-        watchdog
-        for each in file.devices
-        if each.name in devices and (watchdog := getattr(each.settings, "watchdog", 0))
-    ]
-    reconnect = min([file.safety.reconnect, *(0.6 * watchdog for watchdog in watchdogs)])
     lines = LINES[rig.name]
     own = {name for name, line in lines.items() if line == instrument}
+    settings = [each.settings for each in file.devices if each.name in devices]
+    # A watchdog that switches nothing off does not shorten the time for which the line may be away.
+    watchdogs = [getattr(each, "watchdog", 0.0) for each in settings] if own - NO_WATCHDOG else []
+    watchdogs = [watchdog for watchdog in watchdogs if watchdog]
+    reconnect = min([file.safety.reconnect, *(0.6 * watchdog for watchdog in watchdogs)])
     # What belongs to whom, and the time that it has.
     parts: dict[str, tuple[set[str], float]] = {}
     if lines.keys() - own:
