@@ -52,7 +52,9 @@ class World:
         self.lock = threading.RLock()
         self._plant = plant
         self._time = clock.now()
+        self._now = clock.now
         self._timed: list[tuple[Callable[[], float], Timed]] = []
+        self._deadlines: list[Callable[[], float]] = []
         self._advancing = False
 
     @property
@@ -63,6 +65,7 @@ class World:
     def add(self, timed: Timed) -> None:
         """Keep the deadlines of an instrument."""
         self._timed.append((timed.deadline, timed))
+        self._deadlines.append(timed.deadline)
 
     @contextmanager
     def at_present(self) -> Iterator[None]:
@@ -81,14 +84,15 @@ class World:
         # A request from within `expire` sees that instant, not the end.
         if self._advancing:
             return
-        target = self.clock.now()
+        target = self._now()
         # Mostly nothing is due, and a fast loop asks several times for each sample.
-        for deadline, _ in self._timed:
+        for deadline in self._deadlines:
             if deadline() <= target:
                 break
         else:
-            if target > self._time:
-                self._plant.advance(target - self._time)
+            before = self._time
+            if target > before:
+                self._plant.advance(target - before)
                 self._time = target
             return
         self._advancing = True

@@ -31,6 +31,18 @@ MACHINE = re.compile(
     r"/(home|root|tmp|Users|work)/\w|\b(pypi|index)\.[a-z]+\.(org|net|com)/simple|localhost:\d{4}/simple"
 )
 LONGEST = 700
+OPENS_LINES = re.compile(
+    r"import\b.*\bRig\b|import (serial|can|pymodbus|pyvisa)\b|from (serial|can|pymodbus|pyvisa)\b"
+)
+WHERE_LINES_ARE_OPENED = {
+    "bench/contracts/on_a_rig.py",
+    "bench/face.py",
+    "bench/guardian/__main__.py",
+    "bench/guardian/process.py",
+    "bench/runs.py",
+    "bench/station/local.py",
+}
+"""The guardian, and what has a rig in this process; a rig alone connects devices."""
 
 
 def lines(paths):
@@ -69,6 +81,11 @@ def test_the_core_names_no_rig():
                 found.append(f"{path}:{number}: {match[0]}: {line.strip()}")
     assert not found, "\n".join(found)
     assert used == WHERE_A_RIG_IS_NAMED.keys()
+
+
+def test_lines_are_opened_by_the_guardian_and_by_rigs_in_this_process_only():
+    sources = [path for path in SOURCES if path.is_relative_to(ROOT / "bench")]
+    assert {path for path, _, line in lines(sources) if OPENS_LINES.search(line)} == WHERE_LINES_ARE_OPENED
 
 
 def test_no_file_is_long():

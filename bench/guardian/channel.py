@@ -19,6 +19,9 @@ _HEAD = struct.Struct(">I")
 _LONGEST = 1 << 24
 """Longest message, bytes; a block of 40 000 samples takes some 2 MB."""
 
+LONGEST_ANSWER = 15.0
+"""Longest time for the answer to a request, s, beyond that for which a line may be away."""
+
 Message = dict[str, Any]
 
 STILL_AT_IT: Message = {"n": 0}

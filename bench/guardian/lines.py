@@ -6,6 +6,7 @@ import itertools
 import queue
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -89,7 +90,9 @@ class LineThreads:
             # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
             except BaseException as error:
                 result = Result(call.device, None, error, was_away=False)
-            call.done(result)
+            # The thread is needed for the safe state, whatever becomes of an answer.
+            with suppress(Exception):
+                call.done(result)
 
     def _carry(self, call: _Call) -> Result:
         if call.priority != SAFE and self._ending.is_set():

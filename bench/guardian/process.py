@@ -28,7 +28,7 @@ from bench.clock import Clock, WallClock
 from bench.devices import Actuator, Status
 from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianError
 from bench.guardian.black_box import BlackBox
-from bench.guardian.channel import STILL_AT_IT, Channel, ChannelError, Message, to_message
+from bench.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
 from bench.interlocks import InterlockWatch
 from bench.rig import Look, Rig
@@ -112,6 +112,7 @@ class Guardian:
         self._concerned = {name: self._signals_of(name) for name in self._looked_at}
         self._request: Message | None = None
         self._said_at = 0.0
+        self._requested = 0.0
         self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
         self._bench_is_there = True
         self._writes_stacks = False
@@ -180,6 +181,8 @@ class Guardian:
         if self._request is not None:
             self._seen_at = dict.fromkeys(self._seen_at, now)
             self._say_so(now)
+            if (taken := now - self._requested) > LONGEST_ANSWER + self._rig.file.safety.reconnect:
+                self._core.trip(GuardianError(f"a request was not carried out within {taken:.0f} s"))
         for name, seen in self._seen_at.items():
             if now - seen > _BLIND + self._longest_away(name):
                 self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
@@ -228,7 +231,8 @@ class Guardian:
         if self._request is not None and do != "end":
             self._lose_bench("it asks before it was answered")
             return
-        self._request, self._said_at = message, self._wall.now()
+        self._request = message
+        self._requested = self._said_at = self._wall.now()
         if do == "end":
             self._core.end()
             return
@@ -260,13 +264,13 @@ class Guardian:
         if request is not self._request:
             return
         self._request = None
-        self._core.reply(self._wall.now())
-        # Threads of lines append to it.
-        news = self._news[:]
-        del self._news[: len(news)]
-        cause = self._core.cause
-        pause, self._core.pause = self._core.pause, ""
         try:
+            self._core.reply(self._wall.now())
+            # Threads of lines append to it.
+            news = self._news[:]
+            del self._news[: len(news)]
+            cause = self._core.cause
+            pause, self._core.pause = self._core.pause, ""
             self._channel.send(
                 {
                     "n": request.get("n"),
@@ -277,8 +281,9 @@ class Guardian:
                     **content,
                 }
             )
-        except ChannelError as error:
-            self._lose_bench(str(error))
+        # One that gets no answer promises nothing either.
+        except Exception as error:
+            self._lose_bench(f"it could not be answered: {error}")
 
     # Requests
 

@@ -20,7 +20,7 @@ from bench.clock import Clock, Stopwatch
 from bench.description import RigDescription
 from bench.devices import DeviceDescription, Identity, Limits, Signal
 from bench.errors import AbortError, BenchError, GuardianError
-from bench.guardian.channel import ChannelError, Message, to_error
+from bench.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
 from bench.guardian.start import start_guardian
 from bench.rig import Look
 from bench.rig_file import RigFile
@@ -30,9 +30,6 @@ from bench.upkeep.rescue import rescue_by_another_process
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
-
-_ANSWER = 15.0
-"""Longest wait for a reply beyond the time for which a line may be away, s."""
 
 _SILENCE = 8.0
 """Longest silence of the guardian while it carries a request out, s; it says each second that it is still at it."""
@@ -106,7 +103,7 @@ class RemoteStation(Station):
     def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
         self.clock = clock
         self._guarded = guarded
-        self._answer_within = _ANSWER + guarded.file.safety.reconnect
+        self._answer_within = LONGEST_ANSWER + guarded.file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
         self._tripped: BenchError | None = None
@@ -261,9 +258,13 @@ class RemoteStation(Station):
             faulthandler.unregister(_STACKS)
             self._stacks.close()
             path = Path(self._stacks.name)
-            if not path.stat().st_size:
-                path.unlink()
+            # The folder may be gone.
+            with suppress(OSError):
+                if not path.stat().st_size:
+                    path.unlink()
             self._stacks = None
+        if self._log.closed:
+            return
         self._channel.close()
         if not self._has_ended():
             # It goes on until what is not safe yet is safe.

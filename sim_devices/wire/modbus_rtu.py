@@ -16,6 +16,7 @@ broadcast), 2.5.1 (RTU framing) and 6.2.2 (CRC); MODBUS Application Protocol Spe
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 from sim_devices.instruments.emulated import LineFaults
 from sim_devices.wire import WireServer
@@ -57,6 +58,10 @@ def crc16(data: bytes | bytearray | memoryview) -> bytes:
     for byte in data:
         crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
     return crc.to_bytes(2, "little")
+
+
+_crc_of_request = lru_cache(maxsize=256)(crc16)
+"""A host asks the same few again and again."""
 
 
 class ModbusRtuServer(WireServer):
@@ -123,7 +128,7 @@ class ModbusRtuServer(WireServer):
             len(data) >= _SHORTEST_FRAME
             and data[0] == self._address
             and _length(data) == len(data)
-            and data[-2:] == crc16(data[:-2])
+            and data[-2:] == _crc_of_request(data[:-2])
         )
 
     def _find(self, received: memoryview) -> tuple[int, int] | None:

@@ -1,0 +1,57 @@
+"""What a bench does to a guardian, for tests and scripts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+from bench.attachment import attach
+from bench.guardian.remote import GuardedRig, RemoteStation
+from bench.rig_file import load_rig
+from sim_devices.serving.process import EmulatedRig
+
+LONG = 60.0
+"""Wall-clock time that a busy machine may take, s."""
+
+IN_TIME = 10.0
+"""Time beyond the declared one within which an output has to be off on a busy machine, s."""
+
+
+@contextmanager
+def connected(rig: EmulatedRig, file: str | None = None, **overrides: str) -> Iterator[RemoteStation]:
+    """Open a served rig by a guardian, which is gone after the block."""
+    values = {key.replace("__", "."): value for key, value in overrides.items()}
+    name = file or rig.name
+    with ExitStack() as stack:
+        attachment = attach(rig.endpoints_file, rig.name)
+        stack.callback(attachment.close)
+        guarded = GuardedRig(load_rig(name, values), name, values, rig.endpoints_file, 0, "a test")
+        station = RemoteStation(guarded, attachment.clock)
+        stack.callback(_leave, station)
+        yield station
+
+
+def _leave(station: RemoteStation) -> None:
+    station.clock.interrupted = lambda: False
+    station.end()
+    station.close()
+    with suppress(ProcessLookupError):
+        os.kill(station._process.pid, signal.SIGKILL)
+
+
+def is_on(rig: EmulatedRig) -> bool:
+    """Whether the true output of the TEC is on."""
+    return bool(rig.control.state()["tec_output"])
+
+
+def seconds_until(condition: Callable[[], bool], longest: float = LONG) -> float:
+    """Wait until something is so; return for how long, s."""
+    start = time.monotonic()
+    while not condition():
+        passed = time.monotonic() - start
+        assert passed < longest, f"not within {longest:g} s"
+        time.sleep(0.005)
+    return time.monotonic() - start

@@ -1,0 +1,23 @@
+"""A bench that switches an output on, leaves a child, whose number it prints, and is killed."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from bench.attachment import attach
+from bench.guardian.remote import GuardedRig, RemoteStation
+from bench.rig_file import load_rig
+
+endpoints = Path(sys.argv[1])
+guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
+station = RemoteStation(guarded, attach(endpoints, "vo2").clock)
+station.promise(600.0, "a child lives on")
+station.apply({"tec": 40.0})
+child = os.fork()
+if child == 0:
+    time.sleep(600.0)
+    os._exit(0)
+print(child, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)

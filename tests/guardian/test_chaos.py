@@ -1,0 +1,43 @@
+"""Every method of the guardian fails once; the output goes off, and nothing is called safe that is on."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from benches import IN_TIME, LONG
+from chaos import LEASE, METHODS
+
+from bench.guardian.channel import LONGEST_ANSWER
+from bench.rig_file import load_rig
+
+RECONNECT = load_rig("vo2").safety.reconnect
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="it forks")]
+
+
+@pytest.mark.timeout(600)
+def test_whatever_fails_the_output_goes_off(vo2):
+    script = Path(__file__).with_name("chaos.py")
+    done = subprocess.run(
+        [sys.executable, "-P", str(script), str(vo2.endpoints_file)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=10 * LONG,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [each["method"] for each in found] == list(METHODS)
+    # Some are called in runs of another kind only.
+    assert sum(each["failed"] for each in found) > 35
+    for each in found:
+        # While a request is carried out the bench cannot be late; an answer that is lost is noticed by its time.
+        allowed = LONGEST_ANSWER + RECONNECT if each["method"] == "Guardian._hand_over" else 1.1 * LEASE
+        assert each["off_after"] is not None, each
+        assert each["off_after"] < allowed + IN_TIME, each
+    assert not [each for each in found if each["on_at_the_end"]]
+    for each in found:
+        assert each["safe"].keys() == {"tec", "psd"}

@@ -1,0 +1,343 @@
+"""A guardian in a process of its own, in front of instruments in another one."""
+
+import contextlib
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from benches import IN_TIME, LONG, connected, is_on, seconds_until
+
+from bench.clock import VirtualClock
+from bench.errors import (
+    AbortError,
+    ConfigurationError,
+    DeviceConnectionError,
+    GuardianError,
+    InterlockError,
+    LimitError,
+)
+from bench.rig import Look, Rig
+from bench.rig_file import load_rig
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX"),
+    pytest.mark.timeout(240),
+]
+
+HERE = Path(__file__).parent
+SAFE = {"tec": "safe", "psd": "safe"}
+
+
+@pytest.fixture
+def station(vo2):
+    """A station whose TEC is on; its guardian is gone at the end, and the laboratory as it was."""
+    with contextlib.ExitStack() as stack:
+        # The watchdog of the TEC would have to be cleared by hand.
+        stack.callback(vo2.control.power_cycle, "tec")
+        stack.callback(vo2.control.plug_in, "psd")
+        stack.callback(vo2.control.plug_in, "tec")
+
+        def make(file=None, **overrides):
+            made = stack.enter_context(connected(vo2, file, **overrides))
+            made.promise(LONG, "a test")
+            made.apply({"tec": 40.0})
+            assert is_on(vo2)
+            return made
+
+        yield make
+
+
+def guardian_of(station):
+    return station._process
+
+
+def raw(station):
+    """The bench's end of the channel, to send what no station sends."""
+    return station._channel._socket
+
+
+def awaits_safety(station, vo2):
+    """Wait until the output is off, and the guardian has left with exit code 0."""
+    took = seconds_until(lambda: not is_on(vo2))
+    assert guardian_of(station).wait(LONG) == 0
+    return took
+
+
+class TestRequests:
+    def test_the_rig_is_described_as_in_this_process(self, station):
+        rig = Rig(load_rig("vo2"), VirtualClock(), 0)
+        try:
+            described = station().description
+            assert described.devices == rig.description.devices
+            assert described.signals == rig.description.signals
+        finally:
+            rig.close()
+
+    def test_readings_setpoints_and_arrivals(self, station, vo2):
+        it = station()
+        values = it.look(Look.GLANCE)
+        assert values.keys() == {signal.name for signal in it.description.signals}
+        assert values["tec_setpoint"] == it.setpoint("tec") == 40.0
+        assert it.quick_reader(["psd_position"])().keys() == {"psd_position", "curvature"}
+        it.check({"tec": [15.0, 95.0]})
+        with pytest.raises(LimitError, match="tec: set-point 99 °C is outside"):
+            it.apply({"tec": 99.0})
+        with pytest.raises(ConfigurationError, match="psd is not a device that takes a set-point"):
+            it.apply({"psd": 1.0})
+        assert it.arrivals().waiting == ("tec",)
+        for _ in range(60):
+            # In steps that the watchdog of the TEC allows.
+            vo2.control.advance(1.0)
+            it.look(Look.GLANCE)
+        assert it.arrivals().waiting == ()
+        it.mover(["tec"])([41.0])
+        assert it.setpoint("tec") == 41.0
+        assert it.end() == SAFE
+        assert not is_on(vo2)
+        with pytest.raises(GuardianError):
+            it.apply({"tec": 40.0})
+
+    def test_a_rig_that_cannot_be_connected_is_refused_in_the_words_of_its_driver(self, vo2):
+        vo2.control.unplug("tec")
+        try:
+            with pytest.raises(DeviceConnectionError, match="tec: no answer"), connected(vo2):
+                pass
+        finally:
+            vo2.control.plug_in("tec")
+
+    def test_a_wrong_rig_is_refused_with_its_key(self, vo2):
+        wrong = {"devices__tec__port": "emulated://nothing"}
+        with pytest.raises(ConfigurationError, match=r"devices\.tec\.port"), connected(vo2, **wrong):
+            pass
+
+
+class TestBenchGone:
+    def test_end_of_file(self, station, vo2):
+        it = station()
+        raw(it).close()
+        assert awaits_safety(it, vo2) < IN_TIME
+
+    @pytest.mark.parametrize(
+        "sent",
+        [
+            b"GET / HTTP/1.1\r\n\r\n",
+            struct.pack(">I", 3) + b"[1]",
+            struct.pack(">I", 4) + b"{{{{",
+            struct.pack(">I", 1 << 31),
+            struct.pack(">I", 10) + b'{"n": 7, "',
+        ],
+        ids=["no frame", "no object", "no JSON", "too long", "torn JSON"],
+    )
+    def test_garbage(self, station, vo2, sent):
+        it = station()
+        raw(it).send(sent)
+        assert awaits_safety(it, vo2) < IN_TIME
+
+    def test_two_requests_at_once(self, station, vo2):
+        it = station()
+        body = json.dumps({"n": 7, "do": "look", "look": "measure", "wanted": []}).encode()
+        raw(it).send(2 * (struct.pack(">I", len(body)) + body))
+        assert awaits_safety(it, vo2) < IN_TIME
+
+    def test_half_a_message_is_none(self, station, vo2):
+        it = station()
+        it.promise(0.5, "a test")
+        raw(it).send(struct.pack(">I", 100) + b'{"n": ')
+        assert seconds_until(lambda: not is_on(vo2)) < 0.5 + IN_TIME
+        # It waits for the rest still.
+        guardian_of(it).kill()
+
+    def test_an_unknown_request_is_refused_and_no_more(self, station, vo2):
+        it = station()
+        with pytest.raises(Exception, match="KeyError: 'dance'"):
+            it._ask("dance")
+        with pytest.raises(Exception, match="KeyError"):
+            it._ask("look")
+        with pytest.raises(Exception, match="expected a time"):
+            it._ask("promise", seconds=float("nan"), why="for ever")
+        assert it.look(Look.GLANCE)["tec_setpoint"] == 40.0
+        assert is_on(vo2)
+
+    def test_a_child_of_the_bench_that_lives_on_keeps_nothing_on(self, vo2):
+        """It keeps the bench's end of the channel open, so that the end of file never comes."""
+        bench = subprocess.Popen(
+            [sys.executable, str(HERE / "fork_and_die.py"), str(vo2.endpoints_file)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        child = None
+        try:
+            child = int(bench.stdout.readline())
+            assert bench.wait(LONG) == -signal.SIGKILL
+            assert seconds_until(lambda: not is_on(vo2)) < IN_TIME
+            # It lives still.
+            os.kill(child, 0)
+        finally:
+            bench.kill()
+            bench.wait()
+            bench.stdout.close()
+            if child is not None:
+                os.kill(child, signal.SIGKILL)
+            vo2.control.power_cycle("tec")
+
+
+class TestPromises:
+    def test_a_broken_one_is_the_safe_state_and_late_requests_are_refused(self, station, vo2, tmp_path):
+        it = station()
+        it.keep_record(tmp_path)
+        it.promise(0.5, "a test computes")
+        assert seconds_until(lambda: not is_on(vo2)) < 0.5 + IN_TIME
+        for late in (lambda: it.apply({"tec": 41.0}), lambda: it.look(Look.GLANCE)):
+            with pytest.raises(GuardianError, match=r"within the 0.5 s that it promised \(a test computes\)"):
+                late()
+        assert not is_on(vo2)
+        assert it.end() == SAFE
+        # Where this process stood.
+        seconds_until(lambda: (tmp_path / "stacks.txt").stat().st_size > 0)
+        assert "test_guardian.py" in (tmp_path / "stacks.txt").read_text()
+        assert guardian_of(it).wait(LONG) == 0
+        notes = [json.loads(line) for line in (tmp_path / "guardian.jsonl").read_text().splitlines()]
+        kinds = [note["what"] for note in notes]
+        assert kinds[0] == "begin"
+        assert kinds[-1] == "end"
+        assert kinds.index("look") < kinds.index("safe") < kinds.index("device")
+        by_kind = {note["what"]: note for note in notes}
+        assert by_kind["begin"]["rig"] == "vo2"
+        assert by_kind["begin"]["process"] == guardian_of(it).pid
+        assert any("tec_temperature" in note["values"] for note in notes if note["what"] == "look")
+        assert "promised (a test computes)" in by_kind["safe"]["cause"]
+        assert {note["device"]: note["state"] for note in notes if note["what"] == "device"} == SAFE
+        assert by_kind["end"]["safe"] == SAFE
+
+    def test_stacks_that_nobody_wanted_leave_no_file(self, station, tmp_path):
+        it = station()
+        it.keep_record(tmp_path)
+        it.end()
+        it.close()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["guardian.jsonl"]
+
+
+class TestInterlocks:
+    @pytest.fixture
+    def cautious(self, tmp_path):
+        """The rig's file, with an interlock at 30 °C."""
+        text = load_rig("vo2").text
+        assert text.count("high = 100.0") == 1
+        path = tmp_path / "vo2.toml"
+        path.write_text(text.replace("high = 100.0", "high = 30.0"), encoding="utf-8")
+        return str(path)
+
+    def test_they_are_looked_at_while_the_bench_computes(self, station, vo2, cautious, tmp_path):
+        it = station(file=cautious)
+        it.keep_record(tmp_path)
+        seconds_until(lambda: not is_on(vo2))
+        with pytest.raises(InterlockError, match=r"tec_temperature = 3\d.* is outside of 5 to 30 °C"):
+            it.look(Look.GLANCE)
+        assert it.end() == SAFE
+
+    def test_readings_of_the_bench_come_with_what_they_tripped(self, station, cautious):
+        # No look of its own before the bench has looked.
+        it = station(file=cautious, safety__rate="0.1")
+        temperatures = [0.0]
+        while max(temperatures) <= 30.0:
+            temperatures.append(it.look(Look.GLANCE)["tec_temperature"])
+        with pytest.raises(InterlockError):
+            it.judge(0.0, {})
+        assert it.end() == SAFE
+
+    def test_a_blind_interlock_is_the_safe_state_of_what_can_be_reached(self, station, vo2):
+        it = station()
+        vo2.control.unplug("tec")
+        seconds_until(lambda: it._process.poll() is None and not is_on(vo2))
+        with pytest.raises(DeviceConnectionError, match="tec: no answer"):
+            it.look(Look.GLANCE)
+        states = it.end()
+        assert states["psd"] == "safe"
+        assert "no answer" in states["tec"]
+        # It goes on until the TEC is safe.
+        assert guardian_of(it).poll() is None
+        vo2.control.plug_in("tec")
+        it.close()
+        assert guardian_of(it).wait(LONG) == 0
+
+
+class TestReconnection:
+    def test_a_line_that_comes_back_is_a_late_reply_and_news(self, station, vo2):
+        it = station()
+        vo2.control.unplug("tec")
+        back = threading.Timer(1.0, vo2.control.plug_in, ["tec"])
+        back.start()
+        values = it.look(Look.GLANCE)
+        back.join()
+        assert values["tec_setpoint"] == 40.0
+        assert is_on(vo2)
+        it.look(Look.GLANCE)
+        assert any("tec: line lost for" in news.text for news in it.news())
+
+    def test_an_abandoned_request_is_not_taken_for_the_answer_to_the_end(self, station, vo2):
+        it = station()
+        vo2.control.hang("psd")
+        it.clock.interrupted = lambda: True
+        try:
+            with pytest.raises(AbortError, match="had not answered"):
+                it.look(Look.MEASURE)
+            assert set(it.end()) == {"tec", "psd"}
+            assert it.end()["tec"] == "safe"
+            assert not is_on(vo2)
+        finally:
+            vo2.control.plug_in("psd")
+        it.close()
+        assert guardian_of(it).wait(LONG) == 0
+
+
+class TestGuardianGone:
+    def test_asked_to_end(self, station, vo2):
+        it = station()
+        guardian_of(it).terminate()
+        assert seconds_until(lambda: not is_on(vo2)) < IN_TIME
+        with pytest.raises(GuardianError, match="asked to end by SIGTERM"):
+            it.look(Look.GLANCE)
+        assert it.end() == SAFE
+        assert guardian_of(it).wait(LONG) == 0
+
+    def test_killed(self, station, vo2):
+        it = station()
+        guardian_of(it).kill()
+        with pytest.raises(GuardianError, match="was lost"):
+            it.look(Look.GLANCE)
+        assert it.end() == it.end() == SAFE
+        assert not is_on(vo2)
+        (news,) = [news for news in it.news() if news.kind == "guardian"]
+        assert news.level == "ERROR"
+        assert "was lost" in news.text
+
+    def test_stopped(self, station, vo2):
+        """It is killed before the rescue, as it would keep the lines."""
+        it = station()
+        it._answer_within = 1.0
+        guardian_of(it).send_signal(signal.SIGSTOP)
+        with pytest.raises(GuardianError, match="has not answered for 1 s"):
+            it.look(Look.GLANCE)
+        assert it.end() == SAFE
+        assert guardian_of(it).poll() == -signal.SIGKILL
+        assert not is_on(vo2)
+
+    def test_a_rescue_that_fails_is_no_safe_state(self, station, vo2):
+        it = station()
+        guardian_of(it).kill()
+        vo2.control.unplug("tec")
+        assert "safe" not in it.end()["tec"].split()
+
+    @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP", "SIGQUIT", "SIGPIPE", "SIGUSR1", "SIGUSR2"])
+    def test_signals_that_are_meant_for_the_bench_are_not_heard(self, station, vo2, name):
+        it = station()
+        guardian_of(it).send_signal(signal.Signals[name])
+        assert it.look(Look.GLANCE)["tec_setpoint"] == 40.0
+        assert is_on(vo2)
