@@ -44,7 +44,7 @@ types: lint
 
 # Compiled once, before the workers of the tests would each do it.
 kernels: lint
-	$(BIN)/python tests/compile_kernels.py
+	$(BIN)/python -P tests/compile_kernels.py
 
 tests: kernels
 	$(PYTEST)
