@@ -4,7 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+# Many tests wait for another process: one worker more than cores.
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)
+PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
 # mypy keeps one core busy: it runs beside the compilation of the kernels and the tests.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.

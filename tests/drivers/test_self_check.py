@@ -72,7 +72,7 @@ def test_a_battery_that_is_too_low(opened):
 
 def test_a_converter_that_stands_still(opened):
     rig = opened("sma")
-    rig.laboratory.inject("frozen-load-cell")
+    rig.laboratory.inject("load_cell.freeze")
     assert list(advised(rig.devices["load_cell"])) == ["converter"]
 
 
