@@ -41,6 +41,13 @@ class RigDescription:
         """The set-points that are allowed, of each device that takes one."""
         return {name: device.limits for name, device in self.devices.items() if device.limits is not None}
 
+    def limits_of(self, name: str) -> Limits:
+        """Return the set-points that a device allows; raises ConfigurationError if it takes none."""
+        if name not in self.limits:
+            known = ", ".join(self.limits) or "none"
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
+        return self.limits[name]
+
     def unit(self, signal: str) -> str:
         """Return the unit of a signal."""
         return self.by_name[signal].unit

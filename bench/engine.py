@@ -19,7 +19,6 @@ from bench.clock import Pace, PacedClock
 from bench.control.estimators import DriftEstimator, agility_for
 from bench.control.tracking import Command
 from bench.description import RigDescription
-from bench.devices import Limits
 from bench.errors import (
     AbortError,
     BenchError,
@@ -185,7 +184,7 @@ class Engine:
         run = self._run
         wanted = (message.drive, message.response, *message.others)
         run.check_signals(*wanted)
-        limits = self._limits(message.actuator)
+        limits = self._station.description.limits_of(message.actuator)
         started = self._clock.now()
         latest = started + message.timeout
         low, high = message.limits or (limits.low, limits.high)
@@ -246,13 +245,6 @@ class Engine:
                 f"expected {message.low:g} to {message.high:g} {unit}. Was it done?",
             )
         return reading
-
-    def _limits(self, name: str) -> Limits:
-        limits = self._station.description.limits
-        if name not in limits:
-            known = ", ".join(limits) or "none"
-            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
-        return limits[name]
 
     def _settle(self, settle: Settle, started: float) -> tuple[Settled, Exception | None]:
         """Let the rig settle; return how, and what to raise once the reading is recorded."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from enum import StrEnum
-from functools import partial
+from functools import cached_property, partial
 from types import TracebackType
 from typing import Self
 
@@ -98,10 +98,27 @@ class Rig:
         """Close every line that can still be closed; each device keeps the state that it is in."""
         self._stack.close()
 
-    @property
+    @cached_property
     def actuators(self) -> dict[str, Actuator]:
         """The devices that take a set-point, by name."""
         return {name: device for name, device in self.devices.items() if isinstance(device, Actuator)}
+
+    def actuator(self, name: str) -> Actuator:
+        """Return a device that takes a set-point; raises ConfigurationError if there is none of that name."""
+        self.description.limits_of(name)
+        return self.actuators[name]
+
+    @property
+    def setpoints(self) -> dict[str, float]:
+        """The set-points that were last sent, by device; nan before the first."""
+        return {name: actuator.setpoint for name, actuator in self.actuators.items()}
+
+    def check(self, setpoints: Mapping[str, Sequence[float]]) -> None:
+        """Raise LimitError if a device does not take one of its set-points; nothing is sent."""
+        for name, values in setpoints.items():
+            actuator = self.actuator(name)
+            for value in values:
+                actuator.check(value)
 
     def measure(self) -> dict[str, float]:
         """Take the best reading of every signal; raises what the devices raise."""

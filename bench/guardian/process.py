@@ -25,16 +25,18 @@ import numpy as np
 
 from bench.attachment import AttachedClock
 from bench.clock import Clock, WallClock
-from bench.devices import Actuator, Status
+from bench.devices import Status
 from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianError
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
 from bench.interlocks import InterlockWatch
+from bench.locks import line_names, port_of
 from bench.rig import Look, Rig
 from bench.safety import SAFE as IS_SAFE
 from bench.station.core import StationCore
 from bench.station.interface import News, masked, news_of
+from bench.station.reconnection import TRIES
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""
@@ -47,9 +49,6 @@ _TRY_FOR = 600.0
 
 _BLIND = 2.0
 """Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
-
-_TRIES = 3
-"""How often all devices are read again after a line was lost and came back while they were read."""
 
 _NOTHING = Result("", None, None, was_away=False)
 """The result of a request that concerns no device."""
@@ -297,7 +296,7 @@ class Guardian:
         self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
         self._reply(message)
 
-    def _look(self, message: Message, tries: int = _TRIES) -> None:
+    def _look(self, message: Message, tries: int = TRIES) -> None:
         readers = self._rig.readers(Look(message["look"]), message["wanted"])
 
         def done(readings: dict[str, Any]) -> None:
@@ -313,22 +312,18 @@ class Guardian:
 
     def _apply(self, message: Message) -> None:
         setpoints = message["setpoints"]
-        actuators = {name: self._actuator(name) for name in setpoints}
-        for name, value in setpoints.items():
-            actuators[name].check(value)
+        self._rig.check({name: (value,) for name, value in setpoints.items()})
         self._core.arm()
-        calls = {name: partial(actuators[name].set, value) for name, value in setpoints.items()}
+        calls = {name: partial(self._rig.actuator(name).set, value) for name, value in setpoints.items()}
 
         def done(statuses: dict[str, Status]) -> None:
             self._statuses = [statuses[name] for name in setpoints]
-            self._reply(message, {name: actuator.setpoint for name, actuator in actuators.items()})
+            self._reply(message, {name: self._rig.setpoints[name] for name in setpoints})
 
         self._start(BENCH, calls, done, partial(self._refuse, message))
 
     def _check(self, message: Message) -> None:
-        for name, values in message["setpoints"].items():
-            for value in values:
-                self._actuator(name).check(value)
+        self._rig.check(message["setpoints"])
         self._reply(message)
 
     def _arrivals(self, message: Message) -> None:
@@ -372,13 +367,6 @@ class Guardian:
         self._rig.laboratory.operate(message["task"], message["value"])
         self._reply(message)
 
-    def _actuator(self, name: str) -> Actuator:
-        device = self._rig.devices.get(name)
-        if not isinstance(device, Actuator):
-            known = ", ".join(self._rig.description.limits) or "none"
-            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
-        return device
-
     # Interlocks
 
     def _look_readers(self) -> dict[str, Callable[[], dict[str, float]]]:
@@ -418,8 +406,7 @@ class Guardian:
         for name in self._seen_at:
             if self._concerned[name] & self._watched <= values.keys():
                 self._seen_at[name] = now
-        setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
-        findings = self._core.judge(t, values, setpoints, now=now, factor=self._factor)
+        findings = self._core.judge(t, values, self._rig.setpoints, now=now, factor=self._factor)
         self._news += news_of(findings)
 
     def _longest_away(self, name: str) -> float:
@@ -590,8 +577,10 @@ _REQUESTS: Mapping[str, Callable[[Guardian, Message], None]] = {
 
 
 def lines_of(rig: Rig) -> dict[str, str]:
-    """Return the line of each device of a rig: its port where it has one, else a line of its own."""
-    return {entry.name: str(getattr(entry.settings, "port", entry.name)) for entry in rig.file.devices}
+    """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
+    ports = {entry.name: port_of(entry.settings) for entry in rig.file.devices}
+    # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
+    return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
 
 
 def stages(rig: Rig) -> list[list[str]]:

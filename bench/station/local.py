@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
-from bench.devices import Actuator, Status
+from bench.devices import Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.interlocks import Finding, InterlockWatch
 from bench.rig import Look, Rig
@@ -16,12 +16,9 @@ from bench.roles import Floats
 from bench.safety import make_safe
 from bench.station.core import StationCore
 from bench.station.interface import Arrivals, News, Station, masked, news_of
-from bench.station.reconnection import reconnect
+from bench.station.reconnection import TRIES, reconnect
 
 _T = TypeVar("_T")
-
-_TRIES = 3
-"""How often all devices are read again after a line was lost and came back while they were read."""
 
 
 class LocalStation(Station):
@@ -73,7 +70,7 @@ class LocalStation(Station):
         """Read the devices; values by signal name."""
         readers = self._rig.readers(look, wanted)
         lost: set[str] = set()
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             self._lost.clear()
             try:
                 values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
@@ -101,7 +98,7 @@ class LocalStation(Station):
 
     def mover(self, actuators: Sequence[str]) -> Callable[[Sequence[float]], None]:
         """Return a function that sends those of some set-points that have changed."""
-        devices = [self._actuator(name) for name in actuators]
+        devices = [self._rig.actuator(name) for name in actuators]
         core = self._core
         core.arm()
 
@@ -135,10 +132,7 @@ class LocalStation(Station):
 
     def check(self, setpoints: Mapping[str, Sequence[float]]) -> None:
         """Raise LimitError if a device does not take one of its set-points; nothing is sent."""
-        for name, values in setpoints.items():
-            actuator = self._actuator(name)
-            for value in values:
-                actuator.check(value)
+        self._rig.check(setpoints)
 
     def apply(self, setpoints: Mapping[str, float]) -> None:
         """Send set-points; all are checked before any is sent."""
@@ -147,11 +141,11 @@ class LocalStation(Station):
         self._core.arm()
         self._statuses = []
         for name, value in setpoints.items():
-            self._statuses.append(self._ask(name, partial(self._actuator(name).set, value)))
+            self._statuses.append(self._ask(name, partial(self._rig.actuator(name).set, value)))
 
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
-        return self._actuator(device).setpoint
+        return self._rig.actuator(device).setpoint
 
     def arrivals(self) -> Arrivals:
         """Ask the devices that were sent set-points last how far they have come."""
@@ -171,8 +165,7 @@ class LocalStation(Station):
             now = self.clock.now()
             self._core.advance(now)
             if self._core.look_due(now):
-                setpoints = {name: actuator.setpoint for name, actuator in self._rig.actuators.items()}
-                self._note(self._core.judge(now, self.look(Look.PART, self._watched), setpoints))
+                self._note(self._core.judge(now, self.look(Look.PART, self._watched), self._rig.setpoints))
             self._raise_if_tripped()
         self.clock.sleep_until(instant)
 
@@ -203,13 +196,6 @@ class LocalStation(Station):
     def close(self) -> None:
         """Release the lines; each device keeps the state that it is in."""
         self._rig.close()
-
-    def _actuator(self, name: str) -> Actuator:
-        device = self._rig.devices.get(name)
-        if not isinstance(device, Actuator):
-            known = ", ".join(self.description.limits) or "none"
-            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
-        return device
 
     def _ask(self, name: str, call: Callable[[], _T]) -> _T:
         try:

@@ -8,6 +8,9 @@ from bench.clock import Clock
 from bench.devices import Device
 from bench.errors import DeviceConnectionError
 
+TRIES = 3
+"""How often all devices are read at most, when a line is lost and comes back while they are read."""
+
 _INTERVAL = 0.2
 """Time between two attempts, s."""
 
