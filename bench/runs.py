@@ -182,7 +182,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = {
-            **metadata(run.protocol, parameters, description, slots, expected, clock.epoch),
+            **metadata(run.protocol, parameters, description, slots, expected, clock.date()),
             "run": folder.name,
             "overrides": dict(run.overrides),
             "seed": run.seed,
