@@ -37,13 +37,15 @@ class Plan:
         Smallest and largest set-point by device.
     watched : frozenset of str
         Signals that have to become steady, are controlled or looked at.
-    prompts : int
-        How often the operator is asked to do something by hand.
+    prompted : tuple of int
+        Numbers of the steps in which the operator is asked to do something by hand.
     complete : bool
         Whether that is all. Otherwise the protocol goes on by what it reads: the numbers are those up to there, and
         the rest is unknown.
     finished : tuple of float
         Laboratory time from the start in s at which each step ends, counted as `seconds`.
+    latest : tuple of float
+        Longest time of each step, s.
     """
 
     steps: int
@@ -51,9 +53,15 @@ class Plan:
     at_most: float
     extremes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     watched: frozenset[str] = frozenset()
-    prompts: int = 0
+    prompted: tuple[int, ...] = ()
     complete: bool = True
     finished: tuple[float, ...] = ()
+    latest: tuple[float, ...] = ()
+
+    @property
+    def prompts(self) -> int:
+        """How often the operator is asked to do something by hand."""
+        return len(self.prompted)
 
 
 def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: Slots | None = None) -> Plan:
@@ -66,10 +74,12 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: 
     Raises ConfigurationError if the protocol does not end within a million messages, its parameters do not fit
     together, or it fails.
     """
-    others, prompts, seconds, at_most = 0, 0, 0.0, 0.0
+    others, seconds, at_most = 0, 0.0, 0.0
     watched: set[str] = set()
     extremes: dict[str, tuple[float, float]] = {}
     finished: list[float] = []
+    latest: list[float] = []
+    prompted: list[int] = []
     known = _KnownValues()
     reading: Reading | None = None
     try:
@@ -84,9 +94,10 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: 
                     at_most if complete else math.inf,
                     extremes,
                     frozenset(watched),
-                    prompts,
+                    tuple(prompted),
                     complete,
                     tuple(finished),
+                    tuple(latest),
                 )
             if not isinstance(message, Message):
                 raise ConfigurationError(f"protocol {definition.name} yielded {message!r}; {EXPECTED}")
@@ -97,12 +108,13 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: 
             known.take(message)
             watched |= planned.watched
             seconds, at_most = seconds + planned.seconds, at_most + planned.at_most
-            prompts += planned.prompts
+            prompted += [len(finished)] * planned.prompts
             if planned.settled is None:
                 reading, others = None, others + 1
             else:
                 reading = Reading(len(finished), cast("float", _Unknown(known)), planned.settled, known)
                 finished.append(seconds)
+                latest.append(planned.at_most)
             if max(len(finished), others) > LONGEST:
                 what = "steps" if len(finished) > others else "notes"
                 raise ConfigurationError(f"protocol {definition.name} does not end within {LONGEST} {what}")
