@@ -359,7 +359,7 @@ class _Kept:
     def event(self, event: Event) -> None:
         if event.kind == "prompt":
             self.prompted.append(len(self.finished))
-        elif event.level != "INFO":
+        elif event.level != "INFO" and event.kind != "end":
             self.findings.append(Finding(event.t, len(self.finished), event.level, event.kind, event.text))
         self._others += 1
         if self._others > LONGEST:

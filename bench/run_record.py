@@ -60,7 +60,12 @@ def metadata(
         "parameters": parameters.model_dump(mode="json"),
         "controls": protocol.controlled(slots),
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
-        "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
+        "plan": {
+            "steps": expected.steps,
+            "seconds": expected.seconds,
+            "at_most": expected.at_most if expected.complete else None,
+            "complete": expected.complete,
+        },
         "epoch": epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in description.devices.items()},
         "calibration": {
