@@ -27,10 +27,12 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
+from bench.model_file import models_among
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, plan
+from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
-from bench.run_record import RIG_FILE_NAME, make_folder, metadata
+from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -75,6 +77,9 @@ class Run:
         hardware the rig file says it, `[safety] rate`.
     faults : Path, optional
         Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
+    original : Original, optional
+        The run that this one repeats: its files are read in the place of those that `settings` name, and its rig is
+        taken if it has one.
     """
 
     protocol: ProtocolDefinition
@@ -89,6 +94,7 @@ class Run:
     attach: Path | None = None
     interlock_rate: float | None = None
     faults: Path | None = None
+    original: Original | None = None
 
 
 @dataclass(frozen=True)
@@ -135,10 +141,12 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         If a device cannot be connected; nothing has moved.
     """
     stopwatch = Stopwatch()
-    rig_file = load_rig(run.rig, run.overrides)
-    parameters = run.protocol.parse(
+    original = run.original
+    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
+    stated = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
+    parameters = original.readable(run.protocol, stated) if original else stated
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
@@ -177,27 +185,28 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
-        folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
+        models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
+        meta = _asked(run, attachment, rig_file, guardian is not None)
+        meta |= metadata(run.protocol, stated, description, slots, expected, clock.epoch)
+        if original:
+            meta["repeats"] = original.meta["run"]
+            for difference in differences(original.meta, meta):
+                console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
+        folder = make_folder(run.folder, run_name(run.protocol, meta))
         if guardian is not None:
             guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = {
-            **metadata(run.protocol, parameters, description, slots, expected, clock.epoch),
-            "run": folder.name,
-            "overrides": dict(run.overrides),
-            "seed": run.seed,
-            "interlock_rate": run.interlock_rate if guardian is None else rig_file.safety.rate,
-            "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
-        }
+        meta["run"] = folder.name
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta)
+        journal = Journal(folder / FILE_NAME, signals, meta, files | {RIG_FILE_NAME: rig_file.text.encode()})
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
             path = folder / RECORDING_NAME if run.recording else None
-            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
+            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
@@ -213,6 +222,16 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _asked(run: Run, attachment: Attachment | None, rig: RigFile, guarded: bool) -> dict[str, Any]:
+    """Return what the record says of how the run was asked for."""
+    return {
+        "overrides": dict(run.overrides),
+        "seed": run.seed,
+        "interlock_rate": rig.safety.rate if guarded else run.interlock_rate,
+        "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+    }
 
 
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:
