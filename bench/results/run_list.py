@@ -123,7 +123,7 @@ def _listed(path: Path) -> ListedRun:
                 str(meta["rig"]),
                 str(meta["host"]["started"]),
                 meta.get("finished"),
-                record.step_count(),
+                meta["counts"]["steps"] if "counts" in meta else len(record.steps()),
                 main_result(record) if record.status == "completed" else str(meta.get("reason", "")),
                 meta.get("changed", {}),
                 {**meta["parameters"], **{key: meta[key] for key in ("seed", "clock", "run", "operator")}},

@@ -15,6 +15,7 @@ from rerun.chunk import RrdReader
 from bench.cli import main
 from bench.hysteresis import Preisach, uniform_levels
 from bench.journal import FILE_NAME, Record
+from bench.journal.rows import checksum
 from bench.model_file import ModelFile
 
 FAULTS = '[[fault]]\nat = 12\nfault = "tec.delay"\nvalues = { seconds = 0.05 }\nduration = 2\n'
@@ -49,10 +50,10 @@ def carry_out(*arguments):
 def put_meta(run, **values):
     with closing(sqlite3.connect(run / FILE_NAME)) as db, db:
         for key, value in values.items():
-            if value is None:
-                db.execute("DELETE FROM meta WHERE key = ?", (key,))
-            else:
-                db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
+            db.execute("DELETE FROM meta WHERE key = ?", (key,))
+            if value is not None:
+                row = key, json.dumps(value)
+                db.execute("INSERT INTO meta VALUES (?, ?, ?)", (*row, checksum(row)))
 
 
 @pytest.fixture(scope="module")
