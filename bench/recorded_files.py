@@ -101,6 +101,11 @@ def given_files(
     return {RIG_FILE_NAME: rig.text.encode()} | {name: _content(path) for name, path in paths.items()}
 
 
+def file_name(path: str) -> str:
+    """Return the end of a path, which may be one of another system."""
+    return re.split(r"[\\/]", path)[-1]
+
+
 def unpack(files: Mapping[str, bytes], parameters: Mapping[str, Any], folder: Path) -> None:
     """Write the files of a record into a folder, where the modules among them can then be imported.
 
@@ -128,8 +133,8 @@ def unpack(files: Mapping[str, bytes], parameters: Mapping[str, Any], folder: Pa
 
 
 def _place(folder: Path, name: str, path: str) -> Path:
-    # A path may be of another system. Two files of one name stay apart.
-    return folder / name / (re.split(r"[\\/]", path)[-1] or name)
+    # Two files of one name stay apart.
+    return folder / name / (file_name(path) or name)
 
 
 def _content(path: Path) -> bytes:

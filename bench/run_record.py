@@ -24,6 +24,7 @@ from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
 from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, is_installed, source_of
+from bench.recorded_files import file_name
 
 _PACKAGES = (
     "actuator-bench",
@@ -128,19 +129,19 @@ def metadata(
 
 
 def run_name(protocol: ProtocolDefinition, meta: Mapping[str, Any]) -> str:
-    """Return the name of a run without its time: rig, protocol, and the parameters that differ from their defaults.
+    """Return the name of a run without its time: rig, protocol, and what was set differently from the defaults.
 
     At most 96 letters, digits and `.+_-`, which every file system takes; what is left out counts as `more`. `meta` is
-    what `metadata` returns.
+    what `metadata` returns, with the `overrides`.
     """
     name, files = f"{meta['rig']}-{protocol.name}", protocol.file_parameters
-    changed = meta["changed"]
-    # Files last: the runs of a series share them.
-    for key in sorted(changed, key=lambda key: key in files):
-        value = changed[key]
-        if key in files:
-            value = re.split(r"[\\/]", str(value))[-1].rpartition(".")[0]
-        part = re.sub(r"[^A-Za-z0-9.+_-]+", "-", f"{key}-{_short(value)}")[:_LONGEST_PART].rstrip("-.")
+    parts = [f"{key}-{_short(value)}" for key, value in meta["changed"].items() if key not in files]
+    # Last what the runs of a series often share: files by the end of their path, and values of the rig file.
+    for key in filter(meta["changed"].__contains__, files):
+        parts.append(f"{key}-{Path(file_name(meta['changed'][key])).stem}")
+    parts += [f"{key.rpartition('.')[2]}-{value}" for key, value in meta["overrides"].items()]
+    for part in parts:
+        part = re.sub(r"[^A-Za-z0-9.+_-]+", "-", part)[:_LONGEST_PART].rstrip("-.")
         if len(name) + len(part) + len("--more") > _LONGEST_NAME:
             return f"{name}-more"
         name += f"-{part}"

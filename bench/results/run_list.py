@@ -10,6 +10,7 @@ from typing import Any
 
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, Record
+from bench.recorded_files import file_name
 
 DAMAGED = "damaged"
 _RESULT = re.compile(r"\b(RMS|error|spread)\b")
@@ -37,9 +38,10 @@ class ListedRun:
     result : str
         The last note of the protocol that states an error, or why the run did not complete.
     changed : mapping
-        Parameters that differ from their defaults.
+        Parameters that differ from their defaults, and values of the rig file that were replaced.
     values : mapping
-        All parameters, and `seed`, `clock`, `run` and `operator`; what a run is found by.
+        What a run is found by: all parameters, values of the rig file that were replaced, and `seed`, `clock`, `run`
+        and `operator`.
     """
 
     folder: Path
@@ -125,8 +127,12 @@ def _listed(path: Path) -> ListedRun:
                 meta.get("finished"),
                 meta["counts"]["steps"] if "counts" in meta else len(record.steps()),
                 main_result(record) if record.status == "completed" else str(meta.get("reason", "")),
-                meta.get("changed", {}),
-                {**meta["parameters"], **{key: meta[key] for key in ("seed", "clock", "run", "operator")}},
+                meta.get("changed", {}) | meta["overrides"],
+                {
+                    **meta["parameters"],
+                    **meta["overrides"],
+                    **{key: meta[key] for key in ("seed", "clock", "run", "operator")},
+                },
             )
     except DataError as error:
         return ListedRun(folder, DAMAGED, result=str(error))
@@ -142,4 +148,4 @@ def _fits(value: Any, text: str) -> bool:  # noqa: ANN401 - anything that JSON c
             return float(text) == value
         except ValueError:
             return False
-    return text in (str(value), re.split(r"[\\/]", str(value))[-1])
+    return text in (str(value), file_name(str(value)))

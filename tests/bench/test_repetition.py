@@ -114,7 +114,7 @@ def test_the_same_comes_out_when_every_file_is_gone(bench, tracked, tmp_path):
             assert now.meta[key] == before.meta[key], key
         assert len(now.telemetry()) == len(before.telemetry()) > 50
     # Named by what was set; the model is told from the targets by its parameter.
-    assert Path(result["folder"]).name.startswith("vo2-tracking-readings-2-model-m-targets-m-2")
+    assert Path(result["folder"]).name.startswith("vo2-tracking-readings-2-model-m-targets-m-period-0.5-2")
 
 
 def test_the_density_is_in_both_recordings(bench, tracked, tmp_path):

@@ -11,7 +11,10 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.journal import FILE_NAME, Record
+from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
+from bench.protocol.number_list import NumberList
 from bench.results.run_comparison import compare_runs
+from bench.run_record import run_name
 from bench.runs import Run, carry_out
 
 
@@ -124,3 +127,28 @@ def test_a_comparison_of_neither_models_nor_runs_is_refused(bench, arguments, ex
     code, _, err = bench("compare", *arguments)
     assert code in (2, 3)
     assert expected in err
+
+
+def test_the_name_of_a_folder_is_short_and_fits_every_file_system():
+    class Parameters(ProtocolParameters):
+        model: str = parameter("", unit="", help="file", file=True)
+        levels: NumberList = parameter("1", unit="1", help="some")
+        text: str = parameter("", unit="", help="any")
+        more: float = parameter(0.0, unit="1", help="any")
+
+    @protocol(needs=("tec",))
+    def try_out(parameters: Parameters) -> Messages:
+        """Try."""
+        yield Note("x")
+
+    def name(overrides, **settings):
+        changed = try_out.changed(try_out.parse(settings), {}, {})
+        return run_name(try_out, {"rig": "heater", "changed": changed, "overrides": overrides})
+
+    assert name({}) == name({}, more="0") == "heater-try-out"
+    assert name({}, model="C:\\models\\m 1.json", more="-2.50") == "heater-try-out-more--2.5-model-m-1"
+    assert name({"emulation.offset": "0.3"}, levels="1,2.5") == "heater-try-out-levels-1+2.5-offset-0.3"
+    assert name({}, text='a/b:c*"<|>?\n. ') == "heater-try-out-text-a-b-c"
+    long = name({f"table.key{i}": "0123456789" for i in range(20)}, text="x" * 500)
+    assert len(long) <= 96
+    assert long.endswith("-more")
