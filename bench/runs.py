@@ -190,7 +190,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
         }
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta)
+        journal = Journal(
+            folder / FILE_NAME, signals, meta, patience=rig_file.telemetry.period if clock.sleep_waits else None
+        )
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -199,6 +201,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             path = folder / RECORDING_NAME if run.recording else None
             dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard

@@ -68,7 +68,7 @@ class Dashboard:
         self._not_queued = self._not_written = self._reported = 0
         self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
         self._wake = threading.Event()
-        self._closing = False
+        self._closing = self._recording_stops = False
         self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
         self._thread.start()
 
@@ -87,6 +87,10 @@ class Dashboard:
     def model(self, name: str, density: Density) -> None:
         """Show the density of the model `name` under the memory curve, from now on."""
         self._put(ModelDensity(name, density), QUEUED_ENTRIES)
+
+    def stop_recording(self) -> None:
+        """Write no more into the .rrd file, as the journal needs the space; the live view goes on."""
+        self._recording_stops = True
 
     def finish(self, status: str, reason: str) -> None:
         """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
@@ -139,6 +143,8 @@ class Dashboard:
         self._writer.recording.close()
 
     def _hand_over(self) -> None:
+        if self._recording_stops:
+            self._writer.recording.stop_file()
         # In portions, so that turning them into columns does not keep the interpreter from other threads.
         while waiting := min(self._queue.qsize(), CHUNK_ROWS):
             entries = [self._queue.get() for _ in range(waiting)]
