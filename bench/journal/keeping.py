@@ -103,7 +103,7 @@ class Keeper:
 
     def make_room(self) -> None:
         """Give back the space that was kept for the end, and try to write what waits."""
-        self._reserve.unlink(missing_ok=True)
+        _remove(self._reserve)
         if self._waiting:
             self._write(list(self._waiting))
 
@@ -131,8 +131,8 @@ class Keeper:
             if mirror is not None:
                 mirror.close()
                 if is_whole and not self._waiting:
-                    mirror.path.unlink(missing_ok=True)
-        self._reserve.unlink(missing_ok=True)
+                    _remove(mirror.path)
+        _remove(self._reserve)
 
     @property
     def why(self) -> str:
@@ -235,6 +235,12 @@ class Keeper:
             self._mirror.close()
         self._mirror, self._waiting = mirror, []
         raise RecordError(f"{message}everything so far is in {self.store.path}, and the run ends here")
+
+
+def _remove(path: Path) -> None:
+    # A medium that cannot be written keeps it.
+    with suppress(OSError):
+        path.unlink()
 
 
 def _is_busy(problem: str) -> bool:
