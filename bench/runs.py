@@ -28,12 +28,14 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
+from bench.model_file import models_among
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rehearsal import Rehearsal, rehearse
 from bench.remaining_time import Expectation
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
-from bench.run_record import RIG_FILE_NAME, make_folder, metadata
+from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -80,6 +82,9 @@ class Run:
         hardware the rig file says it, `[safety] rate`.
     faults : Path, optional
         Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
+    original : Original, optional
+        The run that this one repeats: its files are read in the place of those that `settings` name, and its rig is
+        taken if it has one.
     rehearse : bool
         Whether the run is rehearsed on the emulated twin of the rig before anything moves. A run on the virtual clock
         is not, as it would take as long itself.
@@ -97,6 +102,7 @@ class Run:
     attach: Path | None = None
     interlock_rate: float | None = None
     faults: Path | None = None
+    original: Original | None = None
     rehearse: bool = True
 
 
@@ -144,7 +150,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         If a device cannot be connected; nothing has moved.
     """
     stopwatch = Stopwatch()
-    rig_file, parameters = _read(run)
+    rig_file, stated, parameters = _read(run)
+    original = run.original
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
@@ -181,29 +188,33 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
-        folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
+        models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
+        meta = _asked(run, attachment, rig_file)
+        meta |= metadata(run.protocol, stated, description, slots, planned, clock.date())
+        if original:
+            meta["repeats"] = original.meta["run"]
+            for difference in differences(original.meta, meta):
+                console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
+        folder = make_folder(run.folder, run_name(run.protocol, meta))
         if guardian is not None:
             guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = {
-            **metadata(run.protocol, parameters, description, slots, planned, clock.date()),
-            "run": folder.name,
-            "overrides": dict(run.overrides),
-            "seed": run.seed,
-            "interlock_rate": _interlock_rate(run, rig_file),
-            "rehearsal": None if rehearsal is None else rehearsal.to_json(),
-            "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
-        }
+        meta["run"] = folder.name
+        meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta)
+        patience = rig_file.telemetry.period if clock.sleep_waits else None
+        given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
             path = folder / RECORDING_NAME if run.recording else None
-            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
+            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
@@ -221,6 +232,16 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     return RunResult(folder, outcome, stopwatch.seconds())
 
 
+def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:
+    """Return what the record says of how the run was asked for."""
+    return {
+        "overrides": dict(run.overrides),
+        "seed": run.seed,
+        "interlock_rate": _interlock_rate(run, rig),
+        "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+    }
+
+
 def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) -> Rehearsal:
     """Return what a run would do and touch: rehearsed, or planned if its rig has no twin; nothing moves.
 
@@ -235,7 +256,7 @@ def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) ->
     AbortError
         If the rehearsal was asked to end.
     """
-    rig_file, parameters = _read(run)
+    rig_file, _, parameters = _read(run)
     with ExitStack() as stack:
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
@@ -253,10 +274,13 @@ def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) ->
     return rehearsal
 
 
-def _read(run: Run) -> tuple[RigFile, ProtocolParameters]:
-    rig_file = load_rig(run.rig, run.overrides)
+def _read(run: Run) -> tuple[RigFile, ProtocolParameters, ProtocolParameters]:
+    """Return the rig file, the parameters as they are stated, and with the paths of files that can be read."""
+    original = run.original
+    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
     defaults = rig_file.protocols.get(run.protocol.name)
-    return rig_file, run.protocol.parse(run.settings, rig_file.roles, defaults, path=rig_file.path)
+    stated = run.protocol.parse(run.settings, rig_file.roles, defaults, path=rig_file.path)
+    return rig_file, stated, original.readable(run.protocol, stated) if original else stated
 
 
 def _rehearsed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -217,10 +218,11 @@ def run(
     with Interrupts(say_at_once) as interrupts:
         with show_compilation():
             result = carry_out(asked, console, interrupts)
-        _print_result(result, json_file)
+        print_result(result, json_file)
 
 
-def _print_result(result: RunResult, json_file: Path | None) -> None:
+def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:
+    """Print how a run ended, write it with `more` for programs, and exit with the code of what ended it."""
     from bench.safety import SAFE
 
     outcome, ratio = result.outcome, result.time_ratio
@@ -244,6 +246,7 @@ def _print_result(result: RunResult, json_file: Path | None) -> None:
             "wall_seconds": result.wall_seconds,
             "safe_state": dict(outcome.safe_state),
             "is_safe": outcome.is_safe,
+            **(more or {}),
         },
     )
     for name, state in outcome.safe_state.items():
