@@ -4,6 +4,7 @@ import math
 import re
 import signal
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -288,3 +289,55 @@ class TestEnd:
 def seconds(text):
     hours, minutes, rest = map(int, text.split(":"))
     return 3600 * hours + 60 * minutes + rest
+
+
+class TestCommand:
+    PROTOCOL = f"{Path(__file__).parent / 'adaptive_protocols.py'}:bisect"
+    SET = ("--set", "goal=900", "--set", "low=30", "--set", "high=80")
+
+    def test_it_prints_what_the_run_would_do(self, bench, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        results = []
+        for command in (["rehearse"], ["run", "--dry-run"]):
+            result = tmp_path / f"{len(results)}.json"
+            code, out, err = bench(*command, self.PROTOCOL, "--rig", "vo2-hardware", *self.SET, "--json", result)
+            assert (code, err) == (0, "")
+            assert "bisect on vo2-hardware, rehearsed on vo2" in out
+            assert re.search(r"tec_setpoint +30 +\S+ +°C +15 to 95", out)
+            results.append(json.loads(result.read_text()))
+        assert results[0] == results[1]
+        assert results[0]["steps"] == 8
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["0.json", "1.json"]
+
+    def test_what_would_not_complete_exits_like_a_wrong_parameter(self, bench, tmp_path):
+        result = tmp_path / "result.json"
+        code, out, err = bench("rehearse", "creep", "--rig", "vo2", "--set", "cool=10", "--json", result)
+        assert code == 2
+        assert "error: tec: set-point 10 °C is outside of 15 to 95 °C" in re.sub(r"\s+", " ", out)
+        assert "in the rehearsal on vo2, protocol creep ends after 122 steps" in re.sub(r"\s+", " ", err)
+        assert json.loads(result.read_text())["status"] == "failed"
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["rehearse", "creep", "--rig", "vo3"], "there is no rig 'vo3'"),
+            (["rehearse", "crep", "--rig", "vo2"], "there is no protocol 'crep'"),
+            (["rehearse", "creep", "--rig", "vo2", "--set", "warm=1"], "there is no parameter 'warm'"),
+            (["run", "creep", "--rig", "vo2", "--dry-run", "--no-rehearse"], "leave --no-rehearse out"),
+        ],
+    )
+    def test_bad_input_is_one_message(self, bench, arguments, message):
+        code, _, err = bench(*arguments)
+        assert code == 2
+        assert message in err
+        assert err.count("error:") == 1
+
+    @pytest.mark.parametrize("terminal", [False, True])
+    def test_a_long_rehearsal_is_seen(self, make, monkeypatch, terminal):
+        monkeypatch.setattr("bench.terminal._UNSEEN", 0.0)
+        monkeypatch.setattr("bench.terminal._REFRESH", 0.0)
+        console = Console(file=io.StringIO(), width=200, force_terminal=terminal)
+        foresee(make(), console)
+        shown = console.file.getvalue()
+        assert "rehearsing stairs on heater" in shown
+        assert ("Ctrl-C ends" in shown) == terminal
