@@ -2,9 +2,9 @@
 
     python tests/faults/journal_kills.py [--rig RIG] [--times N] [--seed N]
 
-Each run is in process, by turns on the virtual clock, where the control thread writes the journal, and on a paced one,
-where a thread of its own does. It is killed by SIGKILL up to 30 ms after a random step was acknowledged. POSIX, as the
-runs are forks. The exit code is 1 if anything is lost.
+Each run is in process, by turns on the virtual clock, where the control thread writes the journal, and on a paced
+one, where a thread of its own does. It is killed by SIGKILL up to 30 ms after a random step was acknowledged. POSIX,
+as the runs are forks. The exit code is 1 if anything is lost.
 """
 
 import argparse
@@ -85,10 +85,8 @@ def _run(rig, clock, folder, writer):
         os.write(writer, b"e")
 
     Journal.step, Journal.event = told_step, told_event
-    run = Run(
-        protocol=find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}"), settings={}, seed=0, clock=clock, rig=rig,
-        folder=folder, recording=False,
-    )  # fmt: skip
+    protocol = find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}")
+    run = Run(protocol=protocol, settings={}, seed=0, clock=clock, rig=rig, folder=folder, recording=False)
     carry_out(run, Console(file=io.StringIO(), width=200))
 
 
