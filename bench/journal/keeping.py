@@ -13,7 +13,7 @@ from bench.clock import Stopwatch
 from bench.errors import RecordError
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import Mirror, elsewhere
-from bench.journal.rows import FILE_NAME, Entry, entry
+from bench.journal.rows import FILE_NAME, Entry, entry, split
 from bench.journal.store import Store
 
 RESERVE_NAME = "journal.reserve"
@@ -171,7 +171,9 @@ class Keeper:
             return False
         if self._why:
             self._why = ""
-            self.notices.append(f"the journal can be written again; {len(entries)} rows were waiting")
+            self.notices.append(
+                f"the journal can be written again; {sum(len(each.rows) for each in self._waiting)} rows were waiting"
+            )
         self._waiting = []
         return True
 
@@ -214,8 +216,8 @@ class Keeper:
     def _rescue(self, loss: str) -> None:
         """Write everything anew elsewhere, from the files that are still open, and go on there; raise RecordError."""
         former, store = self.store.path, self.store
-        rows = {(each.table, each.row[0]): each for each in ([] if self._mirror is None else self._mirror.entries())}
-        rows |= {(each.table, each.row[0]): each for each in self._waiting}
+        beside = [] if self._mirror is None else self._mirror.entries()
+        rows = {(each.table, each.row[0]): each for each in (*beside, *split(self._waiting))}
         if not self._is_whole:
             with suppress(sqlite3.Error):
                 found = [entry(table, row if table == "files" else row[:-1]) for table, row in store.rows()]

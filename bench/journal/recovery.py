@@ -149,7 +149,10 @@ def _salvage(journal: Path) -> tuple[dict[str, dict[Any, Entry]], dict[str, list
     bad: dict[str, list[Any]] = {table: [] for table in TABLES}
     if not journal.is_file():
         return rows, bad, "it is not there"
-    opened = OpenedJournal(journal)
+    try:
+        opened = OpenedJournal(journal)
+    except DataError as error:
+        return rows, bad, str(error.__cause__ or error)
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
     try:
@@ -207,7 +210,7 @@ def _checked(table: str, columns: tuple[Any, ...]) -> Entry | None:
         kept = entry(table, columns[:-1])
     except (ValueError, TypeError):
         return None
-    return kept if kept.columns() == columns else None
+    return kept if kept.columns() == [columns] else None
 
 
 def _write(

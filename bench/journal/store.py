@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from itertools import groupby
 from pathlib import Path
 
 from bench.journal.rows import Entry, table_definitions
@@ -42,7 +41,7 @@ class Store:
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Commit rows, all or none."""
-        if len(entries) == 1:
+        if len(entries) == 1 and len(entries[0].rows) == 1:
             self._insert(entries)
             return
         self._db.execute("BEGIN IMMEDIATE")
@@ -56,11 +55,11 @@ class Store:
             raise
 
     def _insert(self, entries: Iterable[Entry]) -> None:
-        for (table, size), rows in groupby(entries, key=lambda entry: (entry.table, len(entry.row))):
-            marks = ", ".join("?" * (size + (table != "files")))
+        for entry in entries:
+            marks = ", ".join("?" * (len(entry.row) + (entry.table != "files")))
             # A row that comes a second time, from the second file, is the same.
-            statement = f"INSERT OR REPLACE INTO {table} VALUES ({marks})"  # noqa: S608 - own names
-            self._db.executemany(statement, [row.columns() for row in rows])
+            statement = f"INSERT OR REPLACE INTO {entry.table} VALUES ({marks})"  # noqa: S608 - own names
+            self._db.executemany(statement, entry.columns())
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""

@@ -166,7 +166,8 @@ class Journal:
         A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
         the next tick, step or event.
         """
-        self._waiting.append((self._number("telemetry"), t, step, *map(float, values)))
+        self._counts["telemetry"] = tick = self._counts["telemetry"] + 1
+        self._waiting.append((tick, t, step, *map(float, values)))
         if self._background is not None:
             self._background.keep_soon(self._take_ticks())
         elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
@@ -250,7 +251,7 @@ class Journal:
     def _take_ticks(self) -> list[Entry]:
         """Return the ticks that wait, which wait no longer."""
         waiting, self._waiting = self._waiting, []
-        return ticks(waiting) if waiting else []
+        return [ticks(waiting)] if waiting else []
 
     def _write(self, entries: Sequence[Entry]) -> None:
         """Make rows durable, and before them the ticks that wait."""
@@ -279,5 +280,5 @@ def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
         (path.parent / RESERVE_NAME).unlink(missing_ok=True)
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
         for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
-            row = entry("meta", meta_row(key, value)).columns()
-            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", row)
+            rows = entry("meta", meta_row(key, value)).columns()
+            db.executemany("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", rows)

@@ -340,6 +340,23 @@ class TestReadOnlyMedium:
         journal.close()
 
 
+def test_one_whose_process_died_while_it_was_closed_is_read_from_a_copy(tmp_path, other_disk):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"rig.toml": b"[rig]"})
+    count = add(journal, 3)
+    journal.close()
+    with closing(sqlite3.connect(tmp_path / FILE_NAME, isolation_level=None)) as db:
+        # What SQLite would undo stands in a companion while it changes the file.
+        db.execute("PRAGMA cache_size=1")
+        db.execute("BEGIN IMMEDIATE")
+        db.execute("UPDATE steps SET label = hex(zeroblob(20000))")
+        copy = shutil.copytree(tmp_path, other_disk / "died")
+        db.execute("ROLLBACK")
+    with Record(copy) as run:
+        assert "was not closed" in run.remark
+        assert len(run.steps()) == count
+    assert f"{FILE_NAME}-journal" in files_of(copy)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 @pytest.mark.parametrize("patience", [None, 30.0], ids=["caller", "background"])
 def test_kills_at_random_moments_lose_no_acknowledged_step(tmp_path, patience):
