@@ -133,13 +133,14 @@ def _state(
     lacking = {key for key in bad if key not in good} | (set(whole) - set(good))
     missing = {key for key in bad if key not in whole}
     if table in FIRST:
-        first = FIRST[table]
-        numbers = [*whole, *(key for key in bad if isinstance(key, int)), first - 1]
-        last = int(max(numbers)) if count is None else count + first - 1
-        gone = set(range(first, last + 1)) - set(whole)
+        start = FIRST[table]
+        numbers = [*whole, *(key for key in bad if isinstance(key, int)), start - 1]
+        last = int(max(numbers)) if count is None else count + start - 1
+        gone = set(range(start, last + 1)) - set(whole)
         missing |= gone
         lacking |= gone
-    first_bad = str(min(lacking, key=lambda key: (isinstance(key, str), key))) if lacking else ""
+    first = min(lacking, key=lambda key: (isinstance(key, str), key)) if lacking else ""
+    first_bad = first if isinstance(first, str) else str(int(first))
     return TableState(len(good), added, len(missing), first_bad)
 
 

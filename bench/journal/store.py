@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
-from bench.journal.rows import Entry, table_definitions
+from bench.journal.rows import TABLES, Entry, entry, table_definitions
 
 
 class Store:
@@ -55,11 +55,11 @@ class Store:
             raise
 
     def _insert(self, entries: Iterable[Entry]) -> None:
-        for entry in entries:
-            marks = ", ".join("?" * (len(entry.row) + (entry.table != "files")))
+        for each in entries:
+            marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
             # A row that comes a second time, from the second file, is the same.
-            statement = f"INSERT OR REPLACE INTO {entry.table} VALUES ({marks})"  # noqa: S608 - own names
-            self._db.executemany(statement, entry.columns())
+            statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
+            self._db.executemany(statement, each.columns())
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -96,11 +96,11 @@ class Store:
                     return f"table {table} has {rows} rows of {count}"
         return ""
 
-    def rows(self) -> list[tuple[str, tuple[object, ...]]]:
-        """Return table and columns of every row, also of a file that has been removed."""
+    def entries(self) -> list[Entry]:
+        """Return every row, also of a file that has been removed."""
         return [
-            (table, row)
-            for table in ("meta", "signals", "steps", "telemetry", "events", "files")
+            entry(table, row if table == "files" else row[:-1])
+            for table in TABLES
             for row in self._db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
         ]
 

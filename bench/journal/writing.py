@@ -16,6 +16,7 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
@@ -91,7 +92,7 @@ class Journal:
         Raises
         ------
         DataError
-            If there is none, it is damaged or of an older schema.
+            If there is none, it is damaged or of an older schema, or cannot be written.
         ConfigurationError
             If the run has ended.
         """
@@ -121,9 +122,15 @@ class Journal:
                 f"`bench recover-journal {file}` puts them together"
             )
         journal = cls.__new__(cls)
-        keeper = Keeper(Store(file))
+        was_mirrored = (file.parent / MIRROR_NAME).exists()
         missing = [each for (table, _), each in beside.items() if table in FIRST]
-        keeper.store.write(missing)
+        try:
+            keeper = Keeper(Store(file))
+            keeper.store.write(missing)
+            if not was_mirrored:
+                keeper.begin(keeper.store.entries())
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
         for each in missing:
             counts[each.table] += 1
         journal._begin(keeper, signals, counts, patience)

@@ -147,6 +147,23 @@ class TestAnotherProgramWrites:
         assert_whole(copy, 5)
 
 
+def test_a_copy_without_its_second_file_is_written_on_and_rescued(tmp_path, other_disk):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"rig.toml": b"[rig]"})
+    add(journal, 3)
+    journal.close()
+    assert files_of(tmp_path) == [FILE_NAME]
+    journal = Journal.reopen(tmp_path)
+    add(journal, 2)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(RecordError, match="was removed"):
+        add(journal, 1)
+    journal.close()
+    with Record(journal.path) as run:
+        assert run.steps()["step"].tolist()[:5] == list(range(5))
+        assert run.files() == {"rig.toml": b"[rig]"}
+    assert journal.path.is_relative_to(other_disk)
+
+
 class TestNoSpace:
     @pytest.fixture
     def full(self):
