@@ -129,7 +129,6 @@ class ProgressDisplay:
         self._since_redraw = Stopwatch()
         times, completed = f"t {format_duration(t)}", 0.0
         if self._remaining is not None:
-            self._remaining.step(steps, t)
             left = self._remaining.at(t, self._since_start.seconds())
             completed = left.share
             times += f"  left {format_duration(left.laboratory)}, ends {_time_of_day(left.wall)}"
