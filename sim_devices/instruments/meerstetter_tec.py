@@ -510,9 +510,9 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         elif sink > values[5011]:
             self._trip(143, 5011)
         if self._status is DeviceStatus.RUN:
-            self._supervise_output(now)
+            self._supervise_output(now, plate)
 
-    def _supervise_output(self, now: float) -> None:
+    def _supervise_output(self, now: float, plate: float) -> None:
         values = self._values
         current, voltage = self._load.current, self._load.voltage
         if abs(current) > values[2032]:
@@ -527,7 +527,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._trip(108, 6320)
         if self._status is not DeviceStatus.RUN or values[2000] != CONTROLLER:
             return
-        if abs(self._load.plate_temperature - self._target()) > values[4040]:
+        if abs(plate - self._target()) > values[4040]:
             self._in_window_since = math.nan
         elif math.isnan(self._in_window_since):
             self._in_window_since = now
