@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -185,9 +186,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the watchdog: a valid package has arrived."""
-        with self.world.lock:
-            self.world.advance()
-            now = self.world.time
+        world = self.world
+        with world.lock:
+            world.advance_locked()
+            now = world.time
             if now > self._supervised_at:
                 self._supervise(now)
             self._feed(now)
@@ -226,8 +228,8 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         if not row.writable:
             raise RequestRefusedError(ServerError.READ_ONLY)
         kept = stored(row, value)
-        inside = stored(row, row.low) <= kept <= stored(row, row.high)
-        if not inside or (number == 2060 and 0.0 < value < 0.1):
+        low, high = _stored_bounds(number)
+        if not low <= kept <= high or (number == 2060 and 0.0 < value < 0.1):
             raise RequestRefusedError(ServerError.OUT_OF_RANGE)
         key = _key(number, instance)
         self._values[key] = kept
@@ -534,6 +536,13 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         late = values[4042] > 0.0 and now - self._started_at > values[4042]
         if late and self._stability() != 2:
             self._trip(182, 4042)
+
+
+@cache
+def _stored_bounds(number: int) -> tuple[float, float]:
+    """Return the range of a parameter as the device keeps it."""
+    row = PARAMETERS[number]
+    return stored(row, row.low), stored(row, row.high)
 
 
 def _rounded(value: float, resolution: float) -> float:
