@@ -79,6 +79,7 @@ _LAGS_CUTOFF = math.sqrt(math.sqrt(2.0) - 1.0)  # cut-off of two equal lags over
 _MEMORY_LAGS = 16.0  # time constants after which two lags have forgotten, to 2e-6
 _MOST_TRACKING = 255
 _FINE_LAGS = 0.5  # time constants between two looks at the force
+_FEW_LOOKS = 4  # looks that are not put off
 _MOST_ASKED = 256  # readings whose conversions wait
 _NORMALS = 256  # random numbers drawn at once
 _STILL_POLL = 0.05
@@ -287,8 +288,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if self._course is not None:
             if self._may_wait(self._course, now):
                 return math.inf
-            self._catch_up()
-            self._asked.clear()
+            if self._asked:
+                self._catch_up()
+                self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
         return _next_look(self._converted, now, self._conversion)
@@ -296,10 +298,15 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     def _may_wait(self, course: Course, now: float) -> bool:
         """Return whether the conversions for a reading at the present can wait, and note that they do."""
         asked = self._asked
+        if not asked and now - self._converted <= _FEW_LOOKS * self._conversion.fine:
+            # Sooner made than put off.
+            return False
         # Zero tracking leaves the zero between two digits.
         if self._tracking or not course.is_known or not self._zero.is_integer():
             return False
         if not asked:
+            if self._memory + kernels.COARSE > self._kept:
+                return False
             # Before the plant goes on to the present.
             self._asked_since = self.world.time
         elif asked[-1] == now:
@@ -307,8 +314,6 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         elif len(asked) == _MOST_ASKED or now - max(self._converted, asked[0] - self._memory) > self._kept:
             self._catch_up()
             self._asked_since = self.world.time
-        if self._memory + kernels.COARSE > self._kept:
-            return False
         asked.append(now)
         return True
 
