@@ -243,6 +243,8 @@ class InterlockWatch:
 
     def due_after(self, t: float) -> float:
         """Return the first such time after `t`, s; one before it waits for a signal that was not read last."""
+        if not self._restless:
+            return math.inf
         return min((due for course in self._restless if (due := course.due()) > t), default=math.inf)
 
     def look(
