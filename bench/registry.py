@@ -145,6 +145,13 @@ def import_beside(file: Path) -> None:
         sys.path.append(str(folder))
 
 
+def forget_beside(folder: Path) -> None:
+    """Take back `import_beside` for all files below a folder."""
+    gone = {each for each in _beside if each.is_relative_to(folder.resolve())}
+    _beside.difference_update(gone)
+    sys.path[:] = [entry for entry in sys.path if not entry or Path(entry) not in gone]
+
+
 def check_import(module: str) -> None:
     """Check that a file may have a module imported, as importing runs its code.
 

@@ -1,0 +1,119 @@
+"""Carrying out the tasks of a campaign: not those that were done before, and each once what it needs is there."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from bench.campaigns.tasks import UNFINISHED, Done, Task
+from bench.errors import BenchError, ConfigurationError
+from bench.locks import Holder, Locks
+from bench.workers import Pending, Workers
+
+FILE_NAME = "campaign.toml"
+"""Copy of the campaign file in the folder of the campaign."""
+
+
+class Executor(Protocol):
+    """Carries tasks out, many at a time."""
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out; all that it needs is in the folder of the campaign."""
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task that was submitted, and return it with what it left; its folder is there by then."""
+
+
+class WorkersExecutor:
+    """Carries tasks out in the worker processes of this machine.
+
+    Parameters
+    ----------
+    workers : Workers
+        That are at work.
+    campaign : Path
+        Folder of the campaign.
+    """
+
+    def __init__(self, workers: Workers, campaign: Path) -> None:
+        self._workers = workers
+        self._campaign = campaign
+        self._pending: dict[Pending[Done], Task] = {}
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out."""
+        self._pending[self._workers.submit_as(task.name, task.carry_out, self._campaign)] = task
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task."""
+        pending = next(iter(self._workers.as_completed(self._pending)))
+        task = self._pending.pop(pending)
+        return task, settled(task, pending.error, None if pending.error else pending.result())
+
+
+def settled(task: Task, error: BaseException | None, done: Done | None) -> Done:
+    """Return what a task left, also where it has raised."""
+    if done is not None:
+        return done
+    if isinstance(error, BenchError):
+        return Done(task.identity, "refused", str(error))
+    return Done(task.identity, "crashed", f"{type(error).__name__}: {error}")
+
+
+def opened_folder(campaign: Path, text: str, locks: Locks) -> None:
+    """Make the folder of a campaign ready, for one process at a time; what others left unfinished is removed.
+
+    Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
+    """
+    try:
+        campaign.mkdir(parents=True, exist_ok=True)
+        locks.take_folder(campaign)
+        shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
+        (campaign / FILE_NAME).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
+
+
+def holder(campaign: Path) -> Holder:
+    """Return who holds the folder of a campaign, for others."""
+    return Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")
+
+
+def done_before(tasks: Mapping[str, Task], campaign: Path) -> dict[str, Done]:
+    """Return what earlier starts have left, by name of the task."""
+    found = {name: task.done_before(campaign) for name, task in tasks.items()}
+    return {name: done for name, done in found.items() if done is not None}
+
+
+def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:
+    """Carry out all tasks that were not done before; return what each has left, by name, in the order of `tasks`.
+
+    A task whose needs could not be carried out is refused.
+    """
+    done: dict[str, Done] = dict(before)
+    waiting = {name: task for name, task in tasks.items() if name not in done}
+    going: set[str] = set()
+    while waiting or going:
+        for name, task in list(waiting.items()):
+            failed = [need for need in task.needs if need in done and not done[need].carried_out]
+            if failed:
+                reason = done[failed[0]].reason
+                done[name] = Done(task.identity, "refused", f"needs {failed[0]}, which was not carried out: {reason}")
+            elif all(need in done for need in task.needs):
+                going.add(name)
+                executor.submit(task)
+            else:
+                continue
+            del waiting[name]
+        if going:
+            task, result = executor.next_done()
+            going.remove(task.name)
+            done[task.name] = result
+    return {name: done[name] for name in tasks}
+
+
+def all_carried_out(done: Sequence[Done]) -> bool:
+    """Return whether all that was asked for was carried out; a run that has failed was."""
+    return all(each.carried_out for each in done)
