@@ -24,6 +24,7 @@ from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
 from bench.running import ABORT, RESUME
+from bench.workers import report
 
 _REFRESH = 0.1
 """Wall-clock seconds between two redraws of the readings."""
@@ -31,6 +32,8 @@ _REFRESH = 0.1
 
 class ProgressDisplay:
     """A progress bar with ETA and the current readings; an `Observer` of the engine.
+
+    In a worker process the bench draws the bar.
 
     Parameters
     ----------
@@ -84,14 +87,13 @@ class ProgressDisplay:
         """Show the readings of a tick, at most ten times a second."""
         if self._since_redraw.seconds() > _REFRESH:
             self._since_redraw = Stopwatch()
-            self._progress.update(self._task, completed=step, readings=self._readings(t, values))
+            self._show(step, self._readings(t, values))
 
     def step(self, record: StepRecord) -> None:
         """Advance the bar."""
         if self._since_redraw.seconds() > _REFRESH or record.step + 1 == self._progress.tasks[0].total:
             self._since_redraw = Stopwatch()
-            readings = self._readings(record.finished, record.values)
-            self._progress.update(self._task, completed=record.step + 1, readings=readings)
+            self._show(record.step + 1, self._readings(record.finished, record.values))
 
     def event(self, event: Event) -> None:
         """Show the phase beside the bar, and print warnings, errors and notes."""
@@ -102,6 +104,11 @@ class ProgressDisplay:
             self._console.print(
                 f"{_duration(event.t):>10}  {event.kind}: {event.text}", style=style, highlight=False, markup=False
             )
+
+    def _show(self, completed: int, readings: str) -> None:
+        self._progress.update(self._task, completed=completed, readings=readings)
+        total = self._progress.tasks[0].total
+        report(completed, None if total is None else int(total), readings)
 
     def _readings(self, t: float, values: Sequence[float]) -> str:
         parts = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
