@@ -17,12 +17,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from rich.console import Console
+
 from bench import registry
 from bench.campaigns.execution import settled
 from bench.campaigns.sources import code_digest, content_of
 from bench.campaigns.tasks import UNFINISHED, Done, Task
 from bench.errors import ConfigurationError, DataError
 from bench.extras import needed_for
+from bench.workers.display import TasksDisplay
 
 _CONNECTING = 30
 """Wall-clock time within which a scheduler has to answer, s."""
@@ -82,6 +85,8 @@ class ClusterExecutor:
         Of the scheduler: `tls://HOST:PORT`, or `tcp://127.0.0.1:PORT`.
     campaign : Path
         Folder of the campaign.
+    console : Console
+        Where to draw the progress.
 
     Raises
     ------
@@ -89,7 +94,7 @@ class ClusterExecutor:
         If the address is neither, nobody answers, or dask.distributed is not installed.
     """
 
-    def __init__(self, address: str, campaign: Path) -> None:
+    def __init__(self, address: str, campaign: Path, console: Console) -> None:
         check_address(address)
         with needed_for("--scheduler", "cluster"):
             import distributed
@@ -101,23 +106,21 @@ class ClusterExecutor:
             self._client = library.Client(address, security=security, timeout=_CONNECTING, set_as_default=False)
         except (OSError, TimeoutError, TypeError, ValueError) as error:
             raise ConfigurationError(f"--scheduler {address}: {type(error).__name__}: {error}") from None
-        self._completed = library.as_completed([], raise_errors=False)
+        self._completed = library.as_completed([], loop=self._client.loop, raise_errors=False)
         self._campaign = campaign
         self._tasks: dict[str, Task] = {}
+        self._display = TasksDisplay(console, f"tasks at {address}")
 
     def __enter__(self) -> Self:
+        self._display.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._display.stop()
         self._client.cancel([*self._completed.futures])
         self._client.close()
-
-    @property
-    def cores(self) -> int:
-        """Number of workers that the scheduler has now."""
-        return len(self._client.scheduler_info()["workers"])
 
     def submit(self, task: Task) -> None:
         """Have a task carried out on any worker; the tasks of a worker that dies are done again."""
@@ -127,11 +130,13 @@ class ClusterExecutor:
         future = self._client.submit(carry_out_parcel, parcel, key=f"{task.name}-{task.identity}", pure=False)
         self._tasks[future.key] = task
         self._completed.add(future)
+        self._display.add()
 
     def next_done(self) -> tuple[Task, Done]:
         """Wait for a task, and put its folder where it belongs."""
         future = next(self._completed)
         task = self._tasks.pop(future.key)
+        self._display.end(len(self._tasks), finished=True)
         if future.status != "finished":
             return task, settled(task, future.exception(), None)
         done, content = future.result()

@@ -6,28 +6,23 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bench import registry
 from bench.campaign import Study
 from bench.campaigns.file import REFERENCE, CampaignFile, ModelsTable, RunsTable, as_override, axes, dotted
+from bench.campaigns.known_rig import KnownRig
 from bench.campaigns.sources import PROGRAMS, code_digest, digest, file_digest
 from bench.campaigns.tasks import ModelTask, RunTask, StudyTask, Task
-from bench.clock import Stopwatch, VirtualClock
-from bench.description import RigDescription
 from bench.engine import check_before_moving
 from bench.errors import BenchError, ConfigurationError
-from bench.faults import read_schedule, schedule_faults
 from bench.hysteresis import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
-from bench.rig import Rig, clock_for
-from bench.rig_file import RigFile, load_rig
+from bench.rig_file import RigFile
 
 _LONGEST_NAME = 120
-_TICKS = 20
-"""Seconds of laboratory time by which the speed of a rig is measured."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")
 
 Axis = Mapping[str, Any]
@@ -87,23 +82,13 @@ def expand(file: CampaignFile) -> Expansion:
     return _Expander(file).expansion()
 
 
-@dataclass
-class _KnownRig:
-    """A rig with its overrides, connected once to be looked at; seconds of wall-clock time a second of laboratory."""
-
-    file: RigFile
-    description: RigDescription
-    pace: float
-    digest: str
-    faults: set[str] = field(default_factory=set)
-
-
 class _Expander:
     """Carries what was looked up already: a thousand runs of ten rigs connect ten."""
 
     def __init__(self, file: CampaignFile) -> None:
         self._file = file
-        self._rigs: dict[tuple[str, str], _KnownRig] = {}
+        self._rigs: dict[tuple[str, str], KnownRig] = {}
+        self._faults: set[tuple[str, str]] = set()
         self._protocols: dict[str, tuple[ProtocolDefinition, str]] = {}
         self._plans: dict[str, Plan | None] = {}
         self._digests: dict[str, str] = {}
@@ -217,7 +202,7 @@ class _Expander:
         table: RunsTable,
         protocol: str,
         rig: str,
-        known: _KnownRig,
+        known: KnownRig,
         replaced: Axis,
         chosen: Axis,
         models: Mapping[str, Sequence[str]],
@@ -355,38 +340,33 @@ class _Expander:
             self._protocols[name] = definition, source
         return self._protocols[name]
 
-    def _rig(self, where: str, name: str, overrides: Mapping[str, str]) -> _KnownRig:
+    def _rig(self, where: str, name: str, overrides: Mapping[str, str]) -> KnownRig:
         key = name, digest(overrides)
         if key not in self._rigs:
-            path = self._file.beside(name) if name.endswith(".toml") else name
             try:
-                file = load_rig(path, overrides)
-                if not file.in_process:
-                    raise ConfigurationError("not all instruments are emulated; a campaign takes emulated rigs only")
-                self._rigs[key] = _look_at(file, Path(path))
+                path = self._file.beside(name) if name.endswith(".toml") else name
+                self._rigs[key] = KnownRig.look_at(path, overrides)
             except BenchError as error:
                 with_overrides = f" with overrides {dict(overrides)}" if overrides else ""
                 raise ConfigurationError(f"{where}: rigs = {name!r}{with_overrides}: {error}") from None
         return self._rigs[key]
 
-    def _check_faults(self, where: str, known: _KnownRig, faults: str) -> None:
-        if faults in known.faults:
+    def _check_faults(self, where: str, known: KnownRig, faults: str) -> None:
+        key = known.digest, faults
+        if key in self._faults:
             return
-        path = Path(self._file.beside(faults))
         try:
-            rig = known.file
-            laboratory = rig.laboratory(rig.laboratory_settings, VirtualClock(), 0) if rig.laboratory else None
-            schedule_faults(laboratory, read_schedule(path), path)
+            known.check_faults(Path(self._file.beside(faults)))
         except ConfigurationError as error:
             raise ConfigurationError(f"{where}: faults = {faults!r}, rig {known.file.name}: {error}") from None
-        known.faults.add(faults)
+        self._faults.add(key)
 
     def _planned(
         self,
         where: str,
         definition: ProtocolDefinition,
         source: str,
-        known: _KnownRig,
+        known: KnownRig,
         given: Mapping[str, Any],
         referred: Mapping[str, str],
     ) -> tuple[Plan | None, Mapping[str, Any], list[str]]:
@@ -429,20 +409,6 @@ class _Expander:
         if path not in self._digests:
             self._digests[path] = file_digest(Path(path))
         return self._digests[path]
-
-
-def _look_at(file: RigFile, path: Path) -> _KnownRig:
-    """Connect an emulated rig for what only its devices and laboratory know, and measure how fast it is."""
-    clock = clock_for(file, "virtual")
-    with Rig(file, clock, 0) as rig:
-        rig.measure()
-        stopwatch = Stopwatch()
-        for _ in range(_TICKS):
-            clock.sleep(1.0)
-            rig.measure()
-        pace = stopwatch.seconds() / _TICKS
-        programs = file_digest(path, PROGRAMS) if path.suffix == ".toml" else ""
-        return _KnownRig(file, rig.description, pace, digest([file.content, programs]))
 
 
 def _grid(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:

@@ -5,7 +5,7 @@ A campaign file is TOML; `docs/reference/campaign.md` describes each key::
     [[runs]]                                # a grid: each protocol × rig × override × parameter × faults × seed
     name = "characterize"
     protocol = "damped-oscillation"
-    rigs = ["vo2"]
+    rigs = ["my-rig"]
     seeds = "0..9"
     [runs.parameters]
     increment = [1.0, 2.0]                  # a list is an axis of the grid
@@ -18,13 +18,13 @@ A campaign file is TOML; `docs/reference/campaign.md` describes each key::
 
     [[runs]]
     protocol = "tracking"
-    rigs = ["vo2"]
+    rigs = ["my-rig"]
     seeds = "0..9"
     [runs.parameters]
     model = "@density"                      # that of the same rig and seed
 
     [[studies]]                             # what `bench reproduce` carries out
-    name = "vo2"
+    name = "my-study"
     seeds = "0..9"
 
 Paths are relative to the file. Unknown keys are errors.

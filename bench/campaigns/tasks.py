@@ -22,6 +22,7 @@ from bench.results.models import identify_file
 from bench.results.run_folder import RunFolder
 from bench.results.tracking import results_json
 from bench.runs import Run, carry_out
+from bench.workers import Workers
 
 DONE_NAME = "campaign.json"
 """In the folder of each task that is done: what it was, and its results."""
@@ -339,9 +340,11 @@ class StudyTask(Task):
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         del campaign
         study: Study = registry.load("studies", self.study)
-        series = Campaign(self.rig or study.rig or "", scratch / "made", self.seed, False, Console(quiet=True))
-        found = study.carry_out(series)
-        return series.folder, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
+        made = scratch / "made"
+        # The cores are shared by the tasks of the campaign.
+        with Workers(1) as workers:
+            found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
+        return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
 
 
 def run_results(folder: Path) -> dict[str, tuple[float, str]]:

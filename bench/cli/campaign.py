@@ -73,7 +73,7 @@ def campaign(
 
         check_address(scheduler)
     before = done_before(expansion.tasks, folder)
-    _announce(expansion, before, workers or available_cores())
+    _announce(expansion, before, 1 if scheduler else workers or available_cores())
     if dry_run:
         _list(expansion, before)
         write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
@@ -83,7 +83,9 @@ def campaign(
         if scheduler is not None:
             from bench.campaigns.cluster import ClusterExecutor
 
-            done = carry_out_tasks(expansion.tasks, before, stack.enter_context(ClusterExecutor(scheduler, folder)))
+            done = carry_out_tasks(
+                expansion.tasks, before, stack.enter_context(ClusterExecutor(scheduler, folder, console))
+            )
         else:
             pool = stack.enter_context(Workers(workers, console, file.stem))
             done = carry_out_tasks(expansion.tasks, before, WorkersExecutor(pool, folder))
@@ -124,10 +126,9 @@ def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None
     text = ", ".join(f"{count} {kind if count == 1 else plural[kind]}" for kind, count in counts.items() if count)
     line = f"{text or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
     if estimate.laboratory_seconds:
-        line += (
-            f"; {estimate.laboratory_seconds / 3600:.1f} h of laboratory time, about "
-            f"{_duration(estimate.wall_seconds / cores)} on {cores} cores"
-        )
+        on = "1 core" if cores == 1 else f"{cores} cores"
+        hours, wall = estimate.laboratory_seconds / 3600, _duration(estimate.wall_seconds / cores)
+        line += f"; {hours:.1f} h of laboratory time, about {wall} on {on}"
         if estimate.unknown:
             line += f", and {estimate.unknown} tasks of unknown length"
     console.print(line, highlight=False)

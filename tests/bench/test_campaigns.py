@@ -212,7 +212,7 @@ class TestTasks:
             first,
             identity(("[3, 5]", "[4]")),
             identity(("[5.0, 10.0]", "5.5")),
-            identity(("[3, 5]", "[3]\nseed_offset = 1")),
+            identity(("[3, 5]", "[3]\nseed_offset = 7")),
             identity(("[3, 5]", "[3]\ninterlock_rate = 2")),
             identity(("[runs.parameters]", "[runs.overrides]\ntelemetry.period = 1.5\n[runs.parameters]")),
         }
@@ -312,7 +312,7 @@ def the_study(series):
 
 def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys):
     study = Study(str(tmp_path / "heater.toml"), "", "", the_study)
-    monkeypatch.setattr(registry, "load", lambda group, name: study)
+    monkeypatch.setattr(registry, "load", lambda *_: study)
     path = campaign("[[studies]]\nname = 'climbs'\nseeds = [1, 2, 6]\n")
     assert start(path, "--out", tmp_path / "out", "--workers", 1) == 0
     by_number = {row["number"]: row for row in rows(tmp_path / "out" / "studies.csv")}
@@ -380,9 +380,9 @@ def test_a_cluster_gives_the_same(campaign, tmp_path):
         here = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, tmp_path / "here"))
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as cluster,
-        ClusterExecutor(cluster.scheduler_address, tmp_path / "there") as executor,
+        ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor,
     ):
         there = carry_out_tasks(expansion.tasks, {}, executor)
     assert [each.status for each in there.values()] == ["completed"] * 4
