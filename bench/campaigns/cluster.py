@@ -141,7 +141,7 @@ class ClusterExecutor:
             return task, settled(task, future.exception(), None)
         done, content = future.result()
         if content:
-            unpacked(content, self._campaign / UNFINISHED / task.identity[:32], self._campaign / task.name)
+            unpacked(content, self._campaign / UNFINISHED / task.scratch, self._campaign / task.name)
         future.release()
         return task, done
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from bench.campaigns.tasks import UNFINISHED, Done, Task
+from bench.campaigns.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, Done, Task
 from bench.errors import BenchError, ConfigurationError
 from bench.locks import Holder, Locks
 from bench.workers import Pending, Workers
@@ -81,10 +82,42 @@ def holder(campaign: Path) -> Holder:
     return Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")
 
 
-def done_before(tasks: Mapping[str, Task], campaign: Path) -> dict[str, Done]:
-    """Return what earlier starts have left, by name of the task."""
-    found = {name: task.done_before(campaign) for name, task in tasks.items()}
-    return {name: done for name, done in found.items() if done is not None}
+@dataclass(frozen=True)
+class Before:
+    """What earlier starts have left.
+
+    Attributes
+    ----------
+    done : dict of str to Done
+        By name of the task.
+    places : dict of str to str
+        By name of a task the one that it had then: what differs among the runs was something else.
+    """
+
+    done: dict[str, Done]
+    places: dict[str, str]
+
+    def put_in_place(self, campaign: Path) -> None:
+        """Rename the folders of tasks that have another name now."""
+        for name, former in self.places.items():
+            (campaign / name).parent.mkdir(parents=True, exist_ok=True)
+            (campaign / former).replace(campaign / name)
+
+
+def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
+    """Return what earlier starts have left of tasks in the folder of a campaign."""
+    found = {name: task.done_in(campaign / name) for name, task in tasks.items()}
+    done = {name: each for name, each in found.items() if each is not None}
+    missing = {task.identity[:SHOWN_DIGITS]: task for name, task in tasks.items() if name not in done}
+    places: dict[str, str] = {}
+    for file in campaign.glob(f"*/*/{DONE_NAME}") if missing else ():
+        former = file.parent.relative_to(campaign).as_posix()
+        task = missing.get(former[-SHOWN_DIGITS:])
+        if task is None or former in tasks or task.name in done:
+            continue
+        if (left := task.done_in(file.parent)) is not None:
+            done[task.name], places[task.name] = left, former
+    return Before({name: done[name] for name in tasks if name in done}, places)
 
 
 def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:
@@ -93,24 +126,33 @@ def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], execu
     A task whose needs could not be carried out is refused.
     """
     done: dict[str, Done] = dict(before)
-    waiting = {name: task for name, task in tasks.items() if name not in done}
-    going: set[str] = set()
-    while waiting or going:
-        for name, task in list(waiting.items()):
-            failed = [need for need in task.needs if need in done and not done[need].carried_out]
-            if failed:
-                reason = done[failed[0]].reason
-                done[name] = Done(task.identity, "refused", f"needs {failed[0]}, which was not carried out: {reason}")
-            elif all(need in done for need in task.needs):
-                going.add(name)
-                executor.submit(task)
-            else:
-                continue
-            del waiting[name]
-        if going:
-            task, result = executor.next_done()
-            going.remove(task.name)
-            done[task.name] = result
+    missing = {name: {need for need in task.needs if need not in done} for name, task in tasks.items()}
+    users: dict[str, list[str]] = {}
+    for name, needs in missing.items():
+        for need in needs:
+            users.setdefault(need, []).append(name)
+    ready = [name for name, needs in missing.items() if name not in done and not needs]
+    going = 0
+    while ready or going:
+        for name in ready:
+            executor.submit(tasks[name])
+        going += len(ready)
+        task, result = executor.next_done()
+        going -= 1
+        ready = []
+        finished = [(task.name, result)]
+        while finished:
+            name, result = finished.pop()
+            done[name] = result
+            for user in users.get(name, ()):
+                missing[user].discard(name)
+                if user in done:
+                    continue
+                if not result.carried_out:
+                    reason = f"needs {name}, which was not carried out: {result.reason}"
+                    finished.append((user, Done(tasks[user].identity, "refused", reason)))
+                elif not missing[user]:
+                    ready.append(user)
     return {name: done[name] for name in tasks}
 
 

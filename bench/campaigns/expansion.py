@@ -10,16 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bench import registry
 from bench.campaign import Study
 from bench.campaigns.file import REFERENCE, CampaignFile, ModelsTable, RunsTable, as_override, axes, dotted
 from bench.campaigns.known_rig import KnownRig
 from bench.campaigns.sources import PROGRAMS, code_digest, digest, file_digest
-from bench.campaigns.tasks import ModelTask, RunTask, StudyTask, Task
+from bench.campaigns.tasks import SHOWN_DIGITS, ModelTask, RunTask, StudyTask, Task, identification_options
 from bench.engine import check_before_moving
 from bench.errors import BenchError, ConfigurationError
 from bench.hysteresis import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
+from bench.results.models import check_options, model_options
 from bench.rig_file import RigFile
 
 _LONGEST_NAME = 120
@@ -96,6 +99,8 @@ class _Expander:
         self._runs: dict[str, list[RunTask]] = {}
         self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
         self._several: dict[str, bool] = {}
+        self._rig_of: dict[str, KnownRig] = {}
+        self._definition_of: dict[str, ProtocolDefinition] = {}
         self._found_plans: dict[str, tuple[float, float]] = {}
         self._varying: dict[str, tuple[str, ...]] = {}
         self._units: dict[tuple[str, str], str] = {}
@@ -111,7 +116,7 @@ class _Expander:
         for number, table in enumerate(file.runs):
             self._add_runs(number, table)
             for models in [each for each in waiting if each.runs == table.label]:
-                self._add_models(models)
+                self._add_models(file.where("models", file.models.index(models)), models)
                 waiting.remove(models)
         for number, study in enumerate(file.studies):
             self._add_studies(number, study)
@@ -150,6 +155,10 @@ class _Expander:
                 f"{where}: model = {table.model!r}: there is no such model; there are: "
                 f"{', '.join(identifiable_models())}"
             ) from None
+        allowed = model_options(table.model)
+        for key in table.options:
+            if key not in allowed:
+                raise ConfigurationError(f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed)}")
         seeds = self._file.runs[known.index(table.runs)].seeds
         if table.seed is not None and table.seed not in seeds:
             raise ConfigurationError(
@@ -258,6 +267,8 @@ class _Expander:
                 )
                 self._add(task)
                 self._runs[table.label].append(task)
+                self._rig_of[task.name] = known
+                self._definition_of[task.name] = definition
                 if planned is not None:
                     self._found_plans[task.name] = (planned.seconds, planned.seconds * known.pace)
 
@@ -278,17 +289,18 @@ class _Expander:
         for chosen in itertools.product(*found.values()):
             yield dict(zip(found, chosen, strict=True))
 
-    def _add_models(self, table: ModelsTable) -> None:
+    def _add_models(self, where: str, table: ModelsTable) -> None:
         self._models[table.name] = {}
         varying = [key for key in self._varying[table.runs] if key not in ("rig", "seed")]
         self._several[table.name] = bool(varying)
         for run in self._runs[table.runs]:
             if table.seed not in (None, run.seed):
                 continue
+            self._check_identification(where, table, run)
             identity = digest({"run": run.identity, **table.model_dump(exclude={"name", "runs", "seed"})})
             base = run.name.rpartition("/")[2].rpartition("-")[0]
             task = ModelTask(
-                name=f"{table.name}/{base}{'-' * bool(base)}{identity[:8]}",
+                name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
                 identity=identity,
                 table=table.name,
                 source=run.name,
@@ -301,6 +313,27 @@ class _Expander:
             self._add(task)
             rig = self._rig_as_given(table.runs, run)
             self._models[table.name].setdefault((rig, run.seed), []).append(task)
+
+    def _check_identification(self, where: str, table: ModelsTable, run: RunTask) -> None:
+        """Check columns and options of an identification from a run."""
+        known = self._rig_of[run.name]
+        slots = known.description.slots(self._definition_of[run.name])
+        columns = {"input": (table.input, "drive"), "output": (table.output, "response")}
+        for key, (column, slot) in columns.items():
+            if not column and slot not in slots:
+                raise ConfigurationError(f"{where}: {key} is missing, as {run.protocol} has no slot {slot!r}")
+            if column and column not in known.description.by_name:
+                signals = ", ".join(known.description.by_name)
+                raise ConfigurationError(
+                    f"{where}: {key} = {column!r}: there is no such signal; there are: {signals}"
+                )
+        drive = known.file.roles.get("drive")
+        if table.input or drive is None or drive.range is None:
+            return
+        try:
+            check_options(table.model, np.linspace(*drive.range, 100), identification_options(table.options))
+        except ValueError as error:
+            raise ConfigurationError(f"{where}: {error} (rig {known.file.name})") from None
 
     def _rig_as_given(self, label: str, run: RunTask) -> str:
         table = next(each for each in self._file.runs if each.label == label)
@@ -435,4 +468,4 @@ def _name(table: str, values: Mapping[str, Any], varying: Sequence[str], identit
     """Return the folder of a task: what differs within its table, and the first digits of its identity."""
     parts = [str(values[key]) if key in ("protocol", "rig") else f"{key}={values[key]}" for key in varying]
     text = _UNSAFE.sub("_", "-".join(parts))[:_LONGEST_NAME]
-    return f"{table}/{text}{'-' * bool(text)}{identity[:8]}"
+    return f"{table}/{text}{'-' * bool(text)}{identity[:SHOWN_DIGITS]}"

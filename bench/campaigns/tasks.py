@@ -14,7 +14,7 @@ from rich.console import Console
 
 from bench import registry
 from bench.campaign import Campaign, Study
-from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS
+from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import Record
 from bench.protocol import find_protocol
@@ -26,6 +26,8 @@ from bench.workers import Workers
 
 DONE_NAME = "campaign.json"
 """In the folder of each task that is done: what it was, and its results."""
+SHOWN_DIGITS = 8
+"""Digits of its identity at the end of the name of a task."""
 MODEL_NAME = "model.json"
 """In the folder of an identification."""
 UNFINISHED = "unfinished"
@@ -79,6 +81,11 @@ class Task(ABC):
     identity: str
 
     @property
+    def scratch(self) -> str:
+        """Name of the folder in which it is carried out, its own even where another task has the same identity."""
+        return digest(self.name)[:32]
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """The names of the tasks that come before it."""
         return ()
@@ -98,7 +105,7 @@ class Task(ABC):
         Errors of the bench become a status, as they are a result of this task alone; that the operator ends it does
         not.
         """
-        scratch = campaign / UNFINISHED / self.identity[:32]
+        scratch = campaign / UNFINISHED / self.scratch
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True)
         try:
@@ -108,7 +115,7 @@ class Task(ABC):
             raise
         except BenchError as error:
             return Done(self.identity, "refused", str(error))
-        content = {"name": self.name, "task": self.describe(), **asdict(done)}
+        content = {"task": self.describe(), **asdict(done)}
         (made / DONE_NAME).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         target = campaign / self.name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -118,10 +125,10 @@ class Task(ABC):
         shutil.rmtree(scratch, ignore_errors=True)
         return done
 
-    def done_before(self, campaign: Path) -> Done | None:
-        """Return what an earlier start of the campaign has left of this task, or None."""
+    def done_in(self, folder: Path) -> Done | None:
+        """Return what this task has left in a folder, or None if it is not the folder of this task."""
         try:
-            content = json.loads((campaign / self.name / DONE_NAME).read_text(encoding="utf-8"))
+            content = json.loads((folder / DONE_NAME).read_text(encoding="utf-8"))
             results = {name: (value, unit) for name, (value, unit) in content["results"].items()}
             found = Done(content["identity"], content["status"], content["reason"], results)
         except (OSError, ValueError, KeyError, TypeError):
@@ -296,15 +303,12 @@ class ModelTask(Task):
         source = RunFolder(campaign / self.source)
         if source.status != "completed":
             raise DataError(f"the run {self.source} was not completed")
-        options: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in self.options.items()
-        }
         found = identify_file(
             source.folder,
             input_column=self.input or source.signal_of("drive"),
             output_column=self.output or source.signal_of("response"),
             model=self.model,
-            **options,
+            **identification_options(self.options),
         )
         made = scratch / "made"
         made.mkdir()
@@ -345,6 +349,11 @@ class StudyTask(Task):
         with Workers(1) as workers:
             found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
         return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
+
+
+def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options from a file as `identify_file` takes them: ranges are pairs."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
 
 
 def run_results(folder: Path) -> dict[str, tuple[float, str]]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bench.cli.console import JsonOption, console, error_console, show_compilation, write_json
+from bench.errors import AbortError
 
 if TYPE_CHECKING:
     from bench.campaigns.expansion import Expansion
@@ -73,29 +75,33 @@ def campaign(
 
         check_address(scheduler)
     before = done_before(expansion.tasks, folder)
-    _announce(expansion, before, 1 if scheduler else workers or available_cores())
+    _announce(expansion, before.done, 1 if scheduler else workers or available_cores())
     if dry_run:
-        _list(expansion, before)
+        _list(expansion, before.done)
         write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
         return
     with ExitStack() as stack:
+        stack.enter_context(_saying_how_to_go_on(folder))
         opened_folder(folder, file.read_text(encoding="utf-8-sig"), stack.enter_context(Locks(holder(folder))))
+        # Another process may have been at work here until it was locked.
+        before = done_before(expansion.tasks, folder)
+        before.put_in_place(folder)
         if scheduler is not None:
             from bench.campaigns.cluster import ClusterExecutor
 
             done = carry_out_tasks(
-                expansion.tasks, before, stack.enter_context(ClusterExecutor(scheduler, folder, console))
+                expansion.tasks, before.done, stack.enter_context(ClusterExecutor(scheduler, folder, console))
             )
         else:
             pool = stack.enter_context(Workers(workers, console, file.stem))
-            done = carry_out_tasks(expansion.tasks, before, WorkersExecutor(pool, folder))
+            done = carry_out_tasks(expansion.tasks, before.done, WorkersExecutor(pool, folder))
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     files = _show(expansion, done, folder)
     failed = {name: each for name, each in done.items() if not each.carried_out}
     for name, each in failed.items():
         error_console.print(f"{each.status}: {name}: {each.reason}", highlight=False, markup=False, soft_wrap=True)
     console.print(
-        f"{len(done) - len(failed)} of {len(done)} carried out, {len(before)} of them before, "
+        f"{len(done) - len(failed)} of {len(done)} carried out, {len(before.done)} of them before, "
         f"in {stopwatch.seconds():.1f} s: {folder}",
         highlight=False,
         markup=False,
@@ -114,6 +120,14 @@ def campaign(
     )
     if not all_carried_out([*done.values()]):
         sys.exit(1)
+
+
+@contextmanager
+def _saying_how_to_go_on(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except AbortError as error:
+        raise AbortError(f"{error}; what is done is in {folder}, and the same command goes on from there") from None
 
 
 def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None:
