@@ -33,8 +33,8 @@ _UNSEEN = 2.0
 class ProgressDisplay:
     """A bar with steps, laboratory time, what is left, and the current readings; an `Observer` of the engine.
 
-    Times are laboratory times from the start of the run; the end is a time of day. In a worker process the bench draws
-    the bar.
+    Times are laboratory times from the start of the run; the end is a time of day. A worker process has the bar drawn
+    by its bench.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -218,7 +218,10 @@ class _Expander:
     ) -> None:
         """Add the runs of one point of the grid: its faults, seeds, and the models of each."""
         definition, source = self._protocol(where, protocol)
-        given = {key: self._located(definition, key, value) for key, value in chosen.items()}
+        given = {
+            key: self._file.beside(value) if key in definition.file_parameters and _is_path(value) else value
+            for key, value in chosen.items()
+        }
         referred = {key: str(given.pop(key))[1:] for key in models if str(given[key]).startswith(REFERENCE)}
         planned, resolved, inputs = self._planned(where, definition, source, known, given, referred)
         for key in chosen:
@@ -231,10 +234,10 @@ class _Expander:
                     {
                         "code": code_digest(),
                         "rig": known.digest,
-                        "protocol": [protocol, source],
+                        "protocol": [definition.name, source],
                         "parameters": resolved,
                         "models": {key: task.identity for key, task in sources.items()},
-                        "inputs": [self._digest(each) for each in inputs],
+                        "inputs": {key: self._digest(each) for key, each in inputs.items()},
                         "seed": seed + table.seed_offset,
                         "faults": self._digest(path) if path else "",
                         "interlock_rate": table.interlock_rate,
@@ -262,14 +265,14 @@ class _Expander:
                     overrides={key: as_override(value) for key, value in replaced.items()},
                     faults=path,
                     interlock_rate=table.interlock_rate,
-                    inputs=tuple(inputs),
+                    inputs=tuple(inputs.values()),
                     model_labels=labels,
                 )
                 self._add(task)
                 self._runs[table.label].append(task)
                 self._rig_of[task.name] = known
                 self._definition_of[task.name] = definition
-                if planned is not None:
+                if planned is not None and planned.complete:
                     self._found_plans[task.name] = (planned.seconds, planned.seconds * known.pace)
 
     def _sources(
@@ -402,8 +405,8 @@ class _Expander:
         known: KnownRig,
         given: Mapping[str, Any],
         referred: Mapping[str, str],
-    ) -> tuple[Plan | None, Mapping[str, Any], list[str]]:
-        """Check parameters on a rig; return the plan if there is one, all parameters, and the files among them."""
+    ) -> tuple[Plan | None, Mapping[str, Any], Mapping[str, str]]:
+        """Check parameters on a rig; return the plan if there is one, the parameters, and the files among them."""
         file = known.file
         try:
             # The path of a model that does not exist yet is a text like any other.
@@ -413,10 +416,13 @@ class _Expander:
                 file.protocols.get(definition.name),
                 path=file.path,
             )
+            files = {name: path for name, path in definition.files(parameters).items() if name not in referred}
+            # Of a file its content counts, not its place.
+            left_out = {*files, *referred}
             resolved = {
-                key: value for key, value in parameters.model_dump(mode="json").items() if key not in referred
+                key: value for key, value in parameters.model_dump(mode="json").items() if key not in left_out
             }
-            key = digest([definition.name, source, known.digest, resolved, *referred])
+            key = digest([definition.name, source, known.digest, resolved, files, *referred])
             if key not in self._plans:
                 slots = known.description.slots(definition)
                 known.description.check_needs(definition.name, definition.names)
@@ -427,21 +433,16 @@ class _Expander:
         except BenchError as error:
             of = f" (rig {file.name}{''.join(f', {key} = {value}' for key, value in given.items())})"
             raise ConfigurationError(f"{where}: parameters{of}: {error}") from None
-        inputs = [value for value in resolved.values() if isinstance(value, str) and value and Path(value).is_file()]
-        return self._plans[key], resolved, inputs
-
-    def _located(self, definition: ProtocolDefinition, key: str, value: object) -> object:
-        """Return the value of a parameter; the path of a file beside the campaign file as one from here."""
-        del definition, key
-        if isinstance(value, str) and value and not value.startswith(REFERENCE):
-            beside = Path(self._file.beside(value))
-            return str(beside) if beside.is_file() else value
-        return value
+        return self._plans[key], resolved, files
 
     def _digest(self, path: str) -> str:
         if path not in self._digests:
             self._digests[path] = file_digest(Path(path))
         return self._digests[path]
+
+
+def _is_path(value: object) -> TypeGuard[str]:
+    return isinstance(value, str) and not value.startswith(REFERENCE)
 
 
 def _grid(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
