@@ -16,7 +16,7 @@ protocol = "damped-oscillation"
 rigs = ["vo2"]
 seeds = "1..8"
 [runs.parameters]
-increment = 0.3
+increment = 0.6
 """
 
 
