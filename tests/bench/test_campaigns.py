@@ -377,14 +377,15 @@ def test_no_other_scheduler_is_trusted(address, campaign, tmp_path, capsys):
         assert not (tmp_path / "out").exists()
 
 
-def test_a_cluster_gives_the_same(campaign, tmp_path):
+def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     distributed = pytest.importorskip("distributed")
     program = tmp_path / "mine.py"
     program.write_text(PROTOCOLS.read_text())
-    # What the rig file imports goes with it if it stands beside it.
-    shutil.copy(Path(__file__).with_name("heater_laboratory.py"), tmp_path)
+    # What the rig file imports goes with it if it stands beside it; here it is found nowhere else.
+    shutil.copy(Path(__file__).with_name("heater_laboratory.py"), tmp_path / "shipped_laboratory.py")
     chain = CHAIN.replace("0..1", "0..0").replace("[0.1, 0.2]", "0.1")
     path = campaign(chain + STAIRS.replace(str(PROTOCOLS), "mine.py"), ("[3, 5]", "3"), ("[5.0, 10.0]", "5.0"))
+    rig_file(("heater_laboratory:", "shipped_laboratory:"))
     expansion = expand(read_campaign(path))
     with Workers(1) as workers:
         here = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, tmp_path / "here"))

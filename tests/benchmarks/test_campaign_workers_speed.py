@@ -14,9 +14,9 @@ CAMPAIGN = """
 [[runs]]
 protocol = "damped-oscillation"
 rigs = ["vo2"]
-seeds = "1..8"
+seeds = "1..12"
 [runs.parameters]
-increment = 0.6
+increment = 0.3
 """
 
 
