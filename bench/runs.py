@@ -203,7 +203,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         meta["run"] = folder.name
         meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta, files | {RIG_FILE_NAME: rig_file.text.encode()})
+        patience = rig_file.telemetry.period if clock.sleep_waits else None
+        given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -212,6 +214,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             path = folder / RECORDING_NAME if run.recording else None
             dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
