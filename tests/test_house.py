@@ -40,6 +40,7 @@ WHERE_LINES_ARE_OPENED = {
     "bench/face.py",
     "bench/guardian/__main__.py",
     "bench/guardian/process.py",
+    "bench/rehearsal.py",
     "bench/runs.py",
     "bench/station/local.py",
 }

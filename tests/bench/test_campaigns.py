@@ -338,7 +338,8 @@ def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_
     with Workers(2) as workers:
 
         def kill_one():
-            while not any(file.stat().st_size > 100_000 for file in out.glob(f"{UNFINISHED}/*/*/*-wal")):
+            # Once its journal is there a run is going on, for a second at least.
+            while not any(out.glob(f"{UNFINISHED}/*/*/journal.sqlite")):
                 if over.wait(0.01):
                     return
             process = next(iter(workers._processes))
