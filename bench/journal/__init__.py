@@ -1,9 +1,12 @@
 """The durable record of a run: one SQLite file, written before any observer is notified.
 
-The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
-it is handed over; what `Journal` has returned from survives a crash of the process and of the machine.
-Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
-becomes one self-contained file, which can be read where nothing can be written.
+The file is in WAL mode with synchronous=FULL, and every step and event is committed when it is handed over, with the
+telemetry before it; what `Journal` has returned from survives a crash of the process and of the machine. Everything
+else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it becomes one
+self-contained file, which can be read where nothing can be written.
+
+While a run goes on, a second file has every row once more (`bench.journal.mirror`). Where the journal cannot be
+written, a row is durable in that one, and goes into the journal later; see docs/reference/journal.md.
 
 Schema, version 3
 -----------------
