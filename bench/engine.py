@@ -302,6 +302,7 @@ class Engine:
         finished = self._clock.now() - self._run.zero
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
+            self._journal.make_room()
             self._run.take_news()
             if error is not None:
                 self._run.event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)
@@ -320,7 +321,7 @@ class Engine:
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:
-    """Check the plan of a dry run against the rig's devices and limits.
+    """Check the plan of a run against the rig's devices and limits.
 
     Raises ConfigurationError if the rig lacks something, or a set-point would leave a device's limits; nothing has
     moved.

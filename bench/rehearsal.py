@@ -365,6 +365,12 @@ class _Kept:
         if self._others > LONGEST:
             raise ConfigurationError(self._endless.format(f"{LONGEST} notes"))
 
+    def take_notices(self) -> list[str]:
+        return []
+
+    def make_room(self) -> None:
+        pass
+
     def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
         pass
 

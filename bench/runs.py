@@ -203,7 +203,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         meta["run"] = folder.name
         meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta, files | {RIG_FILE_NAME: rig_file.text.encode()})
+        patience = rig_file.telemetry.period if clock.sleep_waits else None
+        given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -212,6 +214,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             path = folder / RECORDING_NAME if run.recording else None
             dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
@@ -309,11 +312,11 @@ def _rehearsed(
 def _expectation(rehearsal: Rehearsal | None, planned: Plan) -> Expectation | None:
     """Return when the steps of a run are expected to end, None if that is not known."""
     if rehearsal is not None:
-        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most, rehearsal.prompted)
+        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most)
     # A plan with steps that may take much longer than their least time says nothing of the end.
     if planned.complete and planned.at_most <= _DEFINITE * planned.seconds:
         marks = tuple(enumerate(planned.finished, 1))
-        return Expectation(marks, planned.seconds, planned.at_most, planned.prompted)
+        return Expectation(marks, planned.seconds, planned.at_most)
     return None
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
+import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +35,24 @@ _TABLES = (
     "text TEXT NOT NULL, checksum INTEGER NOT NULL)",
     "files (name TEXT PRIMARY KEY, sha256 TEXT NOT NULL, content BLOB NOT NULL)",
 )
+
+TABLES = ("meta", "signals", "steps", "telemetry", "events", "files")
+
+_PATTERNS = {
+    "meta": "tt",
+    "signals": "ntttn",
+    "steps": "nnntttt",
+    "telemetry": "nnn",
+    "events": "nnttt",
+    "files": "ttt",
+}
+"""The kinds of a row's columns, numbers or texts; one number a signal may follow."""
+
+TEXTS = {table: pattern.count("t") for table, pattern in _PATTERNS.items()}
+"""Quantity of texts in a row."""
+
+_FEW_ROWS = 3
+"""Rows for which numpy takes longer than it saves."""
 
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
@@ -131,21 +152,100 @@ def canonical(numbers: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return array
 
 
-def checksum(row: Sequence[str | float | None]) -> int:
-    """Return the CRC-32 of a row.
+class Entry(NamedTuple):
+    """Rows that are to be kept: one, or several of the telemetry.
 
-    It is that of the row's numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign,
-    without a sign of zero), then of its texts in their order (UTF-8, each followed by a zero byte).
-
-    Raises ValueError or TypeError if there is neither a number nor a text.
+    Attributes
+    ----------
+    table : str
+        Their table.
+    rows : sequence of tuple
+        Their columns without the checksum.
+    payload : bytes
+        Row by row: its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without
+        a sign of zero), then its texts in their order (UTF-8, each followed by a zero byte). Their CRC-32 is the
+        row's checksum.
     """
-    result = zlib.crc32(
-        canonical([math.nan if value is None else value for value in row if not isinstance(value, str)]).tobytes()
-    )
-    for text in row:
-        if isinstance(text, str):
-            result = zlib.crc32(text.encode() + b"\0", result)
-    return result
+
+    table: str
+    rows: Sequence[tuple[Any, ...]]
+    payload: bytes
+
+    @property
+    def row(self) -> tuple[Any, ...]:
+        """The first row."""
+        return self.rows[0]
+
+    def columns(self) -> Sequence[tuple[Any, ...]]:
+        """Return the rows as they stand in their table."""
+        if self.table == "files":
+            return self.rows
+        content = memoryview(self.payload)
+        size = len(content) // len(self.rows)
+        return [(*row, zlib.crc32(content[size * i : size * (i + 1)])) for i, row in enumerate(self.rows)]
+
+
+def entry(table: str, row: Sequence[Any]) -> Entry:
+    """Return a row as it is kept.
+
+    Raises ValueError or TypeError if one of its values is neither a number nor a text, nor the content of a file.
+    """
+    numbers, texts = [], []
+    for value in row:
+        if isinstance(value, str):
+            texts.append(value.encode())
+        elif isinstance(value, bytes):
+            texts.append(base64.b64encode(value))
+        else:
+            numbers.append(math.nan if value is None else value)
+    return Entry(table, (tuple(row),), b"".join((_packed(numbers), *(text + b"\0" for text in texts))))
+
+
+def ticks(rows: Sequence[tuple[float, ...]]) -> Entry:
+    """Return rows of the telemetry as they are kept."""
+    payload = b"".join(map(_packed, rows)) if len(rows) <= _FEW_ROWS else canonical(rows).tobytes()
+    return Entry("telemetry", rows, payload)
+
+
+def split(entries: Iterable[Entry]) -> Iterator[Entry]:
+    """Yield an entry a row."""
+    for several in entries:
+        size = len(several.payload) // len(several.rows)
+        for i, row in enumerate(several.rows):
+            yield Entry(several.table, (row,), several.payload[size * i : size * (i + 1)])
+
+
+def _packed(numbers: Sequence[float]) -> bytes:
+    """Return numbers as `canonical` does, faster for one row."""
+    numbers = [number + 0.0 for number in numbers]
+    # With infinities the sum is nan as well.
+    if (total := sum(numbers)) != total:
+        numbers = [number if number == number else math.nan for number in numbers]
+    return struct.pack(f"<{len(numbers)}d", *numbers)
+
+
+def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
+    """Return the row of a payload that begins with `count` numbers, or None if it is none of the table's."""
+    if 8 * count > len(payload):
+        return None
+    numbers = list(np.frombuffer(payload, dtype="<f8", count=count).tolist())
+    try:
+        texts: list[Any] = payload[8 * count :].decode().split("\0")[:-1]
+    except UnicodeDecodeError:
+        return None
+    if table == "files" and len(texts) == 3:
+        texts[2] = base64.b64decode(texts[2])
+    pattern = _PATTERNS[table]
+    values = iter(numbers), iter(texts)
+    if TEXTS[table] != len(texts) or pattern.count("n") > count:
+        return None
+    row = [next(values[kind == "t"]) for kind in pattern]
+    return *row, *values[0]
+
+
+def checksum(row: Sequence[str | float | None]) -> int:
+    """Return the CRC-32 of a row, see `Entry`; raise ValueError or TypeError if it has neither number nor text."""
+    return zlib.crc32(entry("", row).payload)
 
 
 def checksums(numbers: npt.NDArray[np.float64]) -> list[int]:

@@ -33,6 +33,7 @@ from bench.hysteresis import (
 )
 from bench.hysteresis.documents import Model
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
+from bench.journal.rows import Entry
 from bench.layout import DashboardLayout, XYPlot
 from bench.model_file import ModelFile
 from bench.protocol import TRACES
@@ -264,7 +265,8 @@ def keep_journal(
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
-    journal._db.execute("BEGIN")
+    rows: list[Entry] = []
+    journal._keeper.keep, keep = rows.extend, journal._keeper.keep  # type: ignore[method-assign]
     for entry in entries:
         if isinstance(entry, StepRecord):
             journal.step(entry)
@@ -272,7 +274,8 @@ def keep_journal(
             journal.event(entry)
         else:
             journal.telemetry(*entry)
-    journal._db.execute("COMMIT")
+    journal._keeper.keep = keep  # type: ignore[method-assign]
+    keep(rows)
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
     if models is None:
@@ -1063,6 +1066,19 @@ def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, mus
             assert (abs(loop - colour).sum(axis=2) < 60).sum() > 10
     for plane, is_drawn in zip(np.array_split(below, 3, axis=1), (True, True, False), strict=True):
         assert ((abs(plane - (255, 226, 138)).sum(axis=2) < 60).sum() > 100) == is_drawn
+
+
+def test_a_recording_that_stops_is_complete_until_then(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with make_dashboard(path) as dashboard:
+        feed(dashboard, 5)
+        wait_until(lambda: not dashboard._queue.qsize())
+        dashboard.stop_recording()
+        feed_batches(dashboard, lambda: not dashboard._writer.recording._streams)
+        size = path.stat().st_size
+        feed(dashboard, 1000, start=1000)
+    assert path.stat().st_size == size
+    assert len(read(path)) > 0
 
 
 def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> None:
