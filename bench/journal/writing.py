@@ -46,6 +46,9 @@ class Journal:
         What is known at the start; values that JSON can hold.
     files : mapping of str to bytes
         Content of the files that the run was given, by name.
+    flushed : bool
+        Whether each step and event waits until it is on the disk, so that a loss of power takes nothing either.
+        Otherwise the disk gets the journal at its end, and the death of the process alone takes nothing.
 
     Attributes
     ----------
@@ -65,11 +68,15 @@ class Journal:
         signals: Sequence[Signal],
         meta: Mapping[str, Any],
         files: Mapping[str, bytes] = MappingProxyType({}),
+        *,
+        flushed: bool = True,
     ) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
         check_names([signal.name for signal in signals])
         self._open(path, signals)
+        if not flushed:
+            self._db.execute("PRAGMA synchronous=NORMAL")
         with self._transaction():
             for statement in table_definitions([signal.name for signal in signals]):
                 self._db.execute(statement)
