@@ -91,6 +91,12 @@ class GuardianError(BenchError):
     exit_code = 7
 
 
+class RecordError(BenchError):
+    """The journal of a run is damaged, or rows are missing in it; `bench recover-journal` says how far it is good."""
+
+    exit_code = 8
+
+
 class AbortError(BenchError):
     """The operator, or the operating system, ended the run; the safe state was reached."""
 

@@ -10,7 +10,9 @@ Schema, version 3
 -----------------
 `meta(key, value, checksum)`
     Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
-    extends and the overrides), `overrides`, `protocol`, `parameters`, `slots` (device and signal by name), `seed`,
+    extends and the overrides), `overrides`, `protocol`, `protocol_source` (its module, whether that is of an
+    installed package, and the checksum of its file), `parameters`, `changed` (those that differ from their defaults),
+    `repeats` (the run that this one repeats), `slots` (device and signal by name), `seed`,
     `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
     0), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
     whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),
@@ -38,7 +40,7 @@ Versions 1 and 2, which are still read, have neither checksums nor files, and a 
 models stand in files beside the journal, see `add_model`. Version 1 has 1 for each `settled`.
 """
 
-from bench.journal.card import run_card
+from bench.journal.card import expected_steps, run_card
 from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
@@ -56,5 +58,6 @@ __all__ = [
     "abandon",
     "add_model",
     "check_names",
+    "expected_steps",
     "run_card",
 ]
