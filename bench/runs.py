@@ -314,11 +314,11 @@ def _rehearsed(
 def _expectation(rehearsal: Rehearsal | None, planned: Plan) -> Expectation | None:
     """Return when the steps of a run are expected to end, None if that is not known."""
     if rehearsal is not None:
-        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most, rehearsal.prompted)
+        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most)
     # A plan with steps that may take much longer than their least time says nothing of the end.
     if planned.complete and planned.at_most <= _DEFINITE * planned.seconds:
         marks = tuple(enumerate(planned.finished, 1))
-        return Expectation(marks, planned.seconds, planned.at_most, planned.prompted)
+        return Expectation(marks, planned.seconds, planned.at_most)
     return None
 
 

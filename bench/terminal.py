@@ -33,9 +33,8 @@ _UNSEEN = 2.0
 class ProgressDisplay:
     """A bar with steps, laboratory time, what is left, and the current readings; an `Observer` of the engine.
 
-    Times are laboratory times from the start of the run; the end is a time of day.
-
-    In a worker process the bench draws the bar.
+    Times are laboratory times from the start of the run; the end is a time of day. A worker process has the bar drawn
+    by its bench.
 
     Parameters
     ----------
@@ -132,7 +131,6 @@ class ProgressDisplay:
         self._since_redraw = Stopwatch()
         times, completed = f"t {format_duration(t)}", 0.0
         if self._remaining is not None:
-            self._remaining.step(steps, t)
             left = self._remaining.at(t, self._since_start.seconds())
             completed = left.share
             times += f"  left {format_duration(left.laboratory)}, ends {_time_of_day(left.wall)}"
@@ -146,7 +144,7 @@ class ProgressDisplay:
             times=times,
             readings="  ".join(readings),
         )
-        report(steps, self._steps or None, "  ".join([f"t {format_duration(t)}", *readings]))
+        report(steps, self._steps or None, "  ".join([times, *readings]))
 
 
 class RehearsalDisplay:
