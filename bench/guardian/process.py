@@ -521,14 +521,17 @@ class Guardian:
                 self._core.trip(_as_bench_error(error))
 
     def _take_part(self, job: _Job, result: Result) -> None:
+        if job.error is not None:
+            return
+        if result.error is not None:
+            # At once: what the others say does not matter any more, and one of them may take long.
+            job.error = result.error
+            job.failed(job.error)
+            return
         job.waiting.discard(result.device)
         job.values[result.device] = result.value
-        job.error = job.error or result.error
         job.was_late = job.was_late or result.was_away
         if job.waiting:
-            return
-        if job.error is not None:
-            job.failed(job.error)
             return
         try:
             job.done(job.values)
