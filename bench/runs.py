@@ -205,7 +205,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         signals = description.signals + trace_signals(run.protocol, description, slots)
         patience = rig_file.telemetry.period if clock.sleep_waits else None
         given = files | {RIG_FILE_NAME: rig_file.text.encode()}
-        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
+        # A run on the virtual clock moves nothing, and is done again in the time that its flushes would take.
+        flushed = clock.sleep_waits
+        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience, flushed=flushed)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []

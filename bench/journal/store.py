@@ -17,10 +17,13 @@ class Store:
     ----------
     path : Path
         The file; it is created if there is none.
+    flushed : bool
+        Whether each commit waits for the disk.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, flushed: bool = True) -> None:
         self.path = path
+        self._synchronous = "FULL" if flushed else "NORMAL"
         self._connect()
         made = path.stat()
         self._file = made.st_dev, made.st_ino
@@ -29,7 +32,7 @@ class Store:
         # One thread at a time, see `Keeper`.
         self._db = sqlite3.connect(self.path, timeout=0.0, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
+        self._db.execute(f"PRAGMA synchronous={self._synchronous}")
 
     def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
         """Make the tables, with their first rows."""
