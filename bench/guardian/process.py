@@ -104,7 +104,7 @@ class Guardian:
         self._wake, self._woken = socket.socketpair()
         for each in (self._wake, self._woken):
             each.setblocking(False)
-        self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
+        self._lines = LineThreads(rig.devices, lines_of(rig.file), rig.clock, self._longest_away, self._line_was_away)
         self._looking: set[str] = set()
         self._latest: dict[str, dict[str, float]] = {}
         self._concerned = {name: self._signals_of(name) for name in self._looked_at}
@@ -409,7 +409,7 @@ class Guardian:
         self._news += news_of(findings)
 
     def _longest_away(self, name: str) -> float:
-        longest = longest_away(self._rig, name)
+        longest = longest_away(self._rig.file, self._rig.devices, name)
         return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:

@@ -499,9 +499,7 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
 
     @property
     def _moving(self) -> bool:
-        if self._trajectory is not None and self.world.time < self._trajectory.end:
-            return True
-        return abs(self._velocity) > self._values[24] * VELOCITY_UNIT
+        return self.is_moving or abs(self._velocity) > self._values[24] * VELOCITY_UNIT
 
     @property
     def _shut_down(self) -> bool:
@@ -649,8 +647,7 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
     def _follow(self) -> None:
         """Bring the shaft to where it is now."""
         now = self.world.time
-        elapsed = now - self._followed_at
-        self._followed_at = now
+        elapsed, self._followed_at = now - self._followed_at, now
         if elapsed > 0.0:
             settled = self._ambient_temperature + FULL_LOAD_HEATING * self._output * self._output
             self._temperature = settled + (self._temperature - settled) * math.exp(-elapsed / HEATING_TIME)
