@@ -190,14 +190,9 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
         return self._trajectory is not None and self.world.time < self._trajectory.end
 
     def position_after(self, seconds: float) -> float:
-        """Return where the profile brings the shaft within some seconds, rad, for a plant on its way there.
-
-        The load is left out of account: a plant that is one takes `position`.
-        """
+        """Return where the profile alone brings the shaft within some seconds, rad, for a plant that is no load."""
         with self.world.lock:
-            if self._trajectory is None:
-                return self._angle
-            return self._trajectory.at(self.world.time + seconds)[0]
+            return self._angle if self._trajectory is None else self._trajectory.at(self.world.time + seconds)[0]
 
     @property
     def holds(self) -> bool:
