@@ -30,17 +30,15 @@ from bench.errors import (
 )
 from bench.interrupts import Interrupts
 from bench.journal import Journal
+from bench.past import Resumption, reprime
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
-from bench.protocol.vocabulary import Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
+from bench.protocol.vocabulary import PROMPT, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
 from bench.rig import Look
 from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, traced
 from bench.safety import SAFE
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.station.interface import Station
-
-PROMPT = "prompt"
-"""Label of the reading that follows a prompt."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +106,13 @@ class Engine:
         for text in warnings:
             self._run.event("WARN", "start", text)
 
-    def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
-        """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
+    def run(
+        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None = None
+    ) -> Outcome:
+        """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception.
+
+        With a past it goes on where its record ends, once the specimen is back where it was.
+        """
         start = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
         if isinstance(self._clock, PacedClock):
@@ -117,7 +120,7 @@ class Engine:
         self._clock.suspension()  # what was before the run does not concern it
         error: Exception | None = None
         try:
-            self._carry_out(definition, parameters)
+            self._carry_out(definition, parameters, past)
         # Every exit path leads through the safe state and the end of the record, after any exception.
         except Exception as caught:
             error = caught
@@ -130,21 +133,30 @@ class Engine:
             safe_state = self._station.end()
         return self._finish(error, start, safe_state)
 
-    def _carry_out(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> None:
+    def _carry_out(
+        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None
+    ) -> None:
         run = self._run
         run.judge(self._clock.now(), self._station.look(Look.GLANCE))
-        messages = definition.start(parameters, self._station.description.slots(definition))
+        slots = self._station.description.slots(definition)
+        messages = definition.start(parameters, slots) if past is None else past.fed.messages
+        waiting = None if past is None else past.fed.message
         reading: Reading | None = None
         try:
+            if past is not None and waiting is not None:
+                run.expect_ticks("the specimen is brought back")
+                reprime(run, past, self._settle_or_raise)
             while True:
                 self._station.promise(self._patience, "the protocol computes")
                 try:
                     # The first `send` of a generator has to be that of None.
-                    message = messages.send(reading)  # type: ignore[arg-type]
+                    message = waiting or messages.send(reading)  # type: ignore[arg-type]
                 except StopIteration:
                     return
                 run.raise_if_aborted()
-                reading = None
+                waiting, reading = None, None
+                if past is not None:
+                    past.fed.check_fresh(message)
                 if isinstance(message, Phase):
                     run.phase = message.name
                     run.event("INFO", "phase", message.name)
@@ -160,6 +172,11 @@ class Engine:
             # What a protocol does or raises while it is closed must not hide why the run ends.
             with suppress(Exception):
                 messages.close()
+
+    def _settle_or_raise(self, settle: Settle) -> None:
+        failure = self._settle(settle, self._clock.now())[1]
+        if failure is not None:
+            raise failure
 
     def _step(self, step: Step) -> Reading:
         if isinstance(step.settle, UntilSteady):
