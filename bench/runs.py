@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import getpass
-import importlib.metadata
 import os
-import platform
-import shutil
-import subprocess
 import sys
 import threading
 from collections.abc import Mapping
@@ -19,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.attachment import AttachedClock, Attachment, attach
+from bench.attachment import Attachment, attach
 from bench.binding import Slots
-from bench.clock import Clock, Stopwatch, wall_time
+from bench.clock import Clock, Stopwatch
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
@@ -32,9 +27,10 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
-from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.protocol import LATENESS, TRACES, ProtocolDefinition, plan
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
+from bench.run_record import RIG_FILE_NAME, make_folder, metadata
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -44,10 +40,8 @@ if TYPE_CHECKING:
     from bench.dashboard import Dashboard
 
 RECORDING_NAME = "run.rrd"
-RIG_FILE_NAME = "rig.toml"
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
-_PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
 
 
 @dataclass(frozen=True)
@@ -183,11 +177,18 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
-        folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
         if guardian is not None:
             guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = _metadata(run, station, parameters, slots, expected, folder.name)
+        meta = {
+            **metadata(run.protocol, parameters, description, slots, expected, clock.epoch),
+            "run": folder.name,
+            "overrides": dict(run.overrides),
+            "seed": run.seed,
+            "interlock_rate": run.interlock_rate if guardian is None else rig_file.safety.rate,
+            "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+        }
         signals = description.signals + trace_signals(run.protocol, description, slots)
         journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
@@ -266,87 +267,3 @@ def trace_signals(protocol: ProtocolDefinition, description: RigDescription, slo
     signal = description.by_name[controlled]
     traces = (replace(trace, unit=signal.unit, precision=signal.precision) for trace in TRACES)
     return (*traces, LATENESS)
-
-
-def _metadata(
-    run: Run, station: Station, parameters: ProtocolParameters, slots: Slots, expected: Plan, name: str
-) -> dict[str, Any]:
-    file, clock = station.description.file, station.clock
-    return {
-        "run": name,
-        "rig": file.name,
-        "rig_title": file.rig.title,
-        "rig_file": file.text,
-        "rig_content": file.content,
-        "overrides": dict(run.overrides),
-        "protocol": run.protocol.name,
-        "protocol_summary": run.protocol.summary,
-        "parameters": parameters.model_dump(mode="json"),
-        "controls": run.protocol.controlled(slots),
-        "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
-        "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
-        "seed": run.seed,
-        "interlock_rate": run.interlock_rate if file.in_process and run.attach is None else file.safety.rate,
-        "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
-        "epoch": clock.epoch.isoformat(),
-        "devices": {name: str(device.identity) for name, device in station.description.devices.items()},
-        "calibration": {
-            **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
-            **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
-        },
-        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
-        "operator": _operator(),
-        "command": sys.argv,
-        "packages": {package: _version(package) for package in _PACKAGES},
-        "git": _git_state(),
-        "host": {
-            "name": platform.node(),
-            "system": platform.platform(),
-            "python": platform.python_version(),
-            "started": wall_time().isoformat(),
-        },
-    }
-
-
-def _make_folder(parent: Path, name: str) -> Path:
-    stamp = wall_time().strftime("%Y%m%d-%H%M%S")
-    for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
-        folder = parent / f"{name}-{stamp}{suffix}"
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
-        return folder
-    raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
-
-
-def _operator() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):
-        return "unknown"
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _git_state() -> str:
-    git = shutil.which("git")
-    if git is None:
-        return "unknown"
-    here = Path(__file__).parent
-
-    def ask(*arguments: str) -> str | None:
-        answer = subprocess.run([git, *arguments], cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
-        return answer.stdout.strip() if answer.returncode == 0 else None
-
-    commit = ask("rev-parse", "--short=12", "HEAD")
-    if commit is None:
-        return "unknown"
-    return commit + (" with changes" if ask("status", "--porcelain") else "")
