@@ -57,6 +57,10 @@ class DeviceRestartedError(DeviceError):
     """An instrument has restarted since it was connected: its settings are lost, and it has to be connected again."""
 
 
+class WatchdogError(DeviceError):
+    """An instrument is in error as its watchdog has expired: its host was silent, and the output is off since then."""
+
+
 class LimitError(DeviceError):
     """A set-point lies outside of the limits of the device; it was not sent."""
 
@@ -77,6 +81,12 @@ class GuardianError(BenchError):
     """The process that holds the lines of the instruments was lost, or ended the run as its bench did not answer."""
 
     exit_code = 7
+
+
+class AgreementError(BenchError):
+    """A resumed run did not find the specimen as its record left it; it was ended in the safe state."""
+
+    exit_code = 9
 
 
 class AbortError(BenchError):

@@ -136,7 +136,14 @@ class Locks:
             what = f"{identity.maker} {identity.model}, serial number {number}"
             self._take({f"instrument {what}".lower(): what})
 
-    def _take(self, wanted: dict[str, str]) -> None:
+    def take_run(self, folder: Path) -> None:
+        """Take the folder of a run, whose record one process writes.
+
+        Raises ConfigurationError if another process, or another bench of this one, holds it.
+        """
+        self._take({f"run {os.path.normcase(folder.resolve())}": f"run {folder}"}, f"run {folder.name} is going on")
+
+    def _take(self, wanted: dict[str, str], refusal: str = "") -> None:
         with ExitStack() as taken:
             # Two benches that ask in the same order cannot refuse each other.
             for name in sorted(wanted.keys() - self._taken):
@@ -147,7 +154,7 @@ class Locks:
                     file = _take_file(_path(name))
                 if file is None:
                     raise ConfigurationError(
-                        f"rig {self._holder.rig} is in use: {wanted[name]} is held by {_holder(name)}; wait for it, "
+                        f"{refusal or f'rig {self._holder.rig} is in use'}: {wanted[name]} is held by {_holder(name)}; wait for it, "
                         "or end it"
                     )
                 taken.callback(_free, _path(name), file)

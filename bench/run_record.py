@@ -16,6 +16,7 @@ from bench.binding import Slots
 from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
+from bench.past.changes import protocol_file, protocol_sources
 from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters
 
 RIG_FILE_NAME = "rig.toml"
@@ -57,6 +58,8 @@ def metadata(
         "rig_content": file.content,
         "protocol": protocol.name,
         "protocol_summary": protocol.summary,
+        "protocol_file": protocol_file(protocol),
+        "protocol_sources": protocol_sources(protocol),
         "parameters": parameters.model_dump(mode="json"),
         "controls": protocol.controlled(slots),
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},

@@ -27,6 +27,8 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
+from bench.locks import Holder, Locks
+from bench.past import Interrupted
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, plan
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
@@ -115,7 +117,9 @@ class RunResult:
         return self.outcome.laboratory_seconds / self.wall_seconds
 
 
-def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) -> RunResult:
+def carry_out(
+    run: Run, console: Console, interrupts: Interrupts | None = None, again: Interrupted | None = None
+) -> RunResult:
     """Carry a run out, keep its record, and leave the rig in the safe state.
 
     Parameters
@@ -126,6 +130,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         Where progress is shown.
     interrupts : Interrupts, optional
         At work already, and for longer than the run; without them the run has its own.
+    again : Interrupted, optional
+        The run that died and is taken up; see `bench.resume`.
 
     Raises
     ------
@@ -146,6 +152,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         clock, attachment = _clock(run, rig_file, stack)
+        if again is not None:
+            again.continue_time(clock)
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
         clock.interrupted = interrupts.abort_requested
@@ -177,20 +185,31 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
-        folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        resumption = None
+        if again is not None:
+            resumption = again.fed(run.protocol, parameters, slots, description, by_hand=guardian is None)
+            folder = again.folder
+        else:
+            folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+            locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
+            locks.take_run(folder)
         if guardian is not None:
             guardian.keep_record(folder)
-        (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta = {
             **metadata(run.protocol, parameters, description, slots, expected, clock.epoch),
             "run": folder.name,
+            "rig_given": str(Path(run.rig).resolve()) if run.rig.endswith(".toml") else run.rig,
             "overrides": dict(run.overrides),
             "seed": run.seed,
             "interlock_rate": run.interlock_rate if guardian is None else rig_file.safety.rate,
             "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
         }
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta)
+        if again is not None and resumption is not None:
+            journal = again.reopen(folder / FILE_NAME, resumption, meta, clock.now())
+        else:
+            (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
+            journal = Journal(folder / FILE_NAME, signals, meta)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -208,7 +227,7 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         ask = partial(ask_operator, console) if operator_is_there else None
         engine = Engine(station, journal, observers, interrupts, ask)
         engine.warn(warnings)
-        outcome = engine.run(run.protocol, parameters)
+        outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()

@@ -199,10 +199,11 @@ def run(
     with Interrupts(say_at_once) as interrupts:
         with show_compilation():
             result = carry_out(asked, console, interrupts)
-        _print_result(result, json_file)
+        print_result(result, json_file)
 
 
-def _print_result(result: RunResult, json_file: Path | None) -> None:
+def print_result(result: RunResult, json_file: Path | None) -> None:
+    """Print how a run ended, and leave with its exit code."""
     from bench.safety import SAFE
 
     outcome, ratio = result.outcome, result.time_ratio

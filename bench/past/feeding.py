@@ -10,7 +10,7 @@ from typing import NoReturn
 import numpy as np
 
 from bench.errors import BenchError, ConfigurationError
-from bench.journal import Event, Record, StepRecord, Table
+from bench.journal import Record, StepRecord, Table
 from bench.past.corners import corners, turning_points
 from bench.protocol.parameters import ProtocolDefinition
 from bench.protocol.vocabulary import (
@@ -71,8 +71,6 @@ class Past:
         Their units.
     ticks : Table
         Its telemetry.
-    resumes : int
-        How often it was resumed before.
     last : float
         Laboratory time of the last row, s.
     """
@@ -82,7 +80,6 @@ class Past:
     names: tuple[str, ...]
     units: Mapping[str, str]
     ticks: Table
-    resumes: int
     last: float
 
     @classmethod
@@ -96,7 +93,6 @@ class Past:
             names=tuple(signal.name for signal in record.signals),
             units={signal.name: signal.unit for signal in record.signals},
             ticks=ticks,
-            resumes=sum(is_resumption(event) for event in events),
             last=max(times, default=0.0),
         )
 
@@ -105,15 +101,6 @@ class Past:
         t = self.ticks["t"]
         rows = (self.ticks["step"] == step.step) & (t >= step.started) & (t <= step.finished)
         return Table({name: column[rows] for name, column in self.ticks.columns.items()})
-
-
-RESUMED = "resumed"
-"""Kind of the event with which a later process takes a run up."""
-
-
-def is_resumption(event: Event) -> bool:
-    """Return whether an event says that a later process has taken the run up."""
-    return event.kind == RESUMED
 
 
 @dataclass

@@ -10,11 +10,14 @@ import numpy as np
 
 from bench.devices import Signal
 from bench.errors import AgreementError
-from bench.past.feeding import RESUMED, Fed
+from bench.past.feeding import Fed
 from bench.rig import Look
 from bench.running import RunAtHand
 from bench.settling import Settle
 from bench.units import format_numbers
+
+RESUMED = "resumed"
+"""Kind of the events of a process that takes a run up."""
 
 NO_STEP = -1
 """Step number of telemetry that belongs to no step."""
@@ -159,5 +162,3 @@ def _noise(fed: Fed, name: str) -> float:
 
 def _spread(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
     return float(np.std(values, ddof=1))
-
-

@@ -1,0 +1,130 @@
+"""A run that died, as it is taken up: what it is compared with, and where it goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.binding import Slots
+from bench.clock import Clock, wall_time
+from bench.description import RigDescription
+from bench.journal import Event, Journal
+from bench.past.changes import check_unchanged
+from bench.past.feeding import Past, feed
+from bench.past.repriming import RESUMED, Resumption
+from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
+
+_DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_sources")
+"""What is kept of each process that takes a run up."""
+
+
+@dataclass(frozen=True)
+class Interrupted:
+    """A run that died.
+
+    Attributes
+    ----------
+    folder : Path
+        Its folder.
+    meta : mapping
+        What its journal says of it as a whole.
+    past : Past
+        What it has recorded.
+    written : datetime
+        Time of day of its last row.
+    sigmas : float
+        See `Resumption`.
+    accept_changes, accept_disagreement : bool
+        Whether to go on although something has changed, or the specimen is not as it was.
+    """
+
+    folder: Path
+    meta: Mapping[str, Any]
+    past: Past
+    written: datetime
+    sigmas: float
+    accept_changes: bool
+    accept_disagreement: bool
+
+    @property
+    def seed(self) -> int:
+        """The seed of a new emulated laboratory: that of the run, and the number of times it was taken up.
+
+        Its noise is another one; with the same seed it would come again from the beginning.
+        """
+        return int(np.random.SeedSequence((self.meta["seed"], len(self._resumes) + 1)).generate_state(1)[0])
+
+    @property
+    def _resumes(self) -> list[dict[str, Any]]:
+        resumes: list[dict[str, Any]] = self.meta.get("resumes", [])
+        return resumes
+
+    def continue_time(self, clock: Clock) -> None:
+        """Let a clock go on with the laboratory time of the run; raises ConfigurationError if it cannot."""
+        clock.go_on(datetime.fromisoformat(self.meta["epoch"]), self.past.last)
+
+    def fed(
+        self,
+        definition: ProtocolDefinition,
+        parameters: ProtocolParameters,
+        slots: Slots,
+        description: RigDescription,
+        by_hand: bool,
+    ) -> Resumption:
+        """Feed the protocol what was recorded; raises ConfigurationError if it does other than that."""
+        fed = feed(definition, definition.start(parameters, slots), self.past)
+        measured = [slot.signal for slot in slots.values()]
+        if not measured:
+            setpoints = {f"{name}_setpoint" for name in description.devices}
+            measured = [signal.name for signal in description.signals if signal.name not in setpoints]
+        traced = {signal.name for signal in (*TRACES, LATENESS)}
+        compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
+        return Resumption(fed, compared, self.sigmas, not self.accept_disagreement, by_hand)
+
+    def reopen(self, path: Path, resumption: Resumption, now: Mapping[str, Any], t: float) -> Journal:
+        """Open the journal to write on, and note in it that the run is taken up, by whom, and after which step.
+
+        Parameters
+        ----------
+        path : Path
+            The journal.
+        resumption : Resumption
+            The run, as it goes on.
+        now : mapping
+            Metadata of the run as it would be started now.
+        t : float
+            Laboratory time, s.
+
+        Raises
+        ------
+        ConfigurationError
+            If something has changed and that is not accepted.
+        """
+        then = {**self.meta, **(self._resumes[-1] if self._resumes else {})}
+        # As JSON has it: a tuple becomes a list.
+        changes = check_unchanged(then, json.loads(json.dumps(now, default=str)), self.accept_changes)
+        step = resumption.fed.step
+        assert step is not None
+        gap = (wall_time() - self.written).total_seconds()
+        entry = {
+            "t": t,
+            "after_step": step.step,
+            "gap_seconds": gap,
+            "seed": self.seed,
+            "changes": changes,
+            "ended": {key: self.meta[key] for key in ("status", "reason") if key in self.meta},
+            **{key: now[key] for key in _DESCRIBED if key in now},
+        }
+        journal = Journal.reopen(path, {"resumes": [*self._resumes, entry]})
+        label = f" ({step.label})" if step.label else ""
+        text = f"resumed by {now['operator']} after step {step.step}{label}; it had stood for {gap:.0f} s"
+        journal.event(
+            Event(t, "INFO", RESUMED, text + (f"; accepted changes: {'; '.join(changes)}" if changes else ""))
+        )
+        return journal

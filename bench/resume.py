@@ -1,0 +1,140 @@
+"""Resuming a run that died: what is read from its record, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from bench.errors import ConfigurationError
+from bench.interrupts import Interrupts
+from bench.journal import SCHEMA, Record
+from bench.locks import Holder, Locks
+from bench.past import Interrupted, Past
+from bench.past.changes import find_recorded
+from bench.rig_file import load_rig
+from bench.runs import Run, RunResult, carry_out
+from bench.upkeep.opening import opened
+from bench.upkeep.recovery import clear_expired_watchdogs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resume:
+    """What to resume, and how.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder of the run, or its journal.
+    rig : str, optional
+        Where its rig file is now; the one that it was started with if not given.
+    attach : Path, optional
+        Endpoints file of `bench emulate`, for a run on a laboratory that is served elsewhere.
+    sigmas : float
+        Standard deviations by which the specimen may differ from the last readings of the record.
+    accept_changes : bool
+        Whether to go on although the protocol, the content of the rig or a version has changed.
+    accept_disagreement : bool
+        Whether to go on although the specimen is not as the record left it.
+    live : bool
+        Whether to serve the live view on the loopback interface.
+    """
+
+    folder: Path
+    rig: str | None = None
+    attach: Path | None = None
+    sigmas: float = 5.0
+    accept_changes: bool = False
+    accept_disagreement: bool = False
+    live: bool = False
+
+
+def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None) -> RunResult:
+    """Go on with a run that died, in its own record, from its last finished step.
+
+    Parameters
+    ----------
+    asked : Resume
+        What to resume.
+    console, interrupts
+        As in `carry_out`.
+
+    Raises
+    ------
+    DataError
+        If it is no run, or its record is damaged or of an older schema.
+    ConfigurationError
+        If it was completed, goes on, has no finished step, or something has changed since; nothing has moved.
+    DeviceError
+        If a device cannot be connected, or is in an error that the death of the run did not cause.
+    """
+    with ExitStack() as stack:
+        with Record(asked.folder) as record:
+            folder, meta = record.path.parent, record.meta
+        locks = stack.enter_context(Locks(Holder.of_this_process(str(meta.get("rig")), "bench resume")))
+        locks.take_run(folder)
+        with Record(folder) as record:
+            _check_can_be_resumed(record, asked.folder)
+            meta, past = record.meta, Past.of(record)
+        if not any(not step.settled.failed for step in past.steps):
+            raise ConfigurationError(f"{asked.folder} has no finished step to go on from; start the run anew")
+        written = max(file.stat().st_mtime for file in folder.glob(f"{record.path.name}*"))
+        again = Interrupted(
+            folder=folder,
+            meta=meta,
+            past=past,
+            written=datetime.fromtimestamp(written, UTC),
+            sigmas=asked.sigmas,
+            accept_changes=asked.accept_changes,
+            accept_disagreement=asked.accept_disagreement,
+        )
+        run = _run_of(asked, meta, again)
+        if asked.attach is not None or not load_rig(run.rig, run.overrides).in_process:
+            with opened(run.rig, run.overrides, asked.attach, "bench resume") as place:
+                for name, meaning in clear_expired_watchdogs(place).items():
+                    console.print(f"{name}: cleared: {meaning}", highlight=False, markup=False, soft_wrap=True)
+        return carry_out(run, console, interrupts, again)
+
+
+def _check_can_be_resumed(record: Record, given: Path) -> None:
+    meta = record.meta
+    if record.status == "completed":
+        raise ConfigurationError(f"{given} was completed; there is nothing to resume")
+    if meta["schema"] != SCHEMA or "rig_given" not in meta:
+        raise ConfigurationError(
+            f"{given} was recorded by an older version, which did not record all that it takes to resume a run; start "
+            "it anew"
+        )
+
+
+def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
+    """Return the run as it was started, on a laboratory with a seed of its own."""
+    overrides: Mapping[str, str] = meta["overrides"]
+    if asked.rig is not None and (name := load_rig(asked.rig, overrides).name) != meta["rig"]:
+        raise ConfigurationError(f"{asked.folder} is a run on rig {meta['rig']}; {name} is another one")
+    attached = str(meta["clock"]).startswith("attached")
+    if attached is not (asked.attach is not None):
+        raise ConfigurationError(
+            f"{asked.folder} is a run on a laboratory that another process served; give its endpoints file by --attach"
+            if attached
+            else f"--attach: {asked.folder} is a run on rig {meta['rig']} itself, not on a served laboratory"
+        )
+    return Run(
+        protocol=find_recorded(meta["protocol"], meta["protocol_file"]),
+        settings=meta["parameters"],
+        rig=asked.rig or meta["rig_given"],
+        overrides=overrides,
+        seed=again.seed,
+        clock="wall" if attached else meta["clock"],
+        folder=again.folder.parent,
+        live=asked.live,
+        # The recording is made from the journal afterwards, whole.
+        recording=False,
+        attach=asked.attach,
+        interlock_rate=meta["interlock_rate"],
+    )
