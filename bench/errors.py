@@ -58,7 +58,7 @@ class DeviceRestartedError(DeviceError):
 
 
 class WatchdogError(DeviceError):
-    """An instrument is in error as its watchdog has expired: its host was silent, and the output is off since then."""
+    """An instrument is in error as its watchdog has expired: its host was silent, and its output went off."""
 
 
 class LimitError(DeviceError):

@@ -153,9 +153,9 @@ class Locks:
                     WallClock().sleep(_WRITING)
                     file = _take_file(_path(name))
                 if file is None:
+                    why = refusal or f"rig {self._holder.rig} is in use"
                     raise ConfigurationError(
-                        f"{refusal or f'rig {self._holder.rig} is in use'}: {wanted[name]} is held by {_holder(name)}; wait for it, "
-                        "or end it"
+                        f"{why}: {wanted[name]} is held by {_holder(name)}; wait for it, or end it"
                     )
                 taken.callback(_free, _path(name), file)
                 _write(file, self._holder)

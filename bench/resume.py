@@ -107,8 +107,8 @@ def _check_can_be_resumed(record: Record, given: Path) -> None:
         raise ConfigurationError(f"{given} was completed; there is nothing to resume")
     if meta["schema"] != SCHEMA or "rig_given" not in meta:
         raise ConfigurationError(
-            f"{given} was recorded by an older version, which did not record all that it takes to resume a run; start "
-            "it anew"
+            f"{given} was recorded by an older version, which did not record all that it takes to resume a run; "
+            "start it anew"
         )
 
 
@@ -120,7 +120,7 @@ def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
     attached = str(meta["clock"]).startswith("attached")
     if attached is not (asked.attach is not None):
         raise ConfigurationError(
-            f"{asked.folder} is a run on a laboratory that another process served; give its endpoints file by --attach"
+            f"{asked.folder} is a run on a laboratory that another process served; name its endpoints by --attach"
             if attached
             else f"--attach: {asked.folder} is a run on rig {meta['rig']} itself, not on a served laboratory"
         )

@@ -18,9 +18,7 @@ def resume(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run.")],
     sigmas: Annotated[
         float,
-        typer.Option(
-            min=0.1, max=1000.0, help="Standard deviations by which the specimen may differ from the record."
-        ),
+        typer.Option(min=0.1, max=1000, help="Standard deviations by which the specimen may differ from the record."),
     ] = 5.0,
     accept_changes: Annotated[
         bool,
@@ -40,9 +38,7 @@ def resume(
     ] = None,
     attach: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Endpoints file of `bench emulate --json`, if the run was attached to one."
-        ),
+        typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`, if the run was attached."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")

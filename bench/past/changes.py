@@ -70,8 +70,8 @@ def check_unchanged(then: Mapping[str, Any], now: Mapping[str, Any], accepted: b
     if found and not accepted:
         more = f", and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
         raise ConfigurationError(
-            f"the run was started with another {'; '.join(found[:_MOST_NAMED])}{more}. Restore that, or go on all the "
-            "same with --accept-changes"
+            f"the run was started with another {'; '.join(found[:_MOST_NAMED])}{more}. Restore that, or go on all "
+            "the same with --accept-changes"
         )
     return tuple(found)
 
@@ -98,4 +98,4 @@ def _belongs(module: ModuleType, first: ModuleType) -> bool:
     if "." in first.__name__:
         return module.__name__.partition(".")[0] == top
     here, there = getattr(first, "__file__", None), getattr(module, "__file__", None)
-    return bool(here and there) and Path(here).parent == Path(there).parent
+    return here is not None and there is not None and Path(here).parent == Path(there).parent

@@ -153,8 +153,8 @@ class Fed:
         """
         if isinstance(message, FixedRate) and any(message.controller is used for used in self.spent):
             raise ConfigurationError(
-                f"the fast loop {message.label!r} goes on with a controller of a loop before it, whose state is not in "
-                "the record; the run cannot be resumed from here, carry it out anew"
+                f"the fast loop {message.label!r} goes on with a controller of a loop before it, whose state is not "
+                "in the record; the run cannot be resumed from here, carry it out anew"
             )
 
     def settle_at(self, place: Place, period: float) -> Settle:
@@ -233,8 +233,8 @@ def _failed(message: Message, record: StepRecord, names: Sequence[str]) -> bool:
 
 def _differs(definition: ProtocolDefinition, how: str) -> NoReturn:
     raise ConfigurationError(
-        f"protocol {definition.name} does other than the record says, so it cannot be resumed: {how}; resume with the "
-        "protocol and the files that the run was started with"
+        f"protocol {definition.name} does other than the record says, so it cannot be resumed: {how}; resume with "
+        "the protocol and the files that the run was started with"
     )
 
 
