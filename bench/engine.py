@@ -206,6 +206,7 @@ class Engine:
         latest = started + message.timeout
         low, high = message.limits or (limits.low, limits.high)
         command: Command | None = None
+        seen: list[float] = []
         try:
             while True:
                 latest += run.pause_if_asked()
@@ -218,9 +219,10 @@ class Engine:
                 run.trace = traced(trace)
                 values |= run.trace
                 run.record_tick(now, values)
+                seen.append(now)
                 if command.done:
                     setpoints = {message.actuator: command.setpoint}
-                    return run.finish_step(started, message.label, setpoints, values, Settled.CONTROLLED)
+                    return run.finish_step(started, message.label, setpoints, values, Settled.CONTROLLED, seen)
                 if not low <= command.setpoint <= high:
                     raise LimitError(
                         message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"

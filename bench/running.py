@@ -164,8 +164,9 @@ class RunAtHand:
         setpoints: Mapping[str, float],
         values: Mapping[str, float],
         settled: Settled,
+        seen: Sequence[float] = (),
     ) -> Reading:
-        """Write a step down, then notify the observers."""
+        """Write a step down, then notify the observers; a controller was given the ticks of the times `seen`, s."""
         finished = self.clock.now()
         record = StepRecord(
             step=self.steps,
@@ -176,6 +177,7 @@ class RunAtHand:
             settled=settled,
             setpoints=setpoints,
             values=tuple(values[name] for name in self.names),
+            seen=tuple(seen),
         )
         self._journal.step(record)
         self.steps += 1

@@ -18,12 +18,14 @@ Schema, version 3
     that is going on or whose process died.
 `signals(position, name, unit, description, precision, checksum)`
     One row a signal column of the two tables below.
-`steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, checksum)`
+`steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, seen, checksum)`
     One row a finished step, numbered from 0; times are laboratory s; `settled` says how (`dwell`, `steady`,
     `arrived`, `controlled`; `not steady` or `not arrived` in the step that ended a run); `setpoints` is JSON by
-    device; then one REAL column a signal, the reading.
+    device; then one REAL column a signal, the reading; `seen` is JSON: the times of the ticks that a controller was
+    given, from which its state can be rebuilt.
 `telemetry(tick, t, step, "<signal>", …, checksum)`
-    One row a tick of a hold, numbered from 1: quick readings.
+    One row a tick of a hold, numbered from 1: quick readings. `step` is that which the tick belongs to; -1 on the
+    way back of a run that is resumed. A step that was not finished when its run died has ticks of both attempts.
 `events(event, t, level, kind, text, checksum)`
     Phases, notes, pauses, suspensions of the machine, interlocks, errors, safe state, the factor that a paced clock
     reached; numbered from 1; level is `INFO`, `WARN` or `ERROR`.

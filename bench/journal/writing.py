@@ -32,6 +32,9 @@ from bench.journal.rows import (
 _LONGEST_UNWRITTEN = 0.1
 """Wall-clock time after which a tick is committed, s."""
 
+_END = ("status", "reason", "finished", "safe_state", "counts")
+"""Entries of the metadata that a run has once it has ended."""
+
 
 class Journal:
     """Writes the record of one run.
@@ -84,20 +87,24 @@ class Journal:
         self._begin(dict(FIRST))
 
     @classmethod
-    def reopen(cls, path: Path) -> Self:
-        """Open the record of an unfinished run to write on: its steps, ticks and events are numbered on.
+    def reopen(cls, path: Path, meta: Mapping[str, Any] = MappingProxyType({})) -> Self:
+        """Open the record of a run that was not completed to write on: steps, ticks and events are numbered on.
+
+        Its end, if it had one, is taken back.
 
         Parameters
         ----------
         path : Path
             The journal, or the folder of the run that holds it.
+        meta : mapping
+            Further entries of the metadata.
 
         Raises
         ------
         DataError
             If there is none, it is damaged or of an older schema.
         ConfigurationError
-            If the run has ended.
+            If the run was completed.
         """
         with Record(path) as record:
             file, signals = record.path, record.signals
@@ -105,13 +112,18 @@ class Journal:
                 raise DataError(
                     f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on"
                 )
-            if "status" in record.meta:
-                raise ConfigurationError(f"{file} is the record of a run that has ended: {record.status}")
+            if record.status == "completed":
+                raise ConfigurationError(f"{file} is the record of a run that was completed")
             tables = {"steps": record.steps(), "telemetry": record.telemetry(), "events": record.events()}
             following = {table: FIRST[table] + len(rows) for table, rows in tables.items()}  # type: ignore[arg-type]
         journal = cls.__new__(cls)
         journal._open(file, signals)
         journal._begin(following)
+        with journal._transaction():
+            for key in _END:
+                journal._db.execute("DELETE FROM meta WHERE key = ?", (key,))
+            for key, value in meta.items():
+                journal._put_meta(key, value)
         return journal
 
     def _open(self, path: Path, signals: Sequence[Signal]) -> None:
@@ -129,7 +141,7 @@ class Journal:
         marks = ", ?" * len(self.signals)
         self._waiting: list[tuple[float, ...]] = []
         self._since_write = Stopwatch()
-        self._insert_step = f"INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?, ?{marks}, ?)"  # noqa: S608 - marks only
+        self._insert_step = f"INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?, ?{marks}, ?, ?)"  # noqa: S608 - marks only
         self._insert_tick = f"INSERT INTO telemetry VALUES (?, ?, ?{marks}, ?)"  # noqa: S608 - marks only
 
     @property
@@ -164,6 +176,7 @@ class Journal:
             record.settled.value,
             json.dumps({name: float(value) for name, value in record.setpoints.items()}),
             *map(float, record.values),
+            json.dumps(record.seen),
         )
         self._write(self._insert_step, row)
 

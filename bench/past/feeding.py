@@ -31,6 +31,9 @@ from bench.settling import Dwell, Settle
 _LEAST_TURN = 0.01
 """Smallest turn under a controller that counts as a corner, as a share of what the actuator went through."""
 
+_LAST_PART = 0.1
+"""Share of a long way to a place that is left for the last step."""
+
 _REMARKS = {Phase: "phase", Note: "note"}
 _FEWEST_TICKS = 5
 """Periods of the telemetry that a place is held where the run held none."""
@@ -139,12 +142,22 @@ class Fed:
         return self.past.steps[-1].step + 1 if self.past.steps else 0
 
     def way_back(self) -> list[Place]:
-        """Return the shortest way to the state in which the record left the specimen, its last place last."""
+        """Return the shortest way to the state in which the record left the specimen, its last place last.
+
+        A place to which the run came by a small step is not jumped at from far, as that would overshoot it: there is
+        a stop before it.
+        """
         found: set[int] = set()
         for actuator in {name for place in self.places for name in place.setpoints}:
             first = next(i for i, place in enumerate(self.places) if actuator in place.setpoints)
             found |= {first + i for i in corners([place.setpoints[actuator] for place in self.places[first:]])}
-        return [self.places[i] for i in sorted(found)]
+        way: list[Place] = []
+        for i in sorted(found):
+            place, own = self.places[i], self.places[i - 1] if i else None
+            if way and own is not None and (near := _approach(way[-1], own, place)):
+                way.append(replace(place, setpoints={**place.setpoints, **near}))
+            way.append(place)
+        return way
 
     def check_fresh(self, message: Message) -> None:
         """Check that a fast loop does not go on with a controller whose state the record does not hold.
@@ -222,6 +235,16 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
             fed.message = message
             return fed
         reading = _Feeding(definition, fed, steps.pop(0)).reading_of(message)
+
+
+def _approach(start: Place, own: Place, end: Place) -> dict[str, float]:
+    """Return where to stop on the way to a place, for each actuator that goes further than the run itself did."""
+    stops = {}
+    for name, value in end.setpoints.items():
+        jump = value - start.setpoints.get(name, value)
+        if abs(jump) > abs(value - own.setpoints.get(name, value)):
+            stops[name] = value - _LAST_PART * jump
+    return stops
 
 
 def _failed(message: Message, record: StepRecord, names: Sequence[str]) -> bool:

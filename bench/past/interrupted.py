@@ -85,7 +85,8 @@ class Interrupted:
             measured = [signal.name for signal in description.signals if signal.name not in setpoints]
         traced = {signal.name for signal in (*TRACES, LATENESS)}
         compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
-        return Resumption(fed, compared, self.sigmas, not self.accept_disagreement, by_hand)
+        drive = slots["drive"].signal if "drive" in slots else ""
+        return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand)
 
     def reopen(self, path: Path, resumption: Resumption, now: Mapping[str, Any], t: float) -> Journal:
         """Open the journal to write on, and note in it that the run is taken up, by whom, and after which step.

@@ -25,6 +25,9 @@ NO_STEP = -1
 _READINGS = 10
 """Readings of which mean and noise are compared with the record."""
 
+_MOVED = 5.0
+"""Standard deviations by which a drive has to move so that a slope can be told."""
+
 _TICKS = 50
 """Ticks at the end of the record from which the noise is taken."""
 
@@ -42,6 +45,8 @@ class Resumption:
         The protocol, with its past.
     compared : tuple of str
         Signals that have to agree with the last readings of the record.
+    drive : str
+        Signal of the slot `drive`; empty if there is none.
     sigmas : float
         Standard deviations by which they may differ, beside one unit of the last digit that is shown.
     required : bool
@@ -52,6 +57,7 @@ class Resumption:
 
     fed: Fed
     compared: tuple[str, ...]
+    drive: str
     sigmas: float
     required: bool
     by_hand: bool
@@ -126,6 +132,9 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
         recorded = max(_noise(fed, name), _spread(before) if len(before) > 2 else 0.0)
         # A mean of readings that are near in time shares what wanders slowly: it counts as one reading.
         sigma = math.hypot(recorded, max(recorded, _spread(now)))
+        if past.drive and name != past.drive:
+            # On a steep branch the noise of the drive is that of the response.
+            sigma = math.hypot(sigma, math.sqrt(2.0) * _slope(fed, past.drive, name) * _noise(fed, past.drive))
         signal = described[name]
         allowed = past.sigmas * sigma + 10.0**-signal.precision
         difference = float(now.mean() - before.mean())
@@ -149,6 +158,15 @@ def _last_readings(fed: Fed, name: str) -> np.ndarray[tuple[int], np.dtype[np.fl
                 break
     # What came first may not have settled; what is compared is the end.
     return np.array(last[:_READINGS])
+
+
+def _slope(fed: Fed, drive: str, name: str) -> float:
+    """Return the greatest slope of a signal over the drive in the last readings of the record."""
+    columns = [fed.past.names.index(signal) for signal in (drive, name)]
+    last = np.array([[step.values[i] for i in columns] for step in fed.past.steps[-_READINGS:]])
+    differences = np.abs(np.diff(last, axis=0))
+    moved = differences[differences[:, 0] > _MOVED * _noise(fed, drive)]
+    return float(np.max(moved[:, 1] / moved[:, 0])) if len(moved) and np.isfinite(moved).all() else 0.0
 
 
 def _noise(fed: Fed, name: str) -> float:
