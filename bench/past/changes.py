@@ -19,15 +19,19 @@ _MOST_NAMED = 8
 
 
 def protocol_sources(definition: ProtocolDefinition) -> dict[str, str]:
-    """Return the SHA-256 of the module of a protocol, and of those that it uses of its own package or folder."""
+    """Return the SHA-256 of the module of a protocol, and of those that it uses of its own package or folder.
+
+    By the name of the module; by that of the file for one of one's own, which has another module's name each time.
+    """
     first = sys.modules[definition.generator.__module__]
     found: dict[str, str] = {}
     waiting = [first]
     while waiting:
         module = waiting.pop()
-        if module.__name__ not in found:
-            file = getattr(module, "__file__", None)
-            found[module.__name__] = hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
+        file = getattr(module, "__file__", None)
+        name = module.__name__ if "." in module.__name__ or file is None else Path(file).name
+        if name not in found:
+            found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
             waiting += [used for used in _used(module) if _belongs(used, first)]
     return dict(sorted(found.items()))
 

@@ -85,6 +85,6 @@ def turning_points(values: Sequence[float], least: float) -> list[int]:
         elif rising is not True and value - values[low] > least:
             found.append(low)
             rising, high = True, i
-    if not found or found[-1] != len(values) - 1:
-        found.append(len(values) - 1)
-    return found
+    # As far as it has come since the last turn, and where it is now.
+    furthest = [] if rising is None else [high if rising else low]
+    return sorted({*found, *furthest, len(values) - 1})
