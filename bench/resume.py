@@ -113,7 +113,7 @@ def _check_can_be_resumed(record: Record, given: Path) -> None:
 
 
 def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
-    """Return the run as it was started, on a laboratory with a seed of its own."""
+    """Return the run as it was started; an emulated laboratory of this process is made anew, with the same seed."""
     overrides: Mapping[str, str] = meta["overrides"]
     if asked.rig is not None and (name := load_rig(asked.rig, overrides).name) != meta["rig"]:
         raise ConfigurationError(f"{asked.folder} is a run on rig {meta['rig']}; {name} is another one")
@@ -129,7 +129,7 @@ def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
         settings=meta["parameters"],
         rig=asked.rig or meta["rig_given"],
         overrides=overrides,
-        seed=again.seed,
+        seed=meta["seed"],
         clock="wall" if attached else meta["clock"],
         folder=again.folder.parent,
         live=asked.live,

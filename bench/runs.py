@@ -152,8 +152,6 @@ def carry_out(
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         clock, attachment = _clock(run, rig_file, stack)
-        if again is not None:
-            again.continue_time(clock)
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))
         clock.interrupted = interrupts.abort_requested
@@ -170,6 +168,9 @@ def carry_out(
             guardian = station
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
+        if again is not None:
+            # An emulated laboratory of this process has begun at 0: its room is that of the run now.
+            again.continue_time(clock)
         if run.faults is not None:
             schedule_faults(laboratory, faults, run.faults)
         description = station.description

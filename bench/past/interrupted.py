@@ -9,8 +9,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bench.binding import Slots
 from bench.clock import Clock, wall_time
 from bench.description import RigDescription
@@ -51,14 +49,6 @@ class Interrupted:
     sigmas: float
     accept_changes: bool
     accept_disagreement: bool
-
-    @property
-    def seed(self) -> int:
-        """The seed of a new emulated laboratory: that of the run, and the number of times it was taken up.
-
-        Its noise is another one; with the same seed it would come again from the beginning.
-        """
-        return int(np.random.SeedSequence((self.meta["seed"], len(self._resumes) + 1)).generate_state(1)[0])
 
     @property
     def _resumes(self) -> list[dict[str, Any]]:
@@ -117,7 +107,6 @@ class Interrupted:
             "t": t,
             "after_step": step.step,
             "gap_seconds": gap,
-            "seed": self.seed,
             "changes": changes,
             "ended": {key: self.meta[key] for key in ("status", "reason") if key in self.meta},
             **{key: now[key] for key in _DESCRIBED if key in now},

@@ -75,7 +75,7 @@ def kill_after(steps: int, folder: Path, *command: str, delay: float = 0.0) -> P
 def distance(resumed: Path, uninterrupted: Path, model: str, options: Mapping[str, Any]) -> float:
     """Return how far the coefficients of a model of two runs are apart: the RMS, in their standard uncertainties."""
     found = [bench.identify(run, model, **options).identification for run in (resumed, uninterrupted)]
-    first, second = (each.coefficients for each in found)
+    first, second = (each.model.coefficients for each in found)
     sigma = np.hypot(*(each.uncertainties for each in found))
     known = np.isfinite(sigma) & (sigma > 0)
     assert known.any()

@@ -1,6 +1,7 @@
 import io
 import random
 import sqlite3
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
@@ -57,7 +58,11 @@ class TestCorners:
             # From saturation to either side the shortest way leads to the same memory.
             below = MemoryCurve.from_negative_saturation(plane[0] - 9.0)
             above = MemoryCurve.from_positive_saturation(plane[1] + 9.0)
-            found = {str(start.advance(path).staircase(*plane)) for start in (below, above) for path in (values, way)}
+            found = {
+                str(reduce(MemoryCurve.step, path, start).staircase(*plane))
+                for start in (below, above)
+                for path in (values, way)
+            }
             assert len(found) == 1
             assert len(way) < len(values)
 
@@ -107,7 +112,6 @@ class TestResume:
             assert "after step 2 (up)" in how
             (entry,) = record.meta["resumes"]
             assert entry["after_step"] == 2
-            assert entry["seed"] != record.meta["seed"]
             way = record.telemetry()
             assert (way["t"][way["step"] == -1] > last.finished).all()
             assert (way["step"] == -1).any()
@@ -120,7 +124,6 @@ class TestResume:
         assert [step.step for step in steps_of(folder)] == list(range(8))
         with Record(folder) as record:
             assert [entry["after_step"] for entry in record.meta["resumes"]] == [1, 4]
-            assert len({entry["seed"] for entry in record.meta["resumes"]}) == 2
 
     def test_ends_what_died_behind_its_last_step(self, climb):
         folder = climb(steps=4, died_after=4)
@@ -186,11 +189,7 @@ class TestResume:
 
     def test_stops_where_the_specimen_is_another(self, climb):
         folder = climb()
-        db = sqlite3.connect(folder / FILE_NAME)
-        db.close()
         result = resume(Resume(folder=folder, sigmas=1e-3), silent())
-        if result.outcome.status == "completed":
-            pytest.skip("the heater came back to the last digit")
         assert isinstance(result.outcome.error, AgreementError)
         assert result.outcome.is_safe
         assert len(steps_of(folder)) == 3
@@ -211,4 +210,4 @@ def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_p
         main(["resume", str(killed)])
     assert not ended.value.code, capsys.readouterr().err
     assert len(steps_of(killed)) == len(whole.readings)
-    assert distance(killed, whole.folder, "preisach", {"levels": 6}) < 1.0
+    assert distance(killed, whole.folder, "preisach-signed", {"levels": 5}) < 1.0
