@@ -31,6 +31,9 @@ from bench.settling import Dwell, Settle
 _LEAST_TURN = 0.01
 """Smallest turn under a controller that counts as a corner, as a share of what the actuator went through."""
 
+_AS_BEFORE = 10
+"""Places at the end of the record that are gone through again, as far back as the last corner."""
+
 _LAST_PART = 0.1
 """Share of a long way to a place that is left for the last step."""
 
@@ -145,12 +148,15 @@ class Fed:
         """Return the shortest way to the state in which the record left the specimen, its last place last.
 
         A place to which the run came by a small step is not jumped at from far, as that would overshoot it: there is
-        a stop before it.
+        a stop before it. The end of the last branch is gone through as the run did, so that what creeps is near to
+        where it was.
         """
         found: set[int] = set()
         for actuator in {name for place in self.places for name in place.setpoints}:
             first = next(i for i, place in enumerate(self.places) if actuator in place.setpoints)
             found |= {first + i for i in corners([place.setpoints[actuator] for place in self.places[first:]])}
+        last = len(self.places) - 1
+        found |= set(range(max(last - _AS_BEFORE, max(found - {last}, default=last)), last))
         way: list[Place] = []
         for i in sorted(found):
             place, own = self.places[i], self.places[i - 1] if i else None

@@ -25,6 +25,9 @@ NO_STEP = -1
 _READINGS = 10
 """Readings of which mean and noise are compared with the record."""
 
+_CREEP = 0.005
+"""Share of what a signal went through in the record by which creep and the way back may make it differ."""
+
 _MOVED = 5.0
 """Standard deviations by which a drive has to move so that a slope can be told."""
 
@@ -48,7 +51,8 @@ class Resumption:
     drive : str
         Signal of the slot `drive`; empty if there is none.
     sigmas : float
-        Standard deviations by which they may differ, beside one unit of the last digit that is shown.
+        Standard deviations by which they may differ, beside the larger of one unit of the last digit
+        that is shown and 0.5 % of what the signal went through.
     required : bool
         Whether the run ends if they differ by more; otherwise that is recorded, and the run goes on.
     by_hand : bool
@@ -136,15 +140,21 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
             # On a steep branch the noise of the drive is that of the response.
             sigma = math.hypot(sigma, math.sqrt(2.0) * _slope(fed, past.drive, name) * _noise(fed, past.drive))
         signal = described[name]
-        allowed = past.sigmas * sigma + 10.0**-signal.precision
+        allowed = past.sigmas * sigma + max(10.0**-signal.precision, _CREEP * _span(fed, name))
         difference = float(now.mean() - before.mean())
         if abs(difference) > allowed:
             *numbers, unit = format_numbers([now.mean(), before.mean(), allowed], signal.unit, signal.precision + 1)
             found.append(
                 f"{name} reads {numbers[0]} {unit} and read {numbers[1]} {unit} in the record; a difference of "
-                f"{numbers[2]} {unit} ({past.sigmas:g} σ and the resolution) is allowed"
+                f"{numbers[2]} {unit} ({past.sigmas:g} σ, and the resolution or 0.5 % of its span) is allowed"
             )
     return found
+
+
+def _span(fed: Fed, name: str) -> float:
+    column = fed.past.names.index(name)
+    values = [value for step in fed.past.steps if math.isfinite(value := step.values[column])]
+    return max(values) - min(values)
 
 
 def _last_readings(fed: Fed, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -210,4 +210,4 @@ def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_p
         main(["resume", str(killed)])
     assert not ended.value.code, capsys.readouterr().err
     assert len(steps_of(killed)) == len(whole.readings)
-    assert distance(killed, whole.folder, "preisach-signed", {"levels": 5}) < 1.0
+    assert distance(killed, whole.folder, "preisach-nonmonotonic", {"levels": 5}) < 1.0
