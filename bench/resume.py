@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,8 +17,9 @@ from bench.interrupts import Interrupts
 from bench.journal import SCHEMA, Record
 from bench.locks import Holder, Locks
 from bench.past import Interrupted, Past
-from bench.past.changes import find_recorded
-from bench.rig_file import load_rig
+from bench.recorded_files import Original, unpack
+from bench.repetition import recorded_protocol
+from bench.rig_file import load_rig, rig_of_content
 from bench.runs import Run, RunResult, carry_out
 from bench.upkeep.opening import opened
 from bench.upkeep.recovery import clear_expired_watchdogs
@@ -80,7 +82,7 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         locks.take_run(folder)
         with Record(folder) as record:
             _check_can_be_resumed(record, asked.folder)
-            meta, past = record.meta, Past.of(record)
+            meta, past, files = record.meta, Past.of(record), record.files()
         if not any(not step.settled.failed for step in past.steps):
             raise ConfigurationError(f"{asked.folder} has no finished step to go on from; start the run anew")
         written = max(file.stat().st_mtime for file in folder.glob(f"{record.path.name}*"))
@@ -93,8 +95,10 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
             accept_changes=asked.accept_changes,
             accept_disagreement=asked.accept_disagreement,
         )
-        run = _run_of(asked, meta, again)
-        if asked.attach is not None or not load_rig(run.rig, run.overrides).in_process:
+        # On Windows, what is still open cannot be deleted.
+        scratch = tempfile.TemporaryDirectory(prefix="bench-resume-", ignore_cleanup_errors=True)
+        run = _run_of(asked, meta, files, Path(stack.enter_context(scratch)).resolve())
+        if asked.attach is not None or run.original is None or run.original.rig is None:
             with opened(run.rig, run.overrides, asked.attach, "bench resume") as place:
                 for name, meaning in clear_expired_watchdogs(place).items():
                     console.print(f"{name}: cleared: {meaning}", highlight=False, markup=False, soft_wrap=True)
@@ -112,11 +116,9 @@ def _check_can_be_resumed(record: Record, given: Path) -> None:
         )
 
 
-def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
-    """Return the run as it was started; an emulated laboratory of this process is made anew, with the same seed."""
-    overrides: Mapping[str, str] = meta["overrides"]
-    if asked.rig is not None and (name := load_rig(asked.rig, overrides).name) != meta["rig"]:
-        raise ConfigurationError(f"{asked.folder} is a run on rig {meta['rig']}; {name} is another one")
+def _run_of(asked: Resume, meta: Mapping[str, Any], files: Mapping[str, bytes], scratch: Path) -> Run:
+    """Return the run as it was started, with the files of its record; an emulated laboratory has the same seed."""
+    unpack(files, meta["parameters"], scratch)
     attached = str(meta["clock"]).startswith("attached")
     if attached is not (asked.attach is not None):
         raise ConfigurationError(
@@ -124,17 +126,25 @@ def _run_of(asked: Resume, meta: Mapping[str, Any], again: Interrupted) -> Run:
             if attached
             else f"--attach: {asked.folder} is a run on rig {meta['rig']} itself, not on a served laboratory"
         )
+    overrides: Mapping[str, str] = meta["overrides"]
+    given = asked.rig or meta["rig_given"]
+    if asked.rig is not None and (name := load_rig(asked.rig, overrides).name) != meta["rig"]:
+        raise ConfigurationError(f"{asked.folder} is a run on rig {meta['rig']}; {name} is another one")
+    recorded = None
+    if asked.rig is None and not attached:
+        recorded = rig_of_content(meta["rig"], meta["rig_file"], meta["rig_content"])
     return Run(
-        protocol=find_recorded(meta["protocol"], meta["protocol_file"]),
+        protocol=recorded_protocol(asked.folder, meta, scratch),
         settings=meta["parameters"],
-        rig=asked.rig or meta["rig_given"],
+        rig=given,
         overrides=overrides,
         seed=meta["seed"],
         clock="wall" if attached else meta["clock"],
-        folder=again.folder.parent,
+        folder=asked.folder,
         live=asked.live,
         # The recording is made from the journal afterwards, whole.
         recording=False,
         attach=asked.attach,
         interlock_rate=meta["interlock_rate"],
+        original=Original(meta, files, scratch, recorded if recorded is not None and recorded.in_process else None),
     )

@@ -311,6 +311,14 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
     return _validate(path, text, content)
 
 
+def rig_of_content(name: str, text: str, content: Mapping[str, Any]) -> RigFile:
+    """Return a rig from what `RigFile.name`, `text` and `content` of it were, as the record of a run keeps them.
+
+    Raises ConfigurationError if something in it is wrong, or no longer there.
+    """
+    return _validate(f"{name}.toml", text, content)
+
+
 def _read(name: str) -> tuple[str, str]:
     if name.endswith(".toml"):
         try:

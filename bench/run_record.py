@@ -3,26 +3,70 @@
 from __future__ import annotations
 
 import getpass
+import hashlib
 import importlib.metadata
+import json
 import platform
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from bench import registry
 from bench.binding import Slots
 from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
-from bench.past.changes import protocol_file, protocol_sources
-from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters
+from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, is_installed, source_of
+from bench.recorded_files import file_name
 
-RIG_FILE_NAME = "rig.toml"
-"""Name of the rig file in the folder of a run."""
+_PACKAGES = (
+    "actuator-bench",
+    "llvmlite",
+    "numba",
+    "numpy",
+    "pydantic",
+    "pymodbus",
+    "pyserial",
+    "rerun-sdk",
+    "scipy",
+)
+_LONGEST_NAME = 96
+_LONGEST_PART = 32
+_COMPARED = (
+    "protocol",
+    "protocol_source.sha256",
+    "parameters",
+    "rig",
+    "rig_content",
+    "seed",
+    "clock",
+    "interlock_rate",
+    "devices",
+    "packages",
+    "git",
+    "host.python",
+    "host.system",
+)
+"""What tells one run from another; the other keys follow from these, or differ always."""
 
-_PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
+
+@dataclass(frozen=True)
+class Difference:
+    """Something that two records say differently: a dotted key of the metadata, and both values; None for none."""
+
+    key: str
+    first: Any
+    second: Any
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.first if self.first is not None else 'none'} → {self.second or 'none'}"
 
 
 def metadata(
@@ -58,9 +102,9 @@ def metadata(
         "rig_content": file.content,
         "protocol": protocol.name,
         "protocol_summary": protocol.summary,
-        "protocol_file": protocol_file(protocol),
-        "protocol_sources": protocol_sources(protocol),
+        "protocol_source": _source(protocol),
         "parameters": parameters.model_dump(mode="json"),
+        "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
         "controls": protocol.controlled(slots),
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
         "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
@@ -73,7 +117,7 @@ def metadata(
         "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
         "operator": _operator(),
         "command": sys.argv,
-        "packages": {package: _version(package) for package in _PACKAGES},
+        "packages": _versions(),
         "git": _git_state(),
         "host": {
             "name": platform.node(),
@@ -82,6 +126,36 @@ def metadata(
             "started": wall_time().isoformat(),
         },
     }
+
+
+def run_name(protocol: ProtocolDefinition, meta: Mapping[str, Any]) -> str:
+    """Return the name of a run without its time: rig, protocol, and what was set differently from the defaults.
+
+    At most 96 letters, digits and `.+_-`, which every file system takes; what is left out counts as `more`. `meta` is
+    what `metadata` returns, with the `overrides`.
+    """
+    name, files = f"{meta['rig']}-{protocol.name}", protocol.file_parameters
+    parts = [f"{key}-{_short(value)}" for key, value in meta["changed"].items() if key not in files]
+    # Last what the runs of a series often share: files by the end of their path, and values of the rig file.
+    for key in filter(meta["changed"].__contains__, files):
+        parts.append(f"{key}-{Path(file_name(meta['changed'][key])).stem}")
+    parts += [f"{key.rpartition('.')[2]}-{value}" for key, value in meta["overrides"].items()]
+    for part in parts:
+        part = re.sub(r"[^A-Za-z0-9.+_-]+", "-", part)[:_LONGEST_PART].rstrip("-.")
+        if len(name) + len(part) + len("--more") > _LONGEST_NAME:
+            return f"{name}-more"
+        name += f"-{part}"
+    return name
+
+
+def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Difference]:
+    """Return what the metadata of two runs say differently of protocol, rig, instruments and software."""
+    ours, theirs = (dict(_leaves("", {key: _at(meta, key) for key in _COMPARED})) for meta in (first, second))
+    return [
+        Difference(key, ours.get(key), theirs.get(key))
+        for key in {**ours, **theirs}
+        if ours.get(key) != theirs.get(key)
+    ]
 
 
 def make_folder(parent: Path, name: str) -> Path:
@@ -109,6 +183,45 @@ def _operator() -> str:
         return "unknown"
 
 
+def _short(value: Any) -> str:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(value, dict):
+        return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:6]
+    if isinstance(value, list):
+        return "+".join(map(_short, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _at(meta: Mapping[str, Any], key: str) -> Any:  # noqa: ANN401 - anything that JSON can hold
+    found: Any = meta
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, dict) else None
+    return found
+
+
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(f"{key}.{name}" if key else name, inner)
+    else:
+        yield key, value
+
+
+def _source(protocol: ProtocolDefinition) -> dict[str, Any]:
+    file = source_of(protocol)
+    return {
+        "module": protocol.generator.__module__,
+        "installed": is_installed(protocol),
+        "sha256": None if file is None else hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
+
+
+@cache
+def _versions() -> Mapping[str, str]:
+    """Return the versions of the packages that compute, talk to instruments, or register parts."""
+    registering = {entry.package for group in registry.GROUPS for entry in registry.entries(group).values()}
+    return {package: _version(package) for package in sorted({*_PACKAGES, *registering})}
+
+
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
@@ -116,6 +229,7 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+@cache
 def _git_state() -> str:
     git = shutil.which("git")
     if git is None:

@@ -28,11 +28,13 @@ from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
 from bench.locks import Holder, Locks
+from bench.model_file import models_among
 from bench.past import Interrupted
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, plan
+from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
-from bench.run_record import RIG_FILE_NAME, make_folder, metadata
+from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -77,6 +79,9 @@ class Run:
         hardware the rig file says it, `[safety] rate`.
     faults : Path, optional
         Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
+    original : Original, optional
+        The run that this one repeats: its files are read in the place of those that `settings` name, and its rig is
+        taken if it has one.
     """
 
     protocol: ProtocolDefinition
@@ -91,6 +96,7 @@ class Run:
     attach: Path | None = None
     interlock_rate: float | None = None
     faults: Path | None = None
+    original: Original | None = None
 
 
 @dataclass(frozen=True)
@@ -141,10 +147,12 @@ def carry_out(
         If a device cannot be connected; nothing has moved.
     """
     stopwatch = Stopwatch()
-    rig_file = load_rig(run.rig, run.overrides)
-    parameters = run.protocol.parse(
+    original = run.original
+    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
+    stated = run.protocol.parse(
         run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
     )
+    parameters = original.readable(run.protocol, stated) if original else stated
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
@@ -186,38 +194,38 @@ def carry_out(
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
+        files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
+        models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
+        meta = _asked(run, attachment, rig_file, guardian is not None)
+        meta |= metadata(run.protocol, stated, description, slots, expected, clock.epoch)
         resumption = None
         if again is not None:
             resumption = again.fed(run.protocol, parameters, slots, description, by_hand=guardian is None)
-            folder = again.folder
-        else:
-            folder = make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        elif original:
+            meta["repeats"] = original.meta["run"]
+            for difference in differences(original.meta, meta):
+                console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
+        folder = again.folder if again is not None else make_folder(run.folder, run_name(run.protocol, meta))
+        if again is None:
             locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
             locks.take_run(folder)
         if guardian is not None:
             guardian.keep_record(folder)
-        meta = {
-            **metadata(run.protocol, parameters, description, slots, expected, clock.epoch),
-            "run": folder.name,
-            "rig_given": str(Path(run.rig).resolve()) if run.rig.endswith(".toml") else run.rig,
-            "overrides": dict(run.overrides),
-            "seed": run.seed,
-            "interlock_rate": run.interlock_rate if guardian is None else rig_file.safety.rate,
-            "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
-        }
+        meta["run"] = folder.name
         signals = description.signals + trace_signals(run.protocol, description, slots)
         if again is not None and resumption is not None:
-            journal = again.reopen(folder / FILE_NAME, resumption, meta, clock.now())
+            changes = [str(each) for each in differences(again.latest, meta)]
+            journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now())
         else:
             (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-            journal = Journal(folder / FILE_NAME, signals, meta)
+            journal = Journal(folder / FILE_NAME, signals, meta, files | {RIG_FILE_NAME: rig_file.text.encode()})
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
             path = folder / RECORDING_NAME if run.recording else None
-            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
+            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
@@ -233,6 +241,17 @@ def carry_out(
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _asked(run: Run, attachment: Attachment | None, rig: RigFile, guarded: bool) -> dict[str, Any]:
+    """Return what the record says of how the run was asked for."""
+    return {
+        "rig_given": str(Path(run.rig).resolve()) if run.rig.endswith(".toml") else run.rig,
+        "overrides": dict(run.overrides),
+        "seed": run.seed,
+        "interlock_rate": rig.safety.rate if guarded else run.interlock_rate,
+        "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+    }
 
 
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:

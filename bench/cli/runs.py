@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -202,8 +203,8 @@ def run(
         print_result(result, json_file)
 
 
-def print_result(result: RunResult, json_file: Path | None) -> None:
-    """Print how a run ended, and leave with its exit code."""
+def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:
+    """Print how a run ended, write it with `more` for programs, and exit with the code of what ended it."""
     from bench.safety import SAFE
 
     outcome, ratio = result.outcome, result.time_ratio
@@ -227,6 +228,7 @@ def print_result(result: RunResult, json_file: Path | None) -> None:
             "wall_seconds": result.wall_seconds,
             "safe_state": dict(outcome.safe_state),
             "is_safe": outcome.is_safe,
+            **(more or {}),
         },
     )
     for name, state in outcome.safe_state.items():

@@ -9,7 +9,9 @@ Schema, version 3
 -----------------
 `meta(key, value, checksum)`
     Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
-    extends and the overrides), `overrides`, `protocol`, `parameters`, `slots` (device and signal by name), `seed`,
+    extends and the overrides), `overrides`, `protocol`, `protocol_source` (its module, whether that is of an
+    installed package, and the checksum of its file), `parameters`, `changed` (those that differ from their defaults),
+    `repeats` (the run that this one repeats), `slots` (device and signal by name), `seed`,
     `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
     0), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
     whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),

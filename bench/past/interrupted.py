@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -12,14 +11,17 @@ from typing import Any
 from bench.binding import Slots
 from bench.clock import Clock, wall_time
 from bench.description import RigDescription
+from bench.errors import ConfigurationError
 from bench.journal import Event, Journal
-from bench.past.changes import check_unchanged
 from bench.past.feeding import Past, feed
 from bench.past.repriming import RESUMED, Resumption
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
 
-_DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_sources")
+_DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_source")
 """What is kept of each process that takes a run up."""
+
+_MOST_NAMED = 8
+"""Changes that a message names."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,14 @@ class Interrupted:
         drive = slots["drive"].signal if "drive" in slots else ""
         return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand)
 
-    def reopen(self, path: Path, resumption: Resumption, now: Mapping[str, Any], t: float) -> Journal:
+    @property
+    def latest(self) -> dict[str, Any]:
+        """The metadata of the run, as the last process had it that carried it out."""
+        return {**self.meta, **(self._resumes[-1] if self._resumes else {})}
+
+    def reopen(
+        self, path: Path, resumption: Resumption, now: Mapping[str, Any], changes: Sequence[str], t: float
+    ) -> Journal:
         """Open the journal to write on, and note in it that the run is taken up, by whom, and after which step.
 
         Parameters
@@ -89,6 +98,8 @@ class Interrupted:
             The run, as it goes on.
         now : mapping
             Metadata of the run as it would be started now.
+        changes : sequence of str
+            What is not as it was when the run was carried out last.
         t : float
             Laboratory time, s.
 
@@ -97,9 +108,12 @@ class Interrupted:
         ConfigurationError
             If something has changed and that is not accepted.
         """
-        then = {**self.meta, **(self._resumes[-1] if self._resumes else {})}
-        # As JSON has it: a tuple becomes a list.
-        changes = check_unchanged(then, json.loads(json.dumps(now, default=str)), self.accept_changes)
+        if changes and not self.accept_changes:
+            more = f", and {len(changes) - _MOST_NAMED} more" if len(changes) > _MOST_NAMED else ""
+            raise ConfigurationError(
+                f"the run was started otherwise: {'; '.join(changes[:_MOST_NAMED])}{more}. Restore that, or go on "
+                "all the same with --accept-changes"
+            )
         step = resumption.fed.step
         assert step is not None
         gap = (wall_time() - self.written).total_seconds()
@@ -107,7 +121,7 @@ class Interrupted:
             "t": t,
             "after_step": step.step,
             "gap_seconds": gap,
-            "changes": changes,
+            "changes": list(changes),
             "ended": {key: self.meta[key] for key in ("status", "reason") if key in self.meta},
             **{key: now[key] for key in _DESCRIBED if key in now},
         }

@@ -12,8 +12,8 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.journal import Event, Record, StepRecord, run_card
 from bench.protocol import Dwell, Step, find_protocol, protocol
+from bench.recorded_files import RIG_FILE_NAME
 from bench.rig_file import load_rig
-from bench.run_record import RIG_FILE_NAME
 from bench.runs import Run, carry_out
 from bench.settling import Settled
 from bench.terminal import ProgressDisplay, ask_operator
