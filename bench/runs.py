@@ -165,20 +165,20 @@ def carry_out(
         clock.interrupted = interrupts.abort_requested
         # A guardian makes the devices safe as soon as this process is gone.
         interrupts.leave_by(_leave)
+        continue_time = partial(again.continue_time, clock) if again is not None else _nothing
         if run.attach is None and rig_file.in_process:
-            rig = Rig(rig_file, clock, run.seed)
+            # A laboratory that begins at 0 has the room that the run has by now.
+            rig = Rig(rig_file, clock, run.seed, continue_time)
             laboratory: object = rig.laboratory
             station: Station = LocalStation(rig, run.interlock_rate)
         else:
+            continue_time()
             doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
             guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
             laboratory, station = attachment, RemoteStation(guarded, clock)
             guardian = station
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
-        if again is not None:
-            # An emulated laboratory of this process has begun at 0: its room is that of the run now.
-            again.continue_time(clock)
         if run.faults is not None:
             schedule_faults(laboratory, faults, run.faults)
         description = station.description
@@ -241,6 +241,10 @@ def carry_out(
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _nothing() -> None:
+    pass
 
 
 def _asked(run: Run, attachment: Attachment | None, rig: RigFile, guarded: bool) -> dict[str, Any]:

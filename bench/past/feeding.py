@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
@@ -33,6 +33,9 @@ _LEAST_TURN = 0.01
 
 _AS_BEFORE = 10
 """Places at the end of the record that are gone through again, as far back as the last corner."""
+
+_FEWEST_VALUES = 3
+"""Different set-points from which an actuator is taken for one that is not just switched on and off."""
 
 _LAST_PART = 0.1
 """Share of a long way to a place that is left for the last step."""
@@ -152,18 +155,28 @@ class Fed:
         where it was.
         """
         found: set[int] = set()
-        for actuator in {name for place in self.places for name in place.setpoints}:
-            first = next(i for i, place in enumerate(self.places) if actuator in place.setpoints)
-            found |= {first + i for i in corners([place.setpoints[actuator] for place in self.places[first:]])}
+        for actuator in self._actuators:
+            path = self._path(actuator)
+            first = len(self.places) - len(path)
+            found |= {first + i for i in corners(path)}
         last = len(self.places) - 1
         found |= set(range(max(last - _AS_BEFORE, max(found - {last}, default=last)), last))
+        switches = {name for name in self._actuators if len({*self._path(name)}) < _FEWEST_VALUES}
         way: list[Place] = []
         for i in sorted(found):
             place, own = self.places[i], self.places[i - 1] if i else None
-            if way and own is not None and (near := _approach(way[-1], own, place)):
+            if way and own is not None and (near := _approach(way[-1], own, place, switches)):
                 way.append(replace(place, setpoints={**place.setpoints, **near}))
             way.append(place)
         return way
+
+    @property
+    def _actuators(self) -> set[str]:
+        return {name for place in self.places for name in place.setpoints}
+
+    def _path(self, actuator: str) -> list[float]:
+        """Return where an actuator has been, from its first set-point on."""
+        return [place.setpoints[actuator] for place in self.places if actuator in place.setpoints]
 
     def check_fresh(self, message: Message) -> None:
         """Check that a fast loop does not go on with a controller whose state the record does not hold.
@@ -243,10 +256,12 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
         reading = _Feeding(definition, fed, steps.pop(0)).reading_of(message)
 
 
-def _approach(start: Place, own: Place, end: Place) -> dict[str, float]:
+def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> dict[str, float]:
     """Return where to stop on the way to a place, for each actuator that goes further than the run itself did."""
     stops = {}
     for name, value in end.setpoints.items():
+        if name in switches:
+            continue
         jump = value - start.setpoints.get(name, value)
         if abs(jump) > abs(value - own.setpoints.get(name, value)):
             stops[name] = value - _LAST_PART * jump

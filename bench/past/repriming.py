@@ -104,6 +104,8 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
             run.station.apply({name: value for name, value in place.setpoints.items() if done.get(name) != value})
             done = place.setpoints
             settle(fed.settle_at(place, run.period))
+            # In the place of the reading of a step, for watchdogs and interlocks.
+            run.tick()
         readings = [run.look(Look.MEASURE)]
         while len(readings) < _READINGS:
             run.sleep_until(run.clock.now() + min(0.1, run.period))
