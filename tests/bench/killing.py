@@ -6,7 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,13 @@ def finished_steps(folder: Path) -> int:
     return 0
 
 
-def kill_after(steps: int, folder: Path, *command: str, delay: float = 0.0) -> Path:
+def kill_after(
+    steps: int,
+    folder: Path,
+    *command: str,
+    delay: float = 0.0,
+    kill: Callable[[subprocess.Popen[bytes]], None] = subprocess.Popen.kill,
+) -> Path:
     """Start a `bench` command that writes one run below a folder, and kill it by SIGKILL.
 
     Parameters
@@ -46,6 +52,8 @@ def kill_after(steps: int, folder: Path, *command: str, delay: float = 0.0) -> P
         Of `bench`.
     delay : float
         Wall-clock time after that step, s, so that it is killed within another one.
+    kill : callable
+        Kills the process, and others with it.
 
     Returns
     -------
@@ -65,7 +73,7 @@ def kill_after(steps: int, folder: Path, *command: str, delay: float = 0.0) -> P
         assert time.monotonic() - start < LONG, f"{steps} steps not within {LONG:g} s"
         time.sleep(0.002)
     time.sleep(delay)
-    process.kill()
+    kill(process)
     process.communicate()
     assert process.returncode != 0, "it ended before it was killed"
     (journal,) = folder.glob(f"**/{FILE_NAME}")

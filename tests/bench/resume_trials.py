@@ -1,0 +1,101 @@
+"""Trials of resuming: runs that are killed at random moments, resumed, and compared with uninterrupted ones.
+
+    python tests/bench/resume_trials.py [--trials 40] [--kills 10] [--seed 0]
+
+First one run of vo2 that is killed many times in a row, then single kills on every rig. Each run has to have the
+steps of the uninterrupted one, and coefficients of a model within one standard uncertainty of it (RMS; by the fit's
+own uncertainties). The last line says how many did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from killing import distance, finished_steps, kill_after
+from rich.console import Console
+from rich.table import Table
+
+import bench
+
+SETTINGS: Mapping[str, Mapping[str, float]] = {
+    "vo2": {"increment": 1.5, "half_cycles": 24},
+    "sma": {"increment": 0.25, "half_cycles": 16, "dwell": 10.0},
+    "hybrid": {"increment": 4.0, "half_cycles": 20},
+}
+MODEL, OPTIONS = "preisach-nonmonotonic", {"levels": 6}
+
+
+def _command(rig: str, out: Path) -> list[str]:
+    settings = [f"--set={name}={value}" for name, value in SETTINGS[rig].items()]
+    return ["run", "damped-oscillation", "--rig", rig, "--clock", "virtual", "--out", str(out), *settings]
+
+
+def _resume(folder: Path) -> str:
+    """Resume a run in another process; return why it did not complete, or nothing."""
+    code = f"from bench.cli import main; main(['resume', {str(folder)!r}])"
+    ended = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
+    return "" if ended.returncode == 0 else f"exit code {ended.returncode}: {ended.stderr.strip().splitlines()[-1:]}"
+
+
+def _trial(rig: str, whole: Path, kills: int, moments: random.Random, out: Path) -> tuple[list[int], int, str]:
+    """Kill a run so often, resume it to its end; return after which steps, how many steps it has, and what failed."""
+    total = finished_steps(whole.parent)
+    after = sorted(moments.sample(range(1, total - 1), kills))
+    folder, killed, command = out, [], _command(rig, out)
+    for step in after:
+        # A kill comes some time after the step: in a hold, in a commit, or on the way back.
+        try:
+            folder = kill_after(step, out, *command, delay=moments.uniform(0.0, 0.05))
+        except AssertionError:
+            # It ended before it could be killed: done, or with fewer steps than it should have.
+            return killed, finished_steps(out), ""
+        killed.append(finished_steps(out))
+        command = ["resume", str(folder)]
+    return killed, finished_steps(out), _resume(folder)
+
+
+def main() -> int:
+    """Carry the trials out and print the table; return 1 if one failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=40, help="runs that are killed once")
+    parser.add_argument("--kills", type=int, default=10, help="kills of the one run of vo2")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    asked = parser.parse_args()
+    moments = random.Random(asked.seed)
+    table = Table("rig", "killed after steps", "steps", "of", "distance of the model / σ", "result")
+    failed = 0
+    with tempfile.TemporaryDirectory(prefix="resume-trials-") as scratch:
+        wholes = {
+            rig: bench.run("damped-oscillation", rig, out=Path(scratch) / rig, **settings).folder
+            for rig, settings in SETTINGS.items()
+        }
+        rigs = ["vo2"] + [list(SETTINGS)[i % len(SETTINGS)] for i in range(asked.trials)]
+        for number, rig in enumerate(rigs):
+            out = Path(scratch) / f"trial-{number}"
+            whole = wholes[rig]
+            killed, steps, problem = _trial(rig, whole, 1 if number else asked.kills, moments, out)
+            total = finished_steps(whole.parent)
+            away = float("nan")
+            if not problem:
+                steps = finished_steps(out)
+                (folder,) = out.iterdir()
+                away = distance(folder, whole, MODEL, OPTIONS)
+            good = not problem and steps == total and away < 1.0
+            failed += not good
+            result = "as uninterrupted" if good else f"FAILED {problem}"
+            row = (rig, ", ".join(map(str, killed)), str(steps), str(total), f"{away:.3f}", result)
+            table.add_row(*row)
+            print(*row, sep="  ", flush=True)
+    Console(width=160).print(table)
+    print(f"{len(rigs) - failed} of {len(rigs)} runs went on as if they had not been killed")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
