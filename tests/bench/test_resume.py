@@ -222,3 +222,31 @@ def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_p
     assert not ended.value.code, capsys.readouterr().err
     assert len(steps_of(killed)) == len(whole.readings)
     assert distance(killed, whole.folder, "preisach-nonmonotonic", {"levels": 5}) < 1.0
+
+
+def test_a_controller_goes_on_where_its_readings_had_brought_it(tmp_path):
+    measured = bench.run("damped-oscillation", "vo2", out=tmp_path / "model", increment=3.0, half_cycles=8)
+    model = tmp_path / "model.json"
+    bench.identify(measured, "preisach-nonmonotonic", levels=8, plane=(30.0, 70.0)).file.save(model)
+    settings = {"model": str(model), "count": 4, "readings": 2}
+    folder = bench.run("tracking", "vo2", out=tmp_path / "runs", **settings).folder
+    whole = steps_of(folder)
+    assert [len(step.seen) > 3 for step in whole if step.label == "reach"] == [True] * 4
+    cut(folder, 8)
+    # It is in the record.
+    model.unlink()
+    assert resume(Resume(folder=folder), silent()).outcome.status == "completed"
+    resumed = steps_of(folder)
+    assert resumed[:8] == whole[:8]
+    assert [step.label for step in resumed] == [step.label for step in whole]
+    targets = [step.values[-5] for step in resumed if step.label == "reach"]
+    assert targets == [step.values[-5] for step in whole if step.label == "reach"]
+    assert not np.isnan(targets).any()
+
+
+def test_what_was_done_by_hand_is_done_again_in_a_new_laboratory(tmp_path):
+    folder = bench.run("force-voltage", "sma", out=tmp_path, points=11, conditioning=1).folder
+    total = len(steps_of(folder))
+    cut(folder, total // 2)
+    assert resume(Resume(folder=folder), silent()).outcome.status == "completed"
+    assert len(steps_of(folder)) == total
