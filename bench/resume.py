@@ -14,7 +14,7 @@ from rich.console import Console
 
 from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
-from bench.journal import SCHEMA, Record
+from bench.journal import FILE_NAME, SCHEMA, Record
 from bench.locks import Holder, Locks
 from bench.past import Interrupted, Past
 from bench.recorded_files import Original, unpack
@@ -76,16 +76,16 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         If a device cannot be connected, or is in an error that the death of the run did not cause.
     """
     with ExitStack() as stack:
+        folder = asked.folder if asked.folder.is_dir() else asked.folder.parent
+        # A reader may touch the companions of the file.
+        written = max((file.stat().st_mtime for file in folder.glob(f"{FILE_NAME}*")), default=0.0)
         with Record(asked.folder) as record:
-            folder, meta = record.path.parent, record.meta
-        locks = stack.enter_context(Locks(Holder.of_this_process(str(meta.get("rig")), "bench resume")))
+            rig = str(record.meta.get("rig"))
+        locks = stack.enter_context(Locks(Holder.of_this_process(rig, f"bench resume {folder}")))
         locks.take_run(folder)
-        with Record(folder) as record:
+        with Record(asked.folder) as record:
             _check_can_be_resumed(record, asked.folder)
             meta, past, files = record.meta, Past.of(record), record.files()
-        if not any(not step.settled.failed for step in past.steps):
-            raise ConfigurationError(f"{asked.folder} has no finished step to go on from; start the run anew")
-        written = max(file.stat().st_mtime for file in folder.glob(f"{record.path.name}*"))
         again = Interrupted(
             folder=folder,
             meta=meta,

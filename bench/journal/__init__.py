@@ -15,7 +15,8 @@ Schema, version 3
     `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
     0), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
     whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),
-    `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished`
+    `plan`, `dashboard`, `rig_given` (name or path of the rig), `resumes` (what each process was that took the run
+    up after its death), and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished`
     (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is of a run
     that is going on or whose process died.
 `signals(position, name, unit, description, precision, checksum)`

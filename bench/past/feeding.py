@@ -105,12 +105,6 @@ class Past:
             last=max(times, default=0.0),
         )
 
-    def ticks_of(self, step: StepRecord) -> Table:
-        """Return the telemetry of a step, without that of an attempt which did not finish."""
-        t = self.ticks["t"]
-        rows = (self.ticks["step"] == step.step) & (t >= step.started) & (t <= step.finished)
-        return Table({name: column[rows] for name, column in self.ticks.columns.items()})
-
 
 @dataclass
 class Fed:
@@ -323,7 +317,7 @@ class _Feeding:
         self._check_label(message.label)
         names = (message.drive, message.response, *message.others)
         setpoint = f"{message.actuator}_setpoint"
-        ticks = fed.past.ticks_of(record)
+        ticks = fed.past.ticks.ticks_of(record)
         rows = self._seen(ticks)
         command = None
         for k, row in enumerate(rows):
@@ -370,7 +364,7 @@ class _Feeding:
         if set(message.actuators) != set(record.setpoints):
             self._differs(f"moves {', '.join(message.actuators)}, in the record {', '.join(record.setpoints)}")
         fed.spent.append(message.controller)
-        ticks = fed.past.ticks_of(record)
+        ticks = fed.past.ticks.ticks_of(record)
         paths = {name: ticks[f"{name}_setpoint"].tolist() for name in message.actuators}
         turns: set[int] = set()
         for name, path in paths.items():

@@ -69,8 +69,13 @@ class Interrupted:
         description: RigDescription,
         by_hand: bool,
     ) -> Resumption:
-        """Feed the protocol what was recorded; raises ConfigurationError if it does other than that."""
+        """Feed the protocol what was recorded.
+
+        Raises ConfigurationError if it does other than that, or there is no finished step.
+        """
         fed = feed(definition, definition.start(parameters, slots), self.past)
+        if fed.step is None:
+            raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run anew")
         measured = [slot.signal for slot in slots.values()]
         if not measured:
             setpoints = {f"{name}_setpoint" for name in description.devices}
