@@ -137,6 +137,8 @@ class Engine:
         self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None
     ) -> None:
         run = self._run
+        if past is not None:
+            run.phase, run.steps = past.fed.phase, past.fed.next_step
         run.judge(self._clock.now(), self._station.look(Look.GLANCE))
         slots = self._station.description.slots(definition)
         messages = definition.start(parameters, slots) if past is None else past.fed.messages

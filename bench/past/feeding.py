@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
@@ -40,9 +41,10 @@ _FEWEST_VALUES = 3
 _LAST_PART = 0.1
 """Share of a long way to a place that is left for the last step."""
 
-_REMARKS = {Phase: "phase", Note: "note"}
 _FEWEST_TICKS = 5
 """Periods of the telemetry that a place is held where the run held none."""
+
+_REMARKS = {Phase: "phase", Note: "note"}
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
         If the protocol does other than the record says, or fails.
     """
     fed = Fed(messages, past)
-    steps, remarks = list(past.steps), list(past.remarks)
+    steps, remarks = deque(past.steps), deque(past.remarks)
     reading: Reading | None = None
     while True:
         try:
@@ -234,20 +236,20 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
                     _differs(definition, f"it yields {message!r} before step {steps[0].step}, which is not recorded")
                 fed.message = message
                 return fed
-            if remarks.pop(0) != (_REMARKS[type(message)], text):
+            if remarks.popleft() != (_REMARKS[type(message)], text):
                 _differs(definition, f"it yields {message!r}, which the record does not have there")
             continue
         if steps and not isinstance(message, Message):
             _differs(definition, f"it yields {message!r}")
         # A step that ended its run was not a reading for the protocol: it is done again.
         while steps and _failed(message, steps[0], past.names):
-            steps.pop(0)
+            steps.popleft()
         if not steps:
             if remarks:
                 _differs(definition, f"it yields {message!r}, where the record has the {' '.join(remarks[0])!r}")
             fed.message = message
             return fed
-        reading = _Feeding(definition, fed, steps.pop(0)).reading_of(message)
+        reading = _Feeding(definition, fed, steps.popleft()).reading_of(message)
 
 
 def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> dict[str, float]:

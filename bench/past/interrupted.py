@@ -73,6 +73,12 @@ class Interrupted:
 
         Raises ConfigurationError if it does other than that, or there is no finished step.
         """
+        traced = {signal.name for signal in (*TRACES, LATENESS)}
+        if missing := [name for name in self.past.names if name not in description.by_name and name not in traced]:
+            raise ConfigurationError(
+                f"{self.folder} has the signals {', '.join(missing)}, which rig {description.file.name} does not "
+                "give any more; restore them"
+            )
         fed = feed(definition, definition.start(parameters, slots), self.past)
         if fed.step is None:
             raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run anew")
@@ -80,7 +86,6 @@ class Interrupted:
         if not measured:
             setpoints = {f"{name}_setpoint" for name in description.devices}
             measured = [signal.name for signal in description.signals if signal.name not in setpoints]
-        traced = {signal.name for signal in (*TRACES, LATENESS)}
         compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
         drive = slots["drive"].signal if "drive" in slots else ""
         return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand)

@@ -87,7 +87,6 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
         If a signal differs from the last readings by more than is allowed.
     """
     fed = past.fed
-    run.phase, run.steps = fed.phase, fed.next_step
     places = fed.way_back()
     if not places or fed.step is None:
         return

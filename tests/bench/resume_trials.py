@@ -52,9 +52,14 @@ def _command(rig: str, out: Path) -> list[str]:
     ]
 
 
+def _resumption(folder: Path) -> list[str]:
+    # A developer may commit something meanwhile.
+    return ["resume", str(folder), "--accept-changes"]
+
+
 def _resume(folder: Path) -> str:
     """Resume a run in another process; return why it did not complete, or nothing."""
-    code = f"from bench.cli import main; main(['resume', {str(folder)!r}])"
+    code = f"from bench.cli import main; main({_resumption(folder)!r})"
     ended = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
     return "" if ended.returncode == 0 else f"exit code {ended.returncode}: {ended.stderr.strip().splitlines()[-1:]}"
 
@@ -72,7 +77,7 @@ def _trial(rig: str, whole: Path, kills: int, moments: random.Random, out: Path)
             # It ended before it could be killed: done, or with fewer steps than it should have.
             return killed, finished_steps(out), ""
         killed.append(finished_steps(out))
-        command = ["resume", str(folder)]
+        command = _resumption(folder)
     return killed, finished_steps(out), _resume(folder)
 
 
