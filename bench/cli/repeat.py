@@ -61,7 +61,11 @@ def repeat(
         equal = found.comparison.equal
         if all(equal.values()):
             console.print(f"as the original: {', '.join(equal)} are equal to the last bit", highlight=False)
-        elif found.is_exact:
-            warn(f"not as the original: {', '.join(name for name, same in equal.items() if not same)}")
-            warn(f"see bench compare {found.original} {found.result.folder}")
+        else:
+            differ = ", ".join(name for name, same in equal.items() if not same)
+            text = f"{differ} differ from the original: bench compare {found.original} {found.result.folder}"
+            if found.is_exact:
+                warn(text)
+            else:
+                console.print(text, highlight=False, markup=False, soft_wrap=True)
         print_result(found.result, json_file, {"repeats": str(found.original), **found.comparison.to_json()})
