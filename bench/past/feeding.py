@@ -10,6 +10,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from bench.control.loops import Playback
 from bench.errors import BenchError, ConfigurationError
 from bench.journal import Record, StepRecord, Table
 from bench.past.corners import corners, turning_points
@@ -365,7 +366,8 @@ class _Feeding:
         self._check_label(message.label)
         if set(message.actuators) != set(record.setpoints):
             self._differs(f"moves {', '.join(message.actuators)}, in the record {', '.join(record.setpoints)}")
-        fed.spent.append(message.controller)
+        if not isinstance(message.controller, Playback):
+            fed.spent.append(message.controller)
         ticks = fed.past.ticks.ticks_of(record)
         paths = {name: ticks[f"{name}_setpoint"].tolist() for name in message.actuators}
         turns: set[int] = set()

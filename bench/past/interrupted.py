@@ -82,6 +82,8 @@ class Interrupted:
         fed = feed(definition, definition.start(parameters, slots), self.past)
         if fed.step is None:
             raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run anew")
+        if fed.message is not None:
+            fed.check_fresh(fed.message)
         measured = [slot.signal for slot in slots.values()]
         if not measured:
             setpoints = {f"{name}_setpoint" for name in description.devices}

@@ -28,6 +28,34 @@ OSCILLATION = {
 }
 
 
+LOOPS = """
+from bench.control.tracking import Trace
+from bench.protocol import FixedRate, Messages, ProtocolParameters, protocol
+
+class P(ProtocolParameters):
+    pass
+
+class Counting:
+    count = 0
+    trace = Trace()
+
+    def update(self, t, measured):
+        self.count += 1
+        return (30.0 + 0.1 * self.count,)
+
+@protocol(needs=("tec",), controls="probe_temperature")
+def loops(parameters: P) -> Messages:
+    "Count."
+    first = Counting()
+    second = first if SHARED else Counting()
+    for label, controller in (("first", first), ("second", second)):
+        yield FixedRate(
+            controller=controller, rate=2.0, duration=6.0, inputs=("probe_temperature",),
+            actuators=("tec",), label=label
+        )
+"""
+
+
 def silent():
     return Console(file=io.StringIO())
 
@@ -199,6 +227,19 @@ class TestResume:
         db.commit()
         db.close()
         assert resume(Resume(folder=folder), silent()).outcome.status == "completed"
+
+    @pytest.mark.parametrize("shared", [False, True])
+    def test_refuses_a_fast_loop_that_goes_on_with_the_controller_of_another(self, shared, tmp_path, rig_file):
+        file = tmp_path / "loops.py"
+        file.write_text(LOOPS.replace("SHARED", str(shared)))
+        folder = bench.run(str(file), rig_file(), out=tmp_path / "runs").folder
+        cut(folder, 1)
+        if shared:
+            with pytest.raises(ConfigurationError, match=r"the fast loop 'second' goes on with a controller"):
+                resume(Resume(folder=folder), silent())
+        else:
+            assert resume(Resume(folder=folder), silent()).outcome.status == "completed"
+        assert len(steps_of(folder)) == 2 - shared
 
     def test_stops_where_the_specimen_is_another(self, climb):
         folder = climb()
