@@ -324,6 +324,7 @@ class Engine:
         finished = self._clock.now()
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
+            self._journal.make_room()
             self._run.take_news()
             if error is not None:
                 self._run.event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)

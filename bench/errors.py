@@ -95,6 +95,12 @@ class GuardianError(BenchError):
     exit_code = 7
 
 
+class RecordError(BenchError):
+    """The journal of a run is damaged, or rows are missing in it; `bench recover-journal` says how far it is good."""
+
+    exit_code = 8
+
+
 class AgreementError(BenchError):
     """A resumed run did not find the specimen as its record left it; it was ended in the safe state."""
 

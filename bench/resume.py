@@ -14,7 +14,7 @@ from rich.console import Console
 
 from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, SCHEMA, Record
+from bench.journal import FILE_NAME, SCHEMA, Record, take_in
 from bench.locks import Holder, Locks
 from bench.past import Interrupted, Past
 from bench.recorded_files import Original, unpack
@@ -85,6 +85,8 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         locks.take_run(folder)
         with Record(asked.folder) as record:
             _check_can_be_resumed(record, asked.folder)
+        take_in(asked.folder)
+        with Record(asked.folder) as record:
             meta, past, files = record.meta, Past.of(record), record.files()
         again = Interrupted(
             folder=folder,

@@ -121,9 +121,11 @@ class RunAtHand:
         self._is_demanded = bool(self._pause_reason) or self.station.is_holding
 
     def take_news(self) -> None:
-        """Record what happened at the station since the last call."""
+        """Record what happened at the station, and to the journal itself, since the last call."""
         for news in self.station.news():
             self.event(news.level, news.kind, news.text)
+        for text in self._journal.take_notices():
+            self.event("WARN", "journal", text)
 
     def tick_after(self, tick: float) -> float:
         """Return when the tick after one is due; missed ticks are skipped, not caught up."""

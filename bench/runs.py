@@ -213,12 +213,14 @@ def carry_out(
             guardian.keep_record(folder)
         meta["run"] = folder.name
         signals = description.signals + trace_signals(run.protocol, description, slots)
+        patience = rig_file.telemetry.period if clock.sleep_waits else None
         if again is not None and resumption is not None:
             changes = [str(each) for each in differences(again.latest, meta)]
-            journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now())
+            journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now(), patience)
         else:
             (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-            journal = Journal(folder / FILE_NAME, signals, meta, files | {RIG_FILE_NAME: rig_file.text.encode()})
+            kept = files | {RIG_FILE_NAME: rig_file.text.encode()}
+            journal = Journal(folder / FILE_NAME, signals, meta, kept, patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -227,6 +229,7 @@ def carry_out(
             path = folder / RECORDING_NAME if run.recording else None
             dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard

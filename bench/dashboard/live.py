@@ -80,7 +80,7 @@ class Dashboard:
         for density in densities:
             self._queue.put(density)
         self._wake = threading.Event()
-        self._closing = False
+        self._closing = self._recording_stops = False
         self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
         self._thread.start()
 
@@ -95,6 +95,10 @@ class Dashboard:
     def event(self, event: Event) -> None:
         """Show something that happened."""
         self._put(event, QUEUED_ENTRIES)
+
+    def stop_recording(self) -> None:
+        """Write no more into the .rrd file, as the journal needs the space; the live view goes on."""
+        self._recording_stops = True
 
     def finish(self, status: str, reason: str) -> None:
         """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
@@ -147,6 +151,8 @@ class Dashboard:
         self._writer.recording.close()
 
     def _hand_over(self) -> None:
+        if self._recording_stops:
+            self._writer.recording.stop_file()
         # In portions, so that turning them into columns does not keep the interpreter from other threads.
         while waiting := min(self._queue.qsize(), CHUNK_ROWS):
             entries = [self._queue.get() for _ in range(waiting)]

@@ -47,7 +47,7 @@ from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
 from bench.journal.table import Table
-from bench.journal.writing import Journal, abandon
+from bench.journal.writing import Journal, abandon, take_in
 
 __all__ = [
     "FILE_NAME",
@@ -61,4 +61,5 @@ __all__ = [
     "add_model",
     "check_names",
     "run_card",
+    "take_in",
 ]

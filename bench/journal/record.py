@@ -15,6 +15,7 @@ import numpy as np
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.journal.models import models_beside
+from bench.journal.opening import OpenedJournal
 from bench.journal.rows import FILE_NAME, READABLE, SCHEMA, Event, StepRecord, checksum, checksums, quoted
 from bench.journal.table import Table
 from bench.settling import Settled
@@ -42,16 +43,18 @@ class Record:
         self.path = path / FILE_NAME if path.is_dir() else path
         if not self.path.is_file():
             raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
-        # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
-        try:
-            self._db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
-        except sqlite3.DatabaseError as error:
-            raise DataError(f"{self.path} cannot be read: {error}") from error
+        self._opened = OpenedJournal(self.path)
+        self._db = self._opened.db
         try:
             self._read_heading()
         except DataError:
-            self._db.close()
+            self.close()
             raise
+
+    @property
+    def remark(self) -> str:
+        """How the journal is read, where that is not the usual way; empty otherwise."""
+        return self._opened.remark
 
     def _read_heading(self) -> None:
         try:
@@ -159,7 +162,7 @@ class Record:
 
     def close(self) -> None:
         """Close the file."""
-        self._db.close()
+        self._opened.close()
 
     def _rows(self, table: str) -> list[tuple[Any, ...]]:
         # Columns by name, as only then a missing one is an error.
@@ -187,7 +190,10 @@ class Record:
                 raise self._damaged(table, row[0])
 
     def _damaged(self, table: str, row: object) -> DataError:
-        return DataError(f"{self.path} is damaged: table {table}, row {row}: its checksum does not fit")
+        return DataError(
+            f"{self.path} is damaged: table {table}, row {row}: its checksum does not fit; "
+            f"`bench recover-journal {self.path}` says what is good"
+        )
 
     def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
         try:

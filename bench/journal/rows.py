@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +47,18 @@ _TABLES = (
     "text TEXT NOT NULL, checksum INTEGER NOT NULL)",
     "files (name TEXT PRIMARY KEY, sha256 TEXT NOT NULL, content BLOB NOT NULL)",
 )
+
+TABLES = ("meta", "signals", "steps", "telemetry", "events", "files")
+
+_PATTERNS = {
+    "meta": "tt",
+    "signals": "ntttn",
+    "steps": "nnntttt",
+    "telemetry": "nnn",
+    "events": "nnttt",
+    "files": "ttt",
+}
+"""The kinds of a row's columns, numbers or texts; one number a signal may follow."""
 
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
@@ -147,21 +161,72 @@ def canonical(numbers: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return array
 
 
-def checksum(row: Sequence[str | float | None]) -> int:
-    """Return the CRC-32 of a row.
+class Entry(NamedTuple):
+    """A row that is to be kept.
 
-    It is that of the row's numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign,
-    without a sign of zero), then of its texts in their order (UTF-8, each followed by a zero byte).
-
-    Raises ValueError or TypeError if there is neither a number nor a text.
+    Attributes
+    ----------
+    table : str
+        Its table.
+    row : tuple
+        Its columns without the checksum.
+    payload : bytes
+        Its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without a sign of
+        zero), then its texts in their order (UTF-8, each followed by a zero byte). Its CRC-32 is the row's checksum.
     """
-    result = zlib.crc32(
-        canonical([math.nan if value is None else value for value in row if not isinstance(value, str)]).tobytes()
-    )
-    for text in row:
-        if isinstance(text, str):
-            result = zlib.crc32(text.encode() + b"\0", result)
-    return result
+
+    table: str
+    row: tuple[Any, ...]
+    payload: bytes
+
+    def columns(self) -> tuple[Any, ...]:
+        """Return the row as it stands in its table."""
+        return self.row if self.table == "files" else (*self.row, zlib.crc32(self.payload))
+
+
+def entry(table: str, row: Sequence[Any]) -> Entry:
+    """Return a row as it is kept.
+
+    Raises ValueError or TypeError if one of its values is neither a number nor a text, nor the content of a file.
+    """
+    numbers = [math.nan if value is None else value for value in row if not isinstance(value, str | bytes)]
+    texts = [
+        base64.b64encode(value) if isinstance(value, bytes) else value.encode()
+        for value in row
+        if isinstance(value, str | bytes)
+    ]
+    return Entry(table, tuple(row), b"".join((canonical(numbers).tobytes(), *(text + b"\0" for text in texts))))
+
+
+def ticks(rows: Sequence[tuple[float, ...]]) -> list[Entry]:
+    """Return rows of numbers, all of the telemetry, as they are kept."""
+    content = canonical(rows).tobytes()
+    size = len(content) // len(rows)
+    return [Entry("telemetry", row, content[size * i : size * (i + 1)]) for i, row in enumerate(rows)]
+
+
+def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
+    """Return the row of a payload that begins with `count` numbers, or None if it is none of the table's."""
+    if 8 * count > len(payload):
+        return None
+    numbers = list(np.frombuffer(payload, dtype="<f8", count=count).tolist())
+    try:
+        texts: list[Any] = payload[8 * count :].decode().split("\0")[:-1]
+    except UnicodeDecodeError:
+        return None
+    if table == "files" and len(texts) == 3:
+        texts[2] = base64.b64decode(texts[2])
+    pattern = _PATTERNS[table]
+    values = iter(numbers), iter(texts)
+    if pattern.count("t") != len(texts) or pattern.count("n") > count:
+        return None
+    row = [next(values[kind == "t"]) for kind in pattern]
+    return *row, *values[0]
+
+
+def checksum(row: Sequence[str | float | None]) -> int:
+    """Return the CRC-32 of a row, see `Entry`; raise ValueError or TypeError if it has neither number nor text."""
+    return zlib.crc32(entry("", row).payload)
 
 
 def checksums(numbers: npt.NDArray[np.float64]) -> list[int]:

@@ -5,32 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-import numpy as np
-
 from bench.clock import Stopwatch
 from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
+from bench.errors import ConfigurationError, DataError, RecordError
+from bench.journal.background import LONGEST_UNWRITTEN, Background
+from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import read_mirror, second_files
 from bench.journal.record import Record
-from bench.journal.rows import (
-    FIRST,
-    SCHEMA,
-    Event,
-    StepRecord,
-    check_names,
-    checksum,
-    checksums,
-    meta_row,
-    table_definitions,
-)
-
-_LONGEST_UNWRITTEN = 0.1
-"""Wall-clock time after which a tick is committed, s."""
+from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
+from bench.journal.store import Store
 
 _END = ("status", "reason", "finished", "safe_state", "counts")
 """Entries of the metadata that a run has once it has ended."""
@@ -49,17 +38,15 @@ class Journal:
         What is known at the start; values that JSON can hold.
     files : mapping of str to bytes
         Content of the files that the run was given, by name.
-
-    Attributes
-    ----------
-    steps, ticks : int
-        Number of rows that were handed over so far.
+    patience : float, optional
+        Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
+        it the caller's writes, which is faster where nothing waits, as on the virtual clock.
 
     Raises
     ------
     ConfigurationError
         If the file exists already: a record is never overwritten. If two signals have one name, or a signal
-        has that of a column which the journal itself needs; case does not count.
+        has that of a column which the journal itself needs; case does not count. If the file cannot be made.
     """
 
     def __init__(
@@ -68,26 +55,35 @@ class Journal:
         signals: Sequence[Signal],
         meta: Mapping[str, Any],
         files: Mapping[str, bytes] = MappingProxyType({}),
+        patience: float | None = None,
     ) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
-        check_names([signal.name for signal in signals])
-        self._open(path, signals)
-        with self._transaction():
-            for statement in table_definitions([signal.name for signal in signals]):
-                self._db.execute(statement)
-            for position, signal in enumerate(signals):
-                row = (position, signal.name, signal.unit, signal.description, signal.precision)
-                self._db.execute("INSERT INTO signals VALUES (?, ?, ?, ?, ?, ?)", (*row, checksum(row)))
-            for name, content in files.items():
-                digest = hashlib.sha256(content).hexdigest()
-                self._db.execute("INSERT INTO files VALUES (?, ?, ?)", (name, digest, content))
-            for key, value in {"schema": SCHEMA, **meta}.items():
-                self._put_meta(key, value)
-        self._begin(dict(FIRST))
+        names = [signal.name for signal in signals]
+        check_names(names)
+        entries = [entry("meta", meta_row(key, value)) for key, value in {"schema": SCHEMA, **meta}.items()]
+        entries += [
+            entry("signals", (position, signal.name, signal.unit, signal.description, signal.precision))
+            for position, signal in enumerate(signals)
+        ]
+        entries += [
+            entry("files", (name, hashlib.sha256(content).hexdigest(), content)) for name, content in files.items()
+        ]
+        for former in second_files(path):
+            former.unlink(missing_ok=True)
+        try:
+            store = Store(path)
+            store.create(names, entries)
+            keeper = Keeper(store)
+            keeper.begin(entries)
+        except (sqlite3.Error, OSError) as error:
+            raise ConfigurationError(f"{path} cannot be made: {error}") from None
+        self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
 
     @classmethod
-    def reopen(cls, path: Path, meta: Mapping[str, Any] = MappingProxyType({})) -> Self:
+    def reopen(
+        cls, path: Path, meta: Mapping[str, Any] = MappingProxyType({}), patience: float | None = None
+    ) -> Self:
         """Open the record of a run that was not completed to write on: steps, ticks and events are numbered on.
 
         Its end, if it had one, is taken back.
@@ -98,6 +94,8 @@ class Journal:
             The journal, or the folder of the run that holds it.
         meta : mapping
             Further entries of the metadata.
+        patience : float, optional
+            As of a new one.
 
         Raises
         ------
@@ -106,53 +104,44 @@ class Journal:
         ConfigurationError
             If the run was completed.
         """
-        with Record(path) as record:
-            file, signals = record.path, record.signals
-            if record.meta["schema"] != SCHEMA:
-                raise DataError(
-                    f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on"
-                )
-            if record.status == "completed":
-                raise ConfigurationError(f"{file} is the record of a run that was completed")
-            tables = {"steps": record.steps(), "telemetry": record.telemetry(), "events": record.events()}
-            following = {table: FIRST[table] + len(rows) for table, rows in tables.items()}  # type: ignore[arg-type]
+        file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
-        journal._open(file, signals)
-        journal._begin(following)
-        with journal._transaction():
-            for key in _END:
-                journal._db.execute("DELETE FROM meta WHERE key = ?", (key,))
-            for key, value in meta.items():
-                journal._put_meta(key, value)
+        keeper = Keeper(Store(file))
+        keeper.store.forget(_END)
+        keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
+        journal._begin(keeper, signals, counts, patience)
         return journal
 
-    def _open(self, path: Path, signals: Sequence[Signal]) -> None:
-        self.path = path
+    def _begin(
+        self, keeper: Keeper, signals: Sequence[Signal], counts: dict[str, int], patience: float | None
+    ) -> None:
+        """Start with rows that are there already, counted by table."""
         self.signals = tuple(signals)
-        self._db = sqlite3.connect(path, isolation_level=None)
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
-
-    def _begin(self, following: dict[str, int]) -> None:
-        """Take the next number of each table."""
-        made = self.path.stat()
-        self._file = made.st_dev, made.st_ino
-        self._next = following
-        marks = ", ?" * len(self.signals)
+        self.when_short: Callable[[], object] = lambda: None
+        """Called once when the disk is nearly full: recordings stop then, as the journal needs the space."""
+        self._is_told = False
+        self._keeper = keeper
+        self._counts = counts
         self._waiting: list[tuple[float, ...]] = []
         self._since_write = Stopwatch()
-        self._insert_step = f"INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?, ?{marks}, ?, ?)"  # noqa: S608 - marks only
-        self._insert_tick = f"INSERT INTO telemetry VALUES (?, ?, ?{marks}, ?)"  # noqa: S608 - marks only
+        self._background = None if patience is None else Background(keeper, patience)
+        self._is_whole = True
+        self._failure: Exception | None = None
+
+    @property
+    def path(self) -> Path:
+        """The journal; another one once the first was removed."""
+        return self._keeper.store.path
 
     @property
     def steps(self) -> int:
         """Number of finished steps that were handed over."""
-        return self._next["steps"] - FIRST["steps"]
+        return self._counts["steps"]
 
     @property
     def ticks(self) -> int:
         """Number of ticks that were handed over."""
-        return self._next["telemetry"] - FIRST["telemetry"]
+        return self._counts["telemetry"]
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Record one tick of a hold: laboratory time in s, step number, one value a signal.
@@ -161,12 +150,14 @@ class Journal:
         the next tick, step or event.
         """
         self._waiting.append((self._number("telemetry"), t, step, *map(float, values)))
-        if self._since_write.seconds() >= _LONGEST_UNWRITTEN:
-            self._write_waiting()
+        if self._background is not None:
+            self._background.keep_soon(self._take_ticks())
+        elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
+            self._write(())
 
     def step(self, record: StepRecord) -> None:
         """Record a finished step."""
-        self._next["steps"] = record.step + 1
+        self._counts["steps"] += 1
         row = (
             record.step,
             record.started,
@@ -178,97 +169,149 @@ class Journal:
             *map(float, record.values),
             json.dumps(record.seen),
         )
-        self._write(self._insert_step, row)
+        self._write([entry("steps", row)])
 
     def event(self, event: Event) -> None:
         """Record something that happened."""
-        row = (self._number("events"), event.t, event.level, event.kind, event.text)
-        self._write("INSERT INTO events VALUES (?, ?, ?, ?, ?, ?)", row)
+        self._write([entry("events", (self._number("events"), event.t, event.level, event.kind, event.text))])
+
+    def take_notices(self) -> list[str]:
+        """Return what happened to the journal itself since the last call."""
+        taken = []
+        while self._keeper.notices:
+            taken.append(self._keeper.notices.pop(0))
+        return taken
+
+    def make_room(self) -> None:
+        """Give back the space that is kept for the end of a run on a full disk."""
+        self._stop_background()
+        self._keeper.make_room()
 
     def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
-        """Record how the run ended: status, reason, laboratory time in s, safe state by device."""
-        self._write_waiting()
-        with self._transaction():
-            self._put_meta("status", status)
-            self._put_meta("reason", reason)
-            self._put_meta("finished", finished)
-            self._put_meta("safe_state", dict(safe_state))
-            self._put_meta("counts", {table: following - FIRST[table] for table, following in self._next.items()})
+        """Record how the run ended: status, reason, laboratory time in s, safe state by device.
 
-    def close(self) -> None:
-        """Close the file; what was recorded stays."""
-        with suppress(sqlite3.OperationalError):
-            self._write_waiting()
-        # Out of WAL mode, as a reader of a WAL file leaves companions beside it; while one reads, it cannot be.
-        with suppress(sqlite3.OperationalError):
-            self._db.execute("PRAGMA busy_timeout=0")
-            self._db.execute("PRAGMA journal_mode=DELETE")
-        self._db.close()
-
-    def _number(self, table: str) -> int:
-        number = self._next[table]
-        self._next[table] = number + 1
-        return number
-
-    def _write(self, statement: str, row: Sequence[str | float]) -> None:
-        """Commit one row, after the ticks that wait."""
-        values = (*row, checksum(row))
-        if not self._waiting:
-            self._db.execute(statement, values)
-        else:
-            with self._transaction():
-                self._insert_waiting()
-                self._db.execute(statement, values)
-            self._waiting.clear()
-        self._since_write = Stopwatch()
-        self._check_file()
-
-    def _check_file(self) -> None:
-        """Raise `DataError` if the file is no longer where it was made: SQLite goes on with one that is removed."""
-        try:
-            found = self.path.stat()
-        except OSError:
-            found = None
-        if found is None or (found.st_dev, found.st_ino) != self._file:
-            raise DataError(
-                f"{self.path} was {'removed' if found is None else 'replaced'} while the run went on; what is "
-                "recorded would be lost, so the run ends here"
+        Raises RecordError if rows are missing or damaged; the status is `failed` then at best.
+        """
+        self._stop_background()
+        if self._waiting:
+            self._write(())
+        problem = self._keeper.end(self._counts) or (str(self._failure) if self._failure else "")
+        if problem:
+            status = "failed" if status == "completed" else status
+            reason = "; ".join(filter(None, (reason, f"the record is not whole: {problem}")))
+        end = {
+            "status": status,
+            "reason": reason,
+            "finished": finished,
+            "safe_state": dict(safe_state),
+            "counts": self._counts,
+        }
+        self._keeper.keep([entry("meta", meta_row(key, value)) for key, value in end.items()])
+        problem = problem or self._keeper.why
+        if problem:
+            self._is_whole = False
+            raise RecordError(
+                f"{self.path} is not whole: {problem}; every row is in {self._keeper.second_file}; "
+                f"`bench recover-journal {self.path}` puts them together"
             )
 
-    def _write_waiting(self) -> None:
-        if self._waiting:
-            with self._transaction():
-                self._insert_waiting()
-            self._waiting.clear()
+    def close(self) -> None:
+        """Close the files; what was recorded stays."""
+        with suppress(RecordError, sqlite3.Error):
+            self._stop_background()
+            if self._waiting:
+                self._write(())
+        # Otherwise its disk does not answer.
+        if self._background is None:
+            self._keeper.close(is_whole=self._is_whole)
+
+    def _number(self, table: str) -> int:
+        """Return the number of the next row of a table."""
+        number = FIRST[table] + self._counts[table]
+        self._counts[table] += 1
+        return number
+
+    def _take_ticks(self) -> list[Entry]:
+        """Return the ticks that wait, which wait no longer."""
+        waiting, self._waiting = self._waiting, []
+        return ticks(waiting) if waiting else []
+
+    def _write(self, entries: Sequence[Entry]) -> None:
+        """Make rows durable, and before them the ticks that wait."""
+        entries = [*self._take_ticks(), *entries]
+        if self._background is not None:
+            self._background.keep(entries)
+        else:
+            self._keeper.keep(entries)
         self._since_write = Stopwatch()
+        if self._keeper.is_short and not self._is_told:
+            self._is_told = True
+            self.when_short()
 
-    def _insert_waiting(self) -> None:
-        sums = checksums(np.array(self._waiting, dtype=np.float64))
-        self._db.executemany(self._insert_tick, [(*row, sum_) for row, sum_ in zip(self._waiting, sums, strict=True)])
+    def _stop_background(self) -> None:
+        """Write in the caller's thread from now on."""
+        if self._background is not None:
+            if not self._background.stop():
+                raise RecordError(f"{self.path}: its disk does not answer")
+            self._failure = self._background.failure
+            self._background = None
 
-    def _put_meta(self, key: str, value: object) -> None:
-        row = meta_row(key, value)
-        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (*row, checksum(row)))
 
-    def _transaction(self) -> AbstractContextManager[None]:
-        # Reuse an open transaction.
-        return nullcontext() if self._db.in_transaction else _Transaction(self._db)
+def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
+    """Bring into the journal of a run that was not completed what waits for it in a second file.
+
+    Returns
+    -------
+    Path
+        The journal.
+    tuple of Signal
+        Its signals.
+    dict of str to int
+        Number of its rows, by table.
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As `Journal.reopen`.
+    """
+    with Record(path) as record:
+        file, signals = record.path, record.signals
+        if record.meta["schema"] != SCHEMA:
+            raise DataError(f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on")
+        if record.status == "completed":
+            raise ConfigurationError(f"{file} is the record of a run that was completed")
+        counts = {
+            "steps": len(record.steps()),
+            "telemetry": len(record.telemetry()),
+            "events": len(record.events()),
+        }
+        has_ended = "status" in record.meta
+    beside = {
+        (each.table, each.row[0]): each
+        for second in second_files(file)
+        for each in read_mirror(second)
+        # Numbered without a gap, so what the journal lacks is behind its last row.
+        if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
+    }
+    if not has_ended and ("meta", "status") in beside:
+        raise ConfigurationError(
+            f"{file} is the record of a run that has ended, of which rows wait in a second file; "
+            f"`bench recover-journal {file}` puts them together"
+        )
+    missing = [each for (table, _), each in beside.items() if table in FIRST]
+    if missing:
+        with closing(Store(file)) as store:
+            store.write(missing)
+    for each in missing:
+        counts[each.table] += 1
+    return file, signals, counts
 
 
 def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
     """Record the end of a run whose own thread hangs, if its file can be written within a second."""
+    with suppress(OSError):
+        (path.parent / RESERVE_NAME).unlink(missing_ok=True)
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
         for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
-            row = meta_row(key, value)
-            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", (*row, checksum(row)))
-
-
-class _Transaction:
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._db.execute("COMMIT" if kind is None else "ROLLBACK")
+            row = entry("meta", meta_row(key, value)).columns()
+            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", row)

@@ -98,7 +98,13 @@ class Interrupted:
         return {**self.meta, **(self._resumes[-1] if self._resumes else {})}
 
     def reopen(
-        self, path: Path, resumption: Resumption, now: Mapping[str, Any], changes: Sequence[str], t: float
+        self,
+        path: Path,
+        resumption: Resumption,
+        now: Mapping[str, Any],
+        changes: Sequence[str],
+        t: float,
+        patience: float | None,
     ) -> Journal:
         """Open the journal to write on, and note in it that the run is taken up, by whom, and after which step.
 
@@ -114,6 +120,8 @@ class Interrupted:
             What is not as it was when the run was carried out last.
         t : float
             Laboratory time, s.
+        patience : float or None
+            As of a journal.
 
         Raises
         ------
@@ -137,7 +145,7 @@ class Interrupted:
             "ended": {key: self.meta[key] for key in ("status", "reason") if key in self.meta},
             **{key: now[key] for key in _DESCRIBED if key in now},
         }
-        journal = Journal.reopen(path, {"resumes": [*self._resumes, entry]})
+        journal = Journal.reopen(path, {"resumes": [*self._resumes, entry]}, patience)
         label = f" ({step.label})" if step.label else ""
         text = f"resumed by {now['operator']} after step {step.step}{label}; it had stood for {gap:.0f} s"
         journal.event(

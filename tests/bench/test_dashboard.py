@@ -33,6 +33,7 @@ from bench.hysteresis import (
 )
 from bench.hysteresis.documents import Model
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
+from bench.journal.rows import Entry
 from bench.layout import DashboardLayout, XYPlot
 from bench.model_file import ModelFile
 from bench.protocol import TRACES
@@ -264,7 +265,8 @@ def keep_journal(
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
-    journal._db.execute("BEGIN")
+    rows: list[Entry] = []
+    journal._keeper.keep, keep = rows.extend, journal._keeper.keep  # type: ignore[method-assign]
     for entry in entries:
         if isinstance(entry, StepRecord):
             journal.step(entry)
@@ -272,7 +274,8 @@ def keep_journal(
             journal.event(entry)
         else:
             journal.telemetry(*entry)
-    journal._db.execute("COMMIT")
+    journal._keeper.keep = keep  # type: ignore[method-assign]
+    keep(rows)
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
     if models is None:

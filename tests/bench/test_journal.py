@@ -183,8 +183,8 @@ class TestDurability:
 
     def test_settings_of_the_database(self, tmp_path):
         journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
-        assert journal._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-        assert journal._db.execute("PRAGMA synchronous").fetchone() == (2,)
+        assert journal._keeper.store._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        assert journal._keeper.store._db.execute("PRAGMA synchronous").fetchone() == (2,)
         journal.close()
 
     def test_survives_the_death_of_the_process(self, tmp_path):
@@ -520,7 +520,7 @@ class TestReopening:
 
     def test_a_run_that_has_ended_is_not_written_on(self, tmp_path):
         write(tmp_path / FILE_NAME)
-        with pytest.raises(ConfigurationError, match="has ended: completed"):
+        with pytest.raises(ConfigurationError, match="a run that was completed"):
             Journal.reopen(tmp_path)
 
     def test_a_damaged_one_is_not_written_on(self, tmp_path):
