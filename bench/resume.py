@@ -20,7 +20,7 @@ from bench.past import Interrupted, Past
 from bench.recorded_files import Original, unpack
 from bench.repetition import recorded_protocol
 from bench.rig_file import load_rig, rig_of_content
-from bench.runs import Run, RunResult, carry_out
+from bench.runs import RECORDING_NAME, Run, RunResult, carry_out
 from bench.upkeep.opening import opened
 from bench.upkeep.recovery import clear_expired_watchdogs
 
@@ -104,7 +104,14 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
             with opened(run.rig, run.overrides, asked.attach, "bench resume") as place:
                 for name, meaning in clear_expired_watchdogs(place).items():
                     console.print(f"{name}: cleared: {meaning}", highlight=False, markup=False, soft_wrap=True)
-        return carry_out(run, console, interrupts, again)
+        result = carry_out(run, console, interrupts, again)
+    recording = folder / RECORDING_NAME
+    if recording.exists():
+        # It ends where the run died.
+        recording.unlink()
+        text = f"{recording} was of the first part and is removed; bench export {folder} --format rrd makes the whole"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    return result
 
 
 def _check_can_be_resumed(record: Record, given: Path) -> None:
