@@ -246,17 +246,6 @@ class AttachedClock(Clock):
         for control in self._opened:
             control.close()
 
-    def go_on(self, epoch: datetime, last: float) -> None:
-        """Go on with the time of the server, if it is still that of the run.
-
-        Raises ConfigurationError if the laboratory was served anew since.
-        """
-        if epoch != self.epoch or self.now() < last:
-            raise ConfigurationError(
-                f"the laboratory that is served now began at {self.epoch.isoformat()}, that of the run at "
-                f"{epoch.isoformat()}: its specimen is another one, so the run cannot be resumed on it"
-            )
-
     @property
     def is_alone(self) -> bool:
         """Whether the server is gone, and its instruments with it."""

@@ -29,13 +29,12 @@ from bench.errors import (
     SettleTimeoutError,
 )
 from bench.interrupts import Interrupts
-from bench.journal import Journal
 from bench.past import Resumption, reprime
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
 from bench.protocol.vocabulary import PROMPT, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
 from bench.rig import Look
-from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, traced
+from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, RunRecord, traced
 from bench.safety import SAFE
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.station.interface import Station
@@ -83,7 +82,7 @@ class Engine:
     def __init__(
         self,
         station: Station,
-        journal: Journal,
+        journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None = None,
@@ -113,7 +112,7 @@ class Engine:
 
         With a past it goes on where its record ends, once the specimen is back where it was.
         """
-        start = self._clock.now()
+        self._run.zero = self._clock.now() if past is None else past.zero
         self._clock.interrupted = self._interrupts.abort_requested
         if isinstance(self._clock, PacedClock):
             self._clock.restart_pace()
@@ -131,7 +130,7 @@ class Engine:
             self._interrupts.acknowledge()
             self._clock.interrupted = lambda: False
             safe_state = self._station.end()
-        return self._finish(error, start, safe_state)
+        return self._finish(error, safe_state)
 
     def _carry_out(
         self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None
@@ -216,12 +215,14 @@ class Engine:
                 values = run.look(Look.SAMPLE, wanted)
                 now = self._clock.now()
                 ask = message.task.begin if command is None else message.task.update
-                command = ask(now, *(values[name] for name in wanted))
+                # As it is recorded, so that a resumed run can repeat it to the last bit.
+                passed = now - run.zero
+                command = ask(passed, *(values[name] for name in wanted))
                 trace = message.task.trace
                 run.trace = traced(trace)
                 values |= run.trace
                 run.record_tick(now, values)
-                seen.append(now)
+                seen.append(passed)
                 if command.done:
                     setpoints = {message.actuator: command.setpoint}
                     return run.finish_step(started, message.label, setpoints, values, Settled.CONTROLLED, seen)
@@ -313,7 +314,7 @@ class Engine:
             run.tick()
             latest += run.pause_if_asked()
 
-    def _finish(self, error: Exception | None, start: float, safe_state: Mapping[str, str]) -> Outcome:
+    def _finish(self, error: Exception | None, safe_state: Mapping[str, str]) -> Outcome:
         if error is None:
             status, reason = "completed", ""
         elif isinstance(error, AbortError):
@@ -321,7 +322,7 @@ class Engine:
         else:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
-        finished = self._clock.now()
+        finished = self._clock.now() - self._run.zero
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
             self._journal.make_room()
@@ -339,7 +340,7 @@ class Engine:
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._run.steps, finished - start, safe_state, error, pace)
+        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace)
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:

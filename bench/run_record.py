@@ -107,7 +107,12 @@ def metadata(
         "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
         "controls": protocol.controlled(slots),
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
-        "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
+        "plan": {
+            "steps": expected.steps,
+            "seconds": expected.seconds,
+            "at_most": expected.at_most if expected.complete else None,
+            "complete": expected.complete,
+        },
         "epoch": epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in description.devices.items()},
         "calibration": {

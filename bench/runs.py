@@ -20,6 +20,7 @@ from bench.clock import Clock, Stopwatch
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
+from bench.emulated_twin import twin_of
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
@@ -30,20 +31,24 @@ from bench.journal import FILE_NAME, Journal, abandon
 from bench.locks import Holder, Locks
 from bench.model_file import models_among
 from bench.past import Interrupted
-from bench.protocol import LATENESS, TRACES, ProtocolDefinition, plan
+from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.recorded_files import RIG_FILE_NAME, Original, given_files
+from bench.rehearsal import Rehearsal, rehearse
+from bench.remaining_time import Expectation
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
 from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
-from bench.terminal import ProgressDisplay, ask_operator
+from bench.terminal import ProgressDisplay, RehearsalDisplay, ask_operator
 
 if TYPE_CHECKING:
     from bench.dashboard import Dashboard
 
 RECORDING_NAME = "run.rrd"
+_DEFINITE = 1.1
+"""Longest time of a plan over its shortest, up to which it says when the run ends."""
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
 
@@ -82,6 +87,9 @@ class Run:
     original : Original, optional
         The run that this one repeats: its files are read in the place of those that `settings` name, and its rig is
         taken if it has one.
+    rehearse : bool
+        Whether the run is rehearsed on the emulated twin of the rig before anything moves. A run on the virtual clock
+        is not, as it would take as long itself.
     """
 
     protocol: ProtocolDefinition
@@ -97,6 +105,7 @@ class Run:
     interlock_rate: float | None = None
     faults: Path | None = None
     original: Original | None = None
+    rehearse: bool = True
 
 
 @dataclass(frozen=True)
@@ -147,16 +156,11 @@ def carry_out(
         If a device cannot be connected; nothing has moved.
     """
     stopwatch = Stopwatch()
+    rig_file, stated, parameters = _read(run)
     original = run.original
-    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
-    stated = run.protocol.parse(
-        run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
-    )
-    parameters = original.readable(run.protocol, stated) if original else stated
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
-    guardian: RemoteStation | None = None
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         clock, attachment = _clock(run, rig_file, stack)
@@ -165,25 +169,21 @@ def carry_out(
         clock.interrupted = interrupts.abort_requested
         # A guardian makes the devices safe as soon as this process is gone.
         interrupts.leave_by(_leave)
-        continue_time = partial(again.continue_time, clock) if again is not None else _nothing
-        if run.attach is None and rig_file.in_process:
-            # A laboratory that begins at 0 has the room that the run has by now.
-            rig = Rig(rig_file, clock, run.seed, continue_time)
-            laboratory: object = rig.laboratory
-            station: Station = LocalStation(rig, run.interlock_rate)
-        else:
-            continue_time()
-            doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
-            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
-            laboratory, station = attachment, RemoteStation(guarded, clock)
-            guardian = station
+        rehearsal = None
+        if run.rehearse and again is None and run.clock != "virtual":
+            rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
+        if rehearsal is not None:
+            rehearsal.raise_if_wrong()
+        station, laboratory = _connected(run, rig_file, clock, attachment, again)
+        guardian = station if isinstance(station, RemoteStation) else None
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
         if run.faults is not None:
             schedule_faults(laboratory, faults, run.faults)
         description = station.description
         slots = description.slots(run.protocol)
-        expected = plan(run.protocol, parameters, slots)
+        planned = plan(run.protocol, parameters, slots)
+        expected = planned if rehearsal is None else rehearsal.widened(planned)
         check_before_moving(description, run.protocol, expected)
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
@@ -196,11 +196,11 @@ def carry_out(
             raise AbortError(f"ended by {reason} before anything moved")
         files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
         models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
-        meta = _asked(run, attachment, rig_file, guardian is not None)
-        meta |= metadata(run.protocol, stated, description, slots, expected, clock.epoch)
+        meta = _asked(run, attachment, rig_file)
+        meta |= metadata(run.protocol, stated, description, slots, planned, clock.date())
         resumption = None
         if again is not None:
-            resumption = again.fed(run.protocol, parameters, slots, description, by_hand=guardian is None)
+            resumption = again.fed(run.protocol, parameters, slots, description, clock, by_hand=guardian is None)
         elif original:
             meta["repeats"] = original.meta["run"]
             for difference in differences(original.meta, meta):
@@ -212,6 +212,7 @@ def carry_out(
         if guardian is not None:
             guardian.keep_record(folder)
         meta["run"] = folder.name
+        meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
         patience = rig_file.telemetry.period if clock.sleep_waits else None
         if again is not None and resumption is not None:
@@ -219,8 +220,8 @@ def carry_out(
             journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now(), patience)
         else:
             (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-            kept = files | {RIG_FILE_NAME: rig_file.text.encode()}
-            journal = Journal(folder / FILE_NAME, signals, meta, kept, patience)
+            given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+            journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -234,11 +235,13 @@ def carry_out(
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
         shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
-        progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
+        length = _expectation(rehearsal, planned)
+        progress = ProgressDisplay(console, run.protocol.name, signals, shown, length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
         engine = Engine(station, journal, observers, interrupts, ask)
-        engine.warn(warnings)
+        if again is None:
+            engine.warn(warnings)
         outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
@@ -246,19 +249,115 @@ def carry_out(
     return RunResult(folder, outcome, stopwatch.seconds())
 
 
-def _nothing() -> None:
-    pass
-
-
-def _asked(run: Run, attachment: Attachment | None, rig: RigFile, guarded: bool) -> dict[str, Any]:
+def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:
     """Return what the record says of how the run was asked for."""
     return {
         "rig_given": str(Path(run.rig).resolve()) if run.rig.endswith(".toml") else run.rig,
         "overrides": dict(run.overrides),
         "seed": run.seed,
-        "interlock_rate": rig.safety.rate if guarded else run.interlock_rate,
+        "interlock_rate": _interlock_rate(run, rig),
         "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+        "laboratory_epoch": None if attachment is None else attachment.clock.epoch.isoformat(),
     }
+
+
+def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) -> Rehearsal:
+    """Return what a run would do and touch: rehearsed, or planned if its rig has no twin; nothing moves.
+
+    A rig without a twin is connected, to know its limits.
+
+    Raises
+    ------
+    ConfigurationError
+        If anything is wrong before the start.
+    DeviceError
+        If a device of a rig without a twin cannot be connected.
+    AbortError
+        If the rehearsal was asked to end.
+    """
+    rig_file, _, parameters = _read(run)
+    with ExitStack() as stack:
+        if interrupts is None:
+            interrupts = stack.enter_context(Interrupts(say_at_once))
+        interrupts.leave_by(_leave)
+        rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
+        if rehearsal is None:
+            clock, attachment = _clock(run, rig_file, stack)
+            station, _ = _connected(run, rig_file, clock, attachment)
+            stack.callback(station.close)
+            description = station.description
+            expected = plan(run.protocol, parameters, description.slots(run.protocol))
+            check_before_moving(description, run.protocol, expected)
+            rehearsal = Rehearsal.of_plan(description, run.protocol, expected)
+    interrupts.finish()
+    return rehearsal
+
+
+def _read(run: Run) -> tuple[RigFile, ProtocolParameters, ProtocolParameters]:
+    """Return the rig file, the parameters as they are stated, and with the paths of files that can be read."""
+    original = run.original
+    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
+    defaults = rig_file.protocols.get(run.protocol.name)
+    stated = run.protocol.parse(run.settings, rig_file.roles, defaults, path=rig_file.path)
+    return rig_file, stated, original.readable(run.protocol, stated) if original else stated
+
+
+def _rehearsed(
+    run: Run, file: RigFile, parameters: ProtocolParameters, console: Console, interrupts: Interrupts
+) -> Rehearsal | None:
+    """Rehearse a run on the twin of its rig; return None if it has none."""
+    twin = twin_of(file, run.rig)
+    if twin is None:
+        console.print(
+            f"not rehearsed: rig {file.name} has no emulated twin; its file can name one: [rig] twin",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        return None
+    with RehearsalDisplay(console, f"rehearsing {run.protocol.name} on {twin.name}") as display:
+        return rehearse(
+            run.protocol,
+            parameters,
+            twin,
+            rig=file.name,
+            seed=run.seed,
+            interlock_rate=_interlock_rate(run, file),
+            interrupts=interrupts,
+            observers=[display],
+        )
+
+
+def _expectation(rehearsal: Rehearsal | None, planned: Plan) -> Expectation | None:
+    """Return when the steps of a run are expected to end, None if that is not known."""
+    if rehearsal is not None:
+        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most, rehearsal.prompted)
+    # A plan with steps that may take much longer than their least time says nothing of the end.
+    if planned.complete and planned.at_most <= _DEFINITE * planned.seconds:
+        marks = tuple(enumerate(planned.finished, 1))
+        return Expectation(marks, planned.seconds, planned.at_most, planned.prompted)
+    return None
+
+
+def _interlock_rate(run: Run, file: RigFile) -> float | None:
+    """Return how often the interlocks of a run are looked at beside its readings, Hz; None for not at all."""
+    return run.interlock_rate if run.attach is None and file.in_process else file.safety.rate
+
+
+def _connected(
+    run: Run, file: RigFile, clock: Clock, attachment: Attachment | None, again: Interrupted | None = None
+) -> tuple[Station, object]:
+    """Connect the rig of a run; return its station, and the emulated laboratory if there is one."""
+    continue_time = None if again is None else partial(again.continue_time, clock)
+    if run.attach is None and file.in_process:
+        # A laboratory that begins at 0 has the room that the run has by now.
+        rig = Rig(file, clock, run.seed, continue_time)
+        return LocalStation(rig, run.interlock_rate), rig.laboratory
+    if continue_time is not None:
+        continue_time()
+    doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
+    guarded = GuardedRig(file, run.rig, run.overrides, run.attach, run.seed, doing)
+    return RemoteStation(guarded, clock), attachment
 
 
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:

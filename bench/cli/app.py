@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from bench import registry
-from bench.cli import comparisons, journals, models, records, repeat, resume, run_list, runs, upkeep
+from bench.cli import comparisons, journals, models, records, rehearse, repeat, resume, run_list, runs, upkeep
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.errors import BenchError
@@ -39,8 +39,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for group in (
-    *(runs.app, repeat.app, resume.app, run_list.app, upkeep.app, models.app),
-    *(comparisons.app, records.app, journals.app),
+    runs.app,
+    rehearse.app,
+    repeat.app,
+    resume.app,
+    run_list.app,
+    upkeep.app,
+    models.app,
+    comparisons.app,
+    records.app,
+    journals.app,
 ):
     app.add_typer(group)
 reproduce_ = typer.Typer(

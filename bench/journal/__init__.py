@@ -42,7 +42,7 @@ Versions 1 and 2, which are still read, have neither checksums nor files, and a 
 models stand in files beside the journal, see `add_model`. Version 1 has 1 for each `settled`.
 """
 
-from bench.journal.card import run_card
+from bench.journal.card import expected_steps, run_card
 from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
@@ -60,6 +60,7 @@ __all__ = [
     "abandon",
     "add_model",
     "check_names",
+    "expected_steps",
     "run_card",
     "take_in",
 ]

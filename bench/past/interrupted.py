@@ -58,8 +58,22 @@ class Interrupted:
         return resumes
 
     def continue_time(self, clock: Clock) -> None:
-        """Let a clock go on with the laboratory time of the run; raises ConfigurationError if it cannot."""
-        clock.go_on(datetime.fromisoformat(self.meta["epoch"]), self.past.last)
+        """Let a clock go on with the laboratory time of the run, which began at its epoch.
+
+        Raises ConfigurationError if it cannot: a served laboratory goes on by itself, and has to be the same.
+        """
+        began = self.meta["laboratory_epoch"]
+        if began is None:
+            clock.go_on(self._epoch, self.past.last)
+        elif clock.epoch.isoformat() != began:
+            raise ConfigurationError(
+                f"the laboratory that is served now began at {clock.epoch.isoformat()}, that of the run at {began}: "
+                "its specimen is another one, so the run cannot be resumed on it"
+            )
+
+    @property
+    def _epoch(self) -> datetime:
+        return datetime.fromisoformat(self.meta["epoch"])
 
     def fed(
         self,
@@ -67,6 +81,7 @@ class Interrupted:
         parameters: ProtocolParameters,
         slots: Slots,
         description: RigDescription,
+        clock: Clock,
         by_hand: bool,
     ) -> Resumption:
         """Feed the protocol what was recorded.
@@ -89,8 +104,9 @@ class Interrupted:
             setpoints = {f"{name}_setpoint" for name in description.devices}
             measured = [signal.name for signal in description.signals if signal.name not in setpoints]
         compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
+        zero = 0.0 if self.meta["laboratory_epoch"] is None else (self._epoch - clock.epoch).total_seconds()
         drive = slots["drive"].signal if "drive" in slots else ""
-        return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand)
+        return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand, zero)
 
     @property
     def latest(self) -> dict[str, Any]:
@@ -119,7 +135,7 @@ class Interrupted:
         changes : sequence of str
             What is not as it was when the run was carried out last.
         t : float
-            Laboratory time, s.
+            Time of the clock, s.
         patience : float or None
             As of a journal.
 
@@ -136,6 +152,7 @@ class Interrupted:
             )
         step = resumption.fed.step
         assert step is not None
+        t -= resumption.zero
         gap = (wall_time() - self.written).total_seconds()
         entry = {
             "t": t,

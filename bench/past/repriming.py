@@ -57,6 +57,8 @@ class Resumption:
         Whether the run ends if they differ by more; otherwise that is recorded, and the run goes on.
     by_hand : bool
         Whether what was done by hand has to be done again, as in a new emulated laboratory.
+    zero : float
+        Time of the clock at which the run began, s.
     """
 
     fed: Fed
@@ -65,6 +67,7 @@ class Resumption:
     sigmas: float
     required: bool
     by_hand: bool
+    zero: float
 
 
 def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) -> None:

@@ -17,7 +17,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.extras import needed_for
 from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
-from bench.journal import Record, Table, run_card
+from bench.journal import Record, Table, expected_steps, run_card
 from bench.model_file import ModelFile, parse_model
 from bench.results.data import write_csv
 from bench.results.figures import (
@@ -177,9 +177,9 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
 def _print_status(record: Record, steps: int, console: Console) -> None:
     reason = record.meta.get("reason")
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
-    console.print(
-        f"[{style}]{record.status}[/] after {steps} of {record.meta['plan']['steps']} steps", highlight=False
-    )
+    expected = expected_steps(record.meta)
+    of = f" of {expected}" if expected is not None else ""
+    console.print(f"[{style}]{record.status}[/] after {steps}{of} steps", highlight=False)
     if reason:
         console.print(f"  {reason}", highlight=False, markup=False)
     for device, state in record.meta.get("safe_state", {}).items():

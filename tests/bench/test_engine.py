@@ -667,7 +667,7 @@ class TestControl:
 
     @pytest.mark.timeout(60)
     def test_a_protocol_that_controls_for_ever_has_no_plan(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "_LONGEST_PLAN", 10_000)
+        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
 
         def endless(parameters):
             message = next(control(Integrator(50.0)).generator(parameters))
