@@ -18,17 +18,19 @@ class Store:
     ----------
     path : Path
         The file; it is created if there is none.
+    wait : float
+        Wall-clock time for which it waits for other programs until `wait_for_others` says otherwise, s.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, wait: float = 0.0) -> None:
         self.path = path
-        self._connect()
+        self._connect(wait)
         made = path.stat()
         self._file = made.st_dev, made.st_ino
 
-    def _connect(self) -> None:
+    def _connect(self, wait: float = 0.0) -> None:
         # One thread at a time, see `Keeper`.
-        self._db = sqlite3.connect(self.path, timeout=0.0, isolation_level=None, check_same_thread=False)
+        self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
         self._db.execute("PRAGMA synchronous=FULL")
 

@@ -21,6 +21,9 @@ from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
 from bench.journal.store import Store
 
+_READERS = 10.0
+"""Wall-clock time for which a journal that is opened again waits for its readers, s."""
+
 _END = ("status", "reason", "finished", "safe_state", "counts")
 """Entries of the metadata that a run has once it has ended."""
 
@@ -106,8 +109,10 @@ class Journal:
         """
         file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
-        keeper = Keeper(Store(file))
+        # A reader may have it for a moment.
+        keeper = Keeper(Store(file, _READERS))
         keeper.store.forget(_END)
+        keeper.store.wait_for_others(0.0)
         keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience)
         return journal
@@ -300,7 +305,7 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
         )
     missing = [each for (table, _), each in beside.items() if table in FIRST]
     if missing:
-        with closing(Store(file)) as store:
+        with closing(Store(file, _READERS)) as store:
             store.write(missing)
     for each in missing:
         counts[each.table] += 1

@@ -73,9 +73,10 @@ def _trial(rig: str, whole: Path, kills: int, moments: random.Random, out: Path)
         # A kill comes some time after the step: in a hold, in a commit, or on the way back.
         try:
             folder = kill_after(step, out, *command, delay=moments.uniform(0.0, 0.05))
-        except AssertionError:
+        except AssertionError as error:
             # It ended before it could be killed: done, or with fewer steps than it should have.
-            return killed, finished_steps(out), ""
+            steps = finished_steps(out)
+            return killed, steps, "" if steps == total else str(error)
         killed.append(finished_steps(out))
         command = _resumption(folder)
     return killed, finished_steps(out), _resume(folder)
