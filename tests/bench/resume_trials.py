@@ -99,19 +99,7 @@ def main() -> int:
     table = Table("rig", "killed after steps", "steps", "of", "model / σ", "another seed / σ", "result")
     failed = 0
     with tempfile.TemporaryDirectory(prefix="resume-trials-") as scratch:
-        wholes: dict[str, list[Path]] = {
-            rig: [
-                bench.run(
-                    "damped-oscillation",
-                    rig.partition(",")[0],
-                    out=Path(scratch) / rig / str(seed),
-                    seed=seed,
-                    **each,
-                ).folder
-                for seed in range(SEEDS)
-            ]
-            for rig, each in SETTINGS.items()
-        }
+        wholes = {rig: _uninterrupted(rig, Path(scratch)) for rig in SETTINGS}
         singles = [rig for rig in SETTINGS if rig != CAMPAIGN]
         rigs = [CAMPAIGN, *(singles[i % len(singles)] for i in range(asked.trials))]
         apart = {rig: _apart(rig, folders) for rig, folders in wholes.items()}
@@ -134,6 +122,15 @@ def main() -> int:
     Console(width=160).print(table)
     print(f"{len(rigs) - failed} of {len(rigs)} runs went on as if they had not been killed")
     return 1 if failed else 0
+
+
+def _uninterrupted(rig: str, out: Path) -> list[Path]:
+    """Carry the run of a rig out with one seed after another; return the folders."""
+    name = rig.partition(",")[0]
+    return [
+        bench.run("damped-oscillation", name, out=out / rig / str(seed), seed=seed, **SETTINGS[rig]).folder
+        for seed in range(SEEDS)
+    ]
 
 
 def _apart(rig: str, folders: Sequence[Path]) -> float:
