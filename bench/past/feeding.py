@@ -147,8 +147,8 @@ class Fed:
     def way_back(self) -> list[Place]:
         """Return the shortest way to the state in which the record left the specimen, its last place last.
 
-        A place to which the run came by a small step is not jumped at from far, as that would overshoot it: there is
-        a stop before it. The end of the last branch is gone through as the run did, so that what creeps is near to
+        A place to which the run came by a small step is not jumped at from far, as that would overshoot it: there are
+        stops before it. The end of the last branch is gone through as the run did, so that what creeps is near to
         where it was.
         """
         found: set[int] = set()
@@ -162,8 +162,9 @@ class Fed:
         way: list[Place] = []
         for i in sorted(found):
             place, own = self.places[i], self.places[i - 1] if i else None
-            if way and own is not None and (near := _approach(way[-1], own, place, switches)):
-                way.append(replace(place, setpoints={**place.setpoints, **near}))
+            if way and own is not None:
+                stops = _approach(way[-1], own, place, switches)
+                way += [replace(place, setpoints={**place.setpoints, **stop}) for stop in stops]
             way.append(place)
         return way
 
@@ -253,16 +254,23 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
         reading = _Feeding(definition, fed, steps.popleft()).reading_of(message)
 
 
-def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> dict[str, float]:
-    """Return where to stop on the way to a place, for each actuator that goes further than the run itself did."""
-    stops = {}
+def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> list[dict[str, float]]:
+    """Return where to stop on the way to a place, for the actuators that go further than the run itself did.
+
+    First with a tenth of the way left if that is still more than the run's own step, then where the run came from.
+    """
+    far, near = {}, {}
     for name, value in end.setpoints.items():
-        if name in switches:
-            continue
         jump = value - start.setpoints.get(name, value)
-        if abs(jump) > abs(value - own.setpoints.get(name, value)):
-            stops[name] = value - _LAST_PART * jump
-    return stops
+        step = value - own.setpoints.get(name, value)
+        if name in switches or abs(jump) <= abs(step):
+            continue
+        if _LAST_PART * abs(jump) > abs(step):
+            far[name] = value - _LAST_PART * jump
+        # A step from the other side is that of a turn: there is none.
+        if step * jump > 0:
+            near[name] = value - step
+    return [stops for stops in (far, near) if stops]
 
 
 def _failed(message: Message, record: StepRecord, names: Sequence[str]) -> bool:
