@@ -13,8 +13,8 @@ MAKEFLAGS += --jobs=2
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix resume-trials
-.PHONY: journal-faults journal-kills clean
+.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
+.PHONY: studies resume-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -62,6 +62,10 @@ benchmark: $(SETUP)
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)
 	$(BIN)/python tests/bench/test_busy_machine.py --runs 50 --busy 16
+
+# The studies with the seeds 0 to 9: median, worst and spread of each number.
+studies: $(SETUP)
+	$(BIN)/bench campaign examples/campaign-studies.toml --out recordings/studies
 
 # Each fault of each rig with five seeds, and a table of what passed.
 fault-matrix: $(SETUP)

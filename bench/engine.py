@@ -344,7 +344,7 @@ class Engine:
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:
-    """Check the plan of a dry run against the rig's devices and limits.
+    """Check the plan of a run against the rig's devices and limits.
 
     Raises ConfigurationError if the rig lacks something, or a set-point would leave a device's limits; nothing has
     moved.

@@ -82,7 +82,7 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         with Record(asked.folder) as record:
             rig = str(record.meta.get("rig"))
         locks = stack.enter_context(Locks(Holder.of_this_process(rig, f"bench resume {folder}")))
-        locks.take_run(folder)
+        locks.take_folder(folder)
         with Record(asked.folder) as record:
             _check_can_be_resumed(record, asked.folder)
         take_in(asked.folder)

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
@@ -223,8 +224,12 @@ def _source(protocol: ProtocolDefinition) -> dict[str, Any]:
 @cache
 def _versions() -> Mapping[str, str]:
     """Return the versions of the packages that compute, talk to instruments, or register parts."""
-    registering = {entry.package for group in registry.GROUPS for entry in registry.entries(group).values()}
-    return {package: _version(package) for package in sorted({*_PACKAGES, *registering})}
+    packages = set(_PACKAGES)
+    for group in registry.GROUPS:
+        # Two packages with one name are refused where the name is asked for.
+        with suppress(ConfigurationError):
+            packages |= {entry.package for entry in registry.entries(group).values()}
+    return {package: _version(package) for package in sorted(packages)}
 
 
 def _version(package: str) -> str:

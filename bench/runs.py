@@ -208,7 +208,7 @@ def carry_out(
         folder = again.folder if again is not None else make_folder(run.folder, run_name(run.protocol, meta))
         if again is None:
             locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
-            locks.take_run(folder)
+            locks.take_folder(folder)
         if guardian is not None:
             guardian.keep_record(folder)
         meta["run"] = folder.name
@@ -331,11 +331,11 @@ def _rehearsed(
 def _expectation(rehearsal: Rehearsal | None, planned: Plan) -> Expectation | None:
     """Return when the steps of a run are expected to end, None if that is not known."""
     if rehearsal is not None:
-        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most, rehearsal.prompted)
+        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most)
     # A plan with steps that may take much longer than their least time says nothing of the end.
     if planned.complete and planned.at_most <= _DEFINITE * planned.seconds:
         marks = tuple(enumerate(planned.finished, 1))
-        return Expectation(marks, planned.seconds, planned.at_most, planned.prompted)
+        return Expectation(marks, planned.seconds, planned.at_most)
     return None
 
 

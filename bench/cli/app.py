@@ -15,7 +15,19 @@ import typer
 from rich.markup import escape
 
 from bench import registry
-from bench.cli import comparisons, journals, models, records, rehearse, repeat, resume, run_list, runs, upkeep
+from bench.cli import (
+    campaign,
+    comparisons,
+    journals,
+    models,
+    records,
+    rehearse,
+    repeat,
+    resume,
+    run_list,
+    runs,
+    upkeep,
+)
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.errors import BenchError
@@ -42,6 +54,7 @@ for group in (
     runs.app,
     rehearse.app,
     repeat.app,
+    campaign.app,
     resume.app,
     run_list.app,
     upkeep.app,

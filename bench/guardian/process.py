@@ -31,12 +31,11 @@ from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
 from bench.interlocks import InterlockWatch
-from bench.locks import line_names, port_of
 from bench.rig import Look, Rig
 from bench.safety import SAFE as IS_SAFE
 from bench.station.core import StationCore
 from bench.station.interface import News, masked, news_of
-from bench.station.reconnection import TRIES
+from bench.station.reconnection import TRIES, lines_of, longest_away
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""
@@ -410,7 +409,7 @@ class Guardian:
         self._news += news_of(findings)
 
     def _longest_away(self, name: str) -> float:
-        longest = self._rig.file.safety.reconnect
+        longest = longest_away(self._rig, name)
         return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
@@ -574,13 +573,6 @@ _REQUESTS: Mapping[str, Callable[[Guardian, Message], None]] = {
     "play": Guardian._play,
     "operate": Guardian._operate,
 }
-
-
-def lines_of(rig: Rig) -> dict[str, str]:
-    """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
-    ports = {entry.name: port_of(entry.settings) for entry in rig.file.devices}
-    # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
-    return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
 
 
 def stages(rig: Rig) -> list[list[str]]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from itertools import groupby
 from pathlib import Path
 
-from bench.journal.rows import Entry, table_definitions
+from bench.journal.rows import TABLES, Entry, entry, table_definitions
 
 
 class Store:
@@ -44,7 +43,7 @@ class Store:
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Commit rows, all or none."""
-        if len(entries) == 1:
+        if len(entries) == 1 and len(entries[0].rows) == 1:
             self._insert(entries)
             return
         self._db.execute("BEGIN IMMEDIATE")
@@ -62,11 +61,11 @@ class Store:
         self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
 
     def _insert(self, entries: Iterable[Entry]) -> None:
-        for (table, size), rows in groupby(entries, key=lambda entry: (entry.table, len(entry.row))):
-            marks = ", ".join("?" * (size + (table != "files")))
+        for each in entries:
+            marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
             # A row that comes a second time, from the second file, is the same.
-            statement = f"INSERT OR REPLACE INTO {table} VALUES ({marks})"  # noqa: S608 - own names
-            self._db.executemany(statement, [row.columns() for row in rows])
+            statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
+            self._db.executemany(statement, each.columns())
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -103,11 +102,11 @@ class Store:
                     return f"table {table} has {rows} rows of {count}"
         return ""
 
-    def rows(self) -> list[tuple[str, tuple[object, ...]]]:
-        """Return table and columns of every row, also of a file that has been removed."""
+    def entries(self) -> list[Entry]:
+        """Return every row, also of a file that has been removed."""
         return [
-            (table, row)
-            for table in ("meta", "signals", "steps", "telemetry", "events", "files")
+            entry(table, row if table == "files" else row[:-1])
+            for table in TABLES
             for row in self._db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
         ]
 

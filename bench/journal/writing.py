@@ -16,6 +16,7 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
@@ -103,16 +104,22 @@ class Journal:
         Raises
         ------
         DataError
-            If there is none, it is damaged or of an older schema.
+            If there is none, it is damaged or of an older schema, or cannot be written.
         ConfigurationError
             If the run was completed.
         """
         file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
-        # A reader may have it for a moment.
-        keeper = Keeper(Store(file, _READERS))
-        keeper.store.forget(_END)
-        keeper.store.wait_for_others(0.0)
+        was_mirrored = (file.parent / MIRROR_NAME).exists()
+        try:
+            # A reader may have it for a moment.
+            keeper = Keeper(Store(file, _READERS))
+            keeper.store.forget(_END)
+            keeper.store.wait_for_others(0.0)
+            if not was_mirrored:
+                keeper.begin(keeper.store.entries())
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
         keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience)
         return journal
@@ -154,7 +161,8 @@ class Journal:
         A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
         the next tick, step or event.
         """
-        self._waiting.append((self._number("telemetry"), t, step, *map(float, values)))
+        self._counts["telemetry"] = tick = self._counts["telemetry"] + 1
+        self._waiting.append((tick, t, step, *map(float, values)))
         if self._background is not None:
             self._background.keep_soon(self._take_ticks())
         elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
@@ -239,7 +247,7 @@ class Journal:
     def _take_ticks(self) -> list[Entry]:
         """Return the ticks that wait, which wait no longer."""
         waiting, self._waiting = self._waiting, []
-        return ticks(waiting) if waiting else []
+        return [ticks(waiting)] if waiting else []
 
     def _write(self, entries: Sequence[Entry]) -> None:
         """Make rows durable, and before them the ticks that wait."""
@@ -305,8 +313,11 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
         )
     missing = [each for (table, _), each in beside.items() if table in FIRST]
     if missing:
-        with closing(Store(file, _READERS)) as store:
-            store.write(missing)
+        try:
+            with closing(Store(file, _READERS)) as store:
+                store.write(missing)
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
     for each in missing:
         counts[each.table] += 1
     return file, signals, counts
@@ -318,5 +329,5 @@ def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
         (path.parent / RESERVE_NAME).unlink(missing_ok=True)
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
         for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
-            row = entry("meta", meta_row(key, value)).columns()
-            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", row)
+            rows = entry("meta", meta_row(key, value)).columns()
+            db.executemany("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", rows)

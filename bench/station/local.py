@@ -16,7 +16,7 @@ from bench.roles import Floats
 from bench.safety import make_safe
 from bench.station.core import StationCore
 from bench.station.interface import Arrivals, News, Station, masked, news_of
-from bench.station.reconnection import TRIES, reconnect
+from bench.station.reconnection import TRIES, longest_away, reconnect
 
 _T = TypeVar("_T")
 
@@ -205,7 +205,7 @@ class LocalStation(Station):
             return call()
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
-        longest = self._rig.file.safety.reconnect
+        longest = longest_away(self._rig, name)
         seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
         self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from bench.clock import Clock
 from bench.devices import Device
 from bench.errors import DeviceConnectionError
+from bench.locks import line_names, port_of
+from bench.rig import Rig
 
 TRIES = 3
 """How often all devices are read at most, when a line is lost and comes back while they are read."""
@@ -15,7 +17,25 @@ _INTERVAL = 0.2
 """Time between two attempts, s."""
 
 _SHARE_OF_WATCHDOG = 0.6
-"""Share of its own watchdog's time for which an instrument may be out of reach."""
+"""Share of its watchdog's time for which an instrument may be out of reach."""
+
+
+def lines_of(rig: Rig) -> dict[str, str]:
+    """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
+    ports = {entry.name: port_of(entry.settings) for entry in rig.file.devices}
+    # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
+    return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
+
+
+def longest_away(rig: Rig, name: str) -> float:
+    """Return for how long the line of a device may be away, s.
+
+    It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
+    it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
+    """
+    lines = lines_of(rig)
+    watchdogs = (rig.devices[other].watchdog for other, line in lines.items() if line == lines[name])
+    return min([rig.file.safety.reconnect, *(_SHARE_OF_WATCHDOG * each for each in watchdogs if each)])
 
 
 def reconnect(
@@ -32,7 +52,7 @@ def reconnect(
     clock : Clock
         The clock of the run.
     longest : float
-        How long the line may be away, s; an instrument with a watchdog only for 0.6 of its time.
+        How long the line may be away, s; see `longest_away`.
     given_up : callable
         Called between two attempts; returns whether the run has ended meanwhile.
 
@@ -50,8 +70,6 @@ def reconnect(
     """
     if type(device).reconnect is Device.reconnect:
         raise lost
-    if device.watchdog:
-        longest = min(longest, _SHARE_OF_WATCHDOG * device.watchdog)
     start = clock.now()
     while True:
         try:

@@ -2,4 +2,5 @@
 
 from bench.workers.process import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -184,6 +184,11 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
             self._follow()
             return self._angle
 
+    @property
+    def is_moving(self) -> bool:
+        """Whether the shaft is on its way, by its profile; asking does not let time pass."""
+        return self._trajectory is not None and self.world.time < self._trajectory.end
+
     def position_after(self, seconds: float) -> float:
         """Return where the profile brings the shaft within some seconds, rad, for a plant on its way there.
 

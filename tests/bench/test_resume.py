@@ -173,8 +173,8 @@ class TestResume:
         with pytest.raises(ConfigurationError, match=r"is a run on rig heater; vo2 is another one"):
             resume(Resume(folder=folder, rig="vo2"), silent())
         with Locks(Holder.of_this_process("heater", f"run {folder}")) as locks:
-            locks.take_run(folder)
-            with pytest.raises(ConfigurationError, match=r"is going on: .* is held by .*process \d+"):
+            locks.take_folder(folder)
+            with pytest.raises(ConfigurationError, match=r"folder .* is in use: it is held by .*process \d+"):
                 resume(Resume(folder=folder), silent())
         assert len(steps_of(folder)) == 3
 

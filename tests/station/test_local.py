@@ -16,6 +16,7 @@ from bench.errors import (
 from bench.rig import Look, Rig
 from bench.rig_file import load_rig
 from bench.station.local import LocalStation
+from bench.station.reconnection import lines_of, longest_away
 
 
 class Later(VirtualClock):
@@ -92,6 +93,17 @@ class TestReconnection:
         with pytest.raises(DeviceConnectionError):
             station.look(Look.GLANCE)
         assert station.clock.now() - since < rig.devices["tec"].watchdog
+
+    def test_the_watchdog_of_an_actuator_counts_for_a_sensor_on_its_line(self):
+        rig = Rig(load_rig("hybrid", {"safety.reconnect": "60"}), VirtualClock(), 0)
+        try:
+            watchdog = rig.devices["piezo"].watchdog
+            lines = lines_of(rig)
+            assert lines["displacement"] == lines["piezo"] != lines["tec"]
+            assert rig.devices["displacement"].watchdog is None
+            assert longest_away(rig, "displacement") == longest_away(rig, "piezo") == 0.6 * watchdog < 60
+        finally:
+            rig.close()
 
     def test_an_operator_who_ends_the_run_does_not_wait_for_the_line(self, vo2):
         station, tec, _ = vo2()
