@@ -151,7 +151,10 @@ class Fed:
         stops before it. The end of the last branch is gone through as the run did, so that what creeps is near to
         where it was.
         """
-        found: set[int] = set()
+        if not self.places:
+            return []
+        # Also where nothing was set: something may have been done by hand there.
+        found = {len(self.places) - 1}
         for actuator in self._actuators:
             path = self._path(actuator)
             first = len(self.places) - len(path)

@@ -1,5 +1,6 @@
 import io
 import random
+import shutil
 import sqlite3
 from functools import reduce
 from hashlib import sha256
@@ -290,6 +291,14 @@ def test_a_controller_goes_on_where_its_readings_had_brought_it(tmp_path):
 def test_what_was_done_by_hand_is_done_again_in_a_new_laboratory(tmp_path):
     folder = bench.run("force-voltage", "sma", out=tmp_path, points=11, conditioning=1).folder
     total = len(steps_of(folder))
+    shutil.copytree(folder, tmp_path / "early")
+    # After the prompt, before anything was set.
+    early = tmp_path / "early"
+    cut(early, 2)
+    assert resume(Resume(folder=early), silent()).outcome.status == "completed"
+    with Record(folder) as whole, Record(early) as resumed:
+        forces = [record.steps()["load_cell_force"][-1] for record in (whole, resumed)]
+    assert forces[1] == pytest.approx(forces[0], abs=0.1)
     cut(folder, total // 2)
     assert resume(Resume(folder=folder), silent()).outcome.status == "completed"
     assert len(steps_of(folder)) == total
