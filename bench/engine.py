@@ -203,9 +203,11 @@ class Engine:
         wanted = (message.drive, message.response, *message.others)
         run.check_signals(*wanted)
         limits = self._station.description.limits_of(message.actuator)
+        low, high = message.limits or (limits.low, limits.high)
+        # Before the controller asks for any of them.
+        self._station.check({message.actuator: (low, high)})
         started = self._clock.now()
         latest = started + message.timeout
-        low, high = message.limits or (limits.low, limits.high)
         command: Command | None = None
         seen: list[float] = []
         try:

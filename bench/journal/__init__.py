@@ -1,7 +1,8 @@
 """The durable record of a run: one SQLite file, written before any observer is notified.
 
 The file is in WAL mode with synchronous=FULL, and every step and event is committed when it is handed over, with the
-telemetry before it; what `Journal` has returned from survives a crash of the process and of the machine. Everything
+telemetry before it; what `Journal` has returned from survives a crash of the process and of the machine. On the
+virtual clock it is synchronous=NORMAL: a crash of the machine may take the last rows, but damages nothing. Everything
 else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it becomes one
 self-contained file, which can be read where nothing can be written.
 

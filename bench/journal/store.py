@@ -19,10 +19,13 @@ class Store:
         The file; it is created if there is none.
     wait : float
         Wall-clock time for which it waits for other programs until `wait_for_others` says otherwise, s.
+    flushed : bool
+        Whether each commit waits for the disk.
     """
 
-    def __init__(self, path: Path, wait: float = 0.0) -> None:
+    def __init__(self, path: Path, wait: float = 0.0, *, flushed: bool = True) -> None:
         self.path = path
+        self._synchronous = "FULL" if flushed else "NORMAL"
         self._connect(wait)
         made = path.stat()
         self._file = made.st_dev, made.st_ino
@@ -31,7 +34,7 @@ class Store:
         # One thread at a time, see `Keeper`.
         self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
+        self._db.execute(f"PRAGMA synchronous={self._synchronous}")
 
     def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
         """Make the tables, with their first rows."""

@@ -45,6 +45,9 @@ class Journal:
     patience : float, optional
         Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
         it the caller's writes, which is faster where nothing waits, as on the virtual clock.
+    flushed : bool
+        Whether each step and event waits until it is on the disk, so that a loss of power takes nothing either.
+        Otherwise the disk gets the journal at its end, and the death of the process alone takes nothing.
 
     Raises
     ------
@@ -60,6 +63,8 @@ class Journal:
         meta: Mapping[str, Any],
         files: Mapping[str, bytes] = MappingProxyType({}),
         patience: float | None = None,
+        *,
+        flushed: bool = True,
     ) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
@@ -76,7 +81,7 @@ class Journal:
         for former in second_files(path):
             former.unlink(missing_ok=True)
         try:
-            store = Store(path)
+            store = Store(path, flushed=flushed)
             store.create(names, entries)
             keeper = Keeper(store)
             keeper.begin(entries)

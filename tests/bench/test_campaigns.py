@@ -387,16 +387,15 @@ def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     chain = CHAIN.replace("0..1", "0..0").replace("[0.1, 0.2]", "0.1")
     path = campaign(chain + STAIRS.replace(str(PROTOCOLS), "mine.py"), ("[3, 5]", "3"), ("[5.0, 10.0]", "5.0"))
     rig_file(("heater_laboratory:", "shipped_laboratory:"))
-    expansion = expand(read_campaign(path))
+    # Its processes begin with the import path of this one, so they come before the folder of the rig is on it.
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        expansion = expand(read_campaign(path))
+        with ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor:
+            there = carry_out_tasks(expansion.tasks, {}, executor)
     with Workers(1) as workers:
         here = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, tmp_path / "here"))
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor,
-    ):
-        there = carry_out_tasks(expansion.tasks, {}, executor)
     assert [(each.status, each.reason) for each in there.values()] == [("completed", "")] * 4
     assert done_before(expansion.tasks, tmp_path / "there").done == there
     for name, task in expansion.tasks.items():
