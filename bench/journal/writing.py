@@ -23,7 +23,7 @@ from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_na
 from bench.journal.store import Store
 
 _READERS = 10.0
-"""Wall-clock time for which a journal that is opened again waits for its readers, s."""
+"""Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
 
 _END = ("status", "reason", "finished", "safe_state", "counts")
 """Entries of the metadata that a run has once it has ended."""
@@ -81,8 +81,9 @@ class Journal:
         for former in second_files(path):
             former.unlink(missing_ok=True)
         try:
-            store = Store(path, flushed=flushed)
+            store = Store(path, _READERS, flushed=flushed)
             store.create(names, entries)
+            store.wait_for_others(0.0)
             keeper = Keeper(store)
             keeper.begin(entries)
         except (sqlite3.Error, OSError) as error:
