@@ -42,7 +42,7 @@ _LONGEST_NAME = 96
 _LONGEST_PART = 32
 _COMPARED = (
     "protocol",
-    "protocol_source",
+    "protocol_source.sha256",
     "parameters",
     "rig",
     "rig_content",

@@ -529,7 +529,7 @@ class TestReopening:
 
     def test_a_run_that_has_ended_is_not_written_on(self, tmp_path):
         write(tmp_path / FILE_NAME)
-        with pytest.raises(ConfigurationError, match="has ended: completed"):
+        with pytest.raises(ConfigurationError, match="a run that was completed"):
             Journal.reopen(tmp_path)
 
     def test_a_damaged_one_is_not_written_on(self, tmp_path):
