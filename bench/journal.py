@@ -11,7 +11,7 @@ Schema, version 2
     Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
     extends and the overrides), `overrides`, `protocol`, `parameters`, `slots` (device and signal by name), `seed`,
     `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
-    0), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
+    0), `devices` (identity by name), `limits` (set-points that each allows), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit and
     whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),
     `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished`
     (laboratory s), `safe_state` (outcome by device). A file without `status` is of a run that is going on or whose

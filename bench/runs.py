@@ -290,6 +290,7 @@ def _metadata(
         "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
         "epoch": clock.epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in station.description.devices.items()},
+        "limits": {name: (limits.low, limits.high) for name, limits in station.description.limits.items()},
         "calibration": {
             **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
             **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},

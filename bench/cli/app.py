@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from bench import registry
-from bench.cli import models, records, runs, upkeep
+from bench.cli import models, records, runs, twin, upkeep
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.errors import BenchError
@@ -37,7 +37,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for group in (runs.app, upkeep.app, models.app, records.app):
+for group in (runs.app, upkeep.app, models.app, records.app, twin.app):
     app.add_typer(group)
 reproduce_ = typer.Typer(
     help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",

@@ -77,14 +77,7 @@ def noise_of(recordings: Sequence[Recording], signal: str) -> Noise:
             same = np.diff(r.last_change[rows]) == 0
             differences.append(np.diff(values[rows])[same])
     every = np.concatenate([r.columns[signal] for r in recordings])
-    resolution = _resolution(every[np.isfinite(every)])
-    deviations = {kind: _deviation(np.concatenate(each)) for kind, each in found.items()}
-    reading, quick = deviations[True], deviations[False]
-    known = [each for each in (reading, quick) if each is not None]
-    spare = known[0] if known else 0.0
-    reading, quick = (spare if each is None else each for each in (reading, quick))
-    # Below the last digit rounding hides it.
-    return Noise(*(0.0 if each < 0.3 * resolution else each for each in (reading, quick)), resolution)
+    return _noise([_deviation(np.concatenate(found[kind])) for kind in (True, False)], every)
 
 
 def identify_disturbances(
@@ -218,26 +211,30 @@ def _squares(pairs: _Pairs, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _response_noise(parts: Sequence[_Part], recordings: Sequence[Recording], signal: str) -> Noise:
-    """Return the noise of the response: of neighbouring rows where it depends least on the drive."""
-    found: dict[bool, float | None] = {}
-    for kind in (False, True):
-        differences = []
-        for part in parts:
-            pairs = part.pairs
-            if not pairs.first.size:
-                continue
-            gaps = pairs.time[pairs.is_reading == kind]
-            if not gaps.size:
-                continue
-            chosen = (pairs.is_reading == kind) & (pairs.slope == 0) & (pairs.time == gaps.min())
-            differences.append(part.errors[pairs.second[chosen]] - part.errors[pairs.first[chosen]])
-        found[kind] = _deviation(np.concatenate(differences)) if differences else None
-    quick, reading = found[False], found[True]
-    known = [each for each in (reading, quick) if each is not None]
-    spare = known[0] if known else 0.0
+    """Return the noise of the response: of neighbouring rows in the class of slopes where they differ least."""
+    found: list[float | None] = []
+    for kind in (True, False):
+        pairs = [(part, part.pairs, part.pairs.is_reading == kind) for part in parts]
+        nearest = min((int(each.time[of].min()) for _, each, of in pairs if of.any()), default=0)
+        deviations = []
+        for slope in range(_SLOPES):
+            differences = [
+                part.errors[each.second[chosen]] - part.errors[each.first[chosen]]
+                for part, each, of in pairs
+                if (chosen := of & (each.slope == slope) & (each.time == nearest)).any()
+            ]
+            deviations.append(_deviation(np.concatenate(differences)) if differences else None)
+        found.append(min((each for each in deviations if each is not None), default=None))
     every = np.concatenate([r.columns[signal] for r in recordings])
+    return _noise(found, every)
+
+
+def _noise(found: Sequence[float | None], values: Floats) -> Noise:
+    """Return the noise of readings and quick readings; where one is not known, it is that of the other."""
+    reading, quick = found
+    known = reading if reading is not None else quick if quick is not None else 0.0
     return Noise(
-        spare if reading is None else reading, spare if quick is None else quick, _resolution(every[np.isfinite(every)])
+        known if reading is None else reading, known if quick is None else quick, _resolution(values[np.isfinite(values)])
     )
 
 

@@ -47,6 +47,8 @@ class Recording:
         To what, input units.
     drive, response : str
         The signals of these slots.
+    ticks : tuple of ndarray
+        When each quick reading was complete, on the clock of the run, s; in which step.
     """
 
     path: Path
@@ -60,6 +62,7 @@ class Recording:
     setpoints: Floats
     drive: str
     response: str
+    ticks: tuple[Floats, Floats]
 
     @property
     def driven(self) -> Floats:
@@ -176,6 +179,7 @@ def read_recording(path: Path, file: RigFile) -> Recording:
         setpoints=setpoint[changed],
         drive=reading,
         response=answer,
+        ticks=(ticks["t"], ticks["step"]),
     )
 
 

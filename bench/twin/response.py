@@ -8,7 +8,7 @@ either sign on a finer plane: the part of the model's error that cross-validatio
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -47,6 +47,8 @@ class IdentifiedResponse:
         Gives what of the model's error repeats; None if nothing does.
     offsets : tuple of float
         Of the response in each run, output units.
+    lag_uncertainty : float
+        Standard uncertainty of the lag, s; 0 without one.
     rms_model, rms : float
         Error of the model with its dynamics over the readings of steps, and what is left over with the correction,
         output units.
@@ -55,6 +57,7 @@ class IdentifiedResponse:
     dynamics: ResponseDynamics
     correction: Operator[Any] | None
     offsets: tuple[float, ...]
+    lag_uncertainty: float
     rms_model: float
     rms: float
 
@@ -91,7 +94,7 @@ def identify_response(
     recordings: Sequence[Recording], actuator: ActuatorDynamics, model: Operator[Any]
 ) -> IdentifiedResponse:
     """Identify the response of a specimen, whose model and actuator are known."""
-    dynamics = _identify_dynamics(recordings, actuator, model)
+    dynamics, uncertainty = _identify_dynamics(recordings, actuator, model)
     step = grid_step(actuator)
     inputs, errors, offsets, readings = [], [], [], []
     for r in recordings:
@@ -109,12 +112,13 @@ def identify_response(
     left = np.concatenate(errors)
     rms_model = float(np.sqrt(np.mean(left[chosen] ** 2)))
     correction, rms = _identify_correction(model, inputs, left, chosen)
-    return IdentifiedResponse(dynamics, correction, tuple(offsets), rms_model, rms)
+    return IdentifiedResponse(dynamics, correction, tuple(offsets), uncertainty, rms_model, rms)
 
 
 def _identify_dynamics(
     recordings: Sequence[Recording], actuator: ActuatorDynamics, model: Operator[Any]
-) -> ResponseDynamics:
+) -> tuple[ResponseDynamics, float]:
+    """Return the dynamics, and the standard uncertainty of the lag, s."""
     from scipy.optimize import minimize_scalar
 
     step = grid_step(actuator)
@@ -147,12 +151,14 @@ def _identify_dynamics(
     def score(squares: float, numbers: int) -> float:
         return count * math.log(squares) + numbers * math.log(count)
 
+    def squares_of(logarithm: float, power: float) -> float:
+        return fitted(columns_of(ResponseDynamics(math.exp(logarithm), power), ()), True)[0]
+
     candidates = [(score(fitted(columns_of(ResponseDynamics(), ()), True)[0], 0), ResponseDynamics())]
     for power in (1.0, 2.0):
         best = minimize_scalar(
-            lambda logarithm, power=power: fitted(
-                columns_of(ResponseDynamics(math.exp(logarithm), power), ()), True
-            )[0],
+            squares_of,
+            args=(power,),
             bounds=(math.log(2.0 * step), math.log(100.0)),
             method="bounded",
             options={"xatol": 0.01, "maxiter": 30},
@@ -171,7 +177,16 @@ def _identify_dynamics(
             times = tuple(every[i] for i in chosen)
             found = ResponseDynamics(lagged.lag, lagged.power, float(solution[0]), shares, times)
             candidates.append((score(squares, 1 + 2 * number + (lagged.lag > 0)), found))
-    return min(candidates, key=lambda each: each[0])[1]
+    chosen_one = min(candidates, key=lambda each: each[0])[1]
+    return chosen_one, _uncertainty(squares_of, lagged, count) if lagged.lag else 0.0
+
+
+def _uncertainty(squares_of: Callable[[float, float], float], lagged: ResponseDynamics, count: int) -> float:
+    """Return the standard uncertainty of a lag from the curvature of the sum of squares about it, s."""
+    near = 0.05
+    middle, low, high = (squares_of(math.log(lagged.lag) + each, lagged.power) for each in (0.0, -near, near))
+    curvature = max((low - 2.0 * middle + high) / near**2, 1e-300)
+    return lagged.lag * math.sqrt(2.0 * middle / count / curvature)
 
 
 def _weights(recording: Recording) -> Floats:
