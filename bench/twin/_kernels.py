@@ -8,8 +8,8 @@ from numba import njit
 
 from bench.hysteresis._checks import Floats
 
-POSITION, VELOCITY, LAGGED, WANDER = range(4)
-"""Places in the state of the drive."""
+STATE_SIZE = 5
+"""Numbers of the state of the drive: position, velocity, lagged, wander, unevenness."""
 
 
 @njit(cache=True)
@@ -26,22 +26,26 @@ def follow(
     power: float,
     wander: float,
     wander_time: float,
+    uneven: float,
+    uneven_length: float,
 ) -> None:
     """Move the drive by as many grid steps as there are set-points; write what the operator sees to `out`.
 
     A frequency of 0 is an actuator that follows at once, a damping of 0 one of first order. Rows of `out`: what the
-    actuator did, and that with the lag before the operator and the wander.
+    actuator did, and that with the lag before the operator, the wander and the unevenness. Rows of `normals`: standard
+    normal numbers for wander, another for unevenness.
     """
     decay = math.exp(-step / wander_time)
     kick = wander * math.sqrt(1.0 - decay * decay)
     remains = math.exp(-step / lag) if lag > 0.0 else 0.0
-    position, velocity, lagged, drift = state[0], state[1], state[2], state[3]
+    position, velocity, lagged, drift, place = state[0], state[1], state[2], state[3], state[4]
     # Steps short enough for the pole, whatever the grid.
     inner = max(1, math.ceil(frequency * max(1.0, 2.0 * damping) * step / 0.1))
     h = step / inner
     first = math.exp(-frequency * step)
     for k in range(setpoints.size):
         target = setpoints[k]
+        before = position
         if frequency <= 0.0:
             position, velocity = target, 0.0
         elif damping <= 0.0:
@@ -58,10 +62,13 @@ def follow(
             seen = lagged if power == 1.0 else math.copysign(abs(lagged) ** (1.0 / power), lagged)
         else:
             seen = position
-        drift = decay * drift + kick * normals[k]
+        drift = decay * drift + kick * normals[0, k]
+        if uneven > 0.0 and position != before:
+            kept = math.exp(-abs(position - before) / uneven_length)
+            place = kept * place + uneven * math.sqrt(1.0 - kept * kept) * normals[1, k]
         out[0, k] = position
-        out[1, k] = seen + drift
-    state[0], state[1], state[2], state[3] = position, velocity, lagged, drift
+        out[1, k] = seen + drift + place
+    state[0], state[1], state[2], state[3], state[4] = position, velocity, lagged, drift, place
 
 
 @njit(cache=True)

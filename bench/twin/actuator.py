@@ -74,8 +74,8 @@ def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float
     setpoints = recording.on_grid(step, initial, end)
     out = np.empty((2, setpoints.size))
     _kernels.follow(
-        np.array([initial, 0.0, initial, 0.0]), setpoints, np.zeros(setpoints.size), out, step, dynamics.frequency,
-        dynamics.damping, dynamics.rate, 0.0, 1.0, 0.0, 1.0,
+        np.array([initial, 0.0, initial, 0.0, 0.0]), setpoints, np.zeros((2, setpoints.size)), out, step,
+        dynamics.frequency, dynamics.damping, dynamics.rate, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
     )  # fmt: skip
     return at_rows(recording, out[0], initial, step, dynamics.delay)
 

@@ -86,7 +86,7 @@ def identify_disturbances(
     """Return the noise of the response, the wander of the drive, and the drift of the response."""
     from scipy.optimize import minimize
 
-    parts = [_Part(r, tuple(operators), dynamics) for r in recordings]
+    parts = [Part(r, tuple(operators), dynamics) for r in recordings]
     _classify(parts)
     noise = _response_noise(parts, recordings, signal)
     variances = np.array([noise.quick**2, noise.reading**2])
@@ -127,12 +127,14 @@ def identify_disturbances(
     return noise, wander, drift
 
 
-class _Part:
+class Part:
     """A run, simulated without disturbances, and the pairs of its rows within holds."""
 
-    def __init__(self, recording: Recording, operators: tuple[Operator[Any], ...], dynamics: Dynamics) -> None:
+    def __init__(
+        self, recording: Recording, operators: tuple[Operator[Any], ...], dynamics: Dynamics, longest: float = _LONGEST
+    ) -> None:
         self._recording, self._operators, self._dynamics = recording, operators, dynamics
-        self._end = min(_LONGEST, float(recording.times[-1]))
+        self._end = min(longest, float(recording.times[-1]))
         first = float(recording.driven[0])
         initial = (first - dynamics.actuator.offset) / dynamics.actuator.gain
         self._first = first
@@ -190,7 +192,7 @@ class _Part:
         return _Pairs(first, second, time, slope, np.concatenate(kinds))
 
 
-def _classify(parts: Sequence[_Part]) -> None:
+def _classify(parts: Sequence[Part]) -> None:
     """Divide the pairs of all parts into classes of the slope that hold as many rows each."""
     every = np.concatenate([part.slopes for part in parts])
     edges = np.quantile(every, np.arange(1, _SLOPES) / _SLOPES)
@@ -210,7 +212,7 @@ def _squares(pairs: _Pairs, values: Floats) -> tuple[Floats, Floats]:
     )
 
 
-def _response_noise(parts: Sequence[_Part], recordings: Sequence[Recording], signal: str) -> Noise:
+def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
     """Return the noise of the response: of neighbouring rows in the class of slopes where they differ least."""
     found: list[float | None] = []
     for kind in (True, False):

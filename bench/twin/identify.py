@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from bench.twin.disturbances import Noise, identify_disturbances, noise_of
 from bench.twin.reading_time import ReadingTime, time_readings
 from bench.twin.recording import Recording, read_recording, slots_of_twin
 from bench.twin.response import IdentifiedResponse, identify_response
-from bench.twin.specimen import Dynamics, Wander
+from bench.twin.specimen import Dynamics, Unevenness, Wander
+from bench.twin.unevenness import identify_unevenness
 
 _MODELS: Mapping[str, Mapping[str, Any]] = {
     "preisach": {"reversible": "linear"},
@@ -49,7 +50,7 @@ class IdentifiedTwin:
         Name of the model, or of its file.
     model : Operator
         The hysteresis.
-    actuator, response, noise, wander, drift, reading_time
+    actuator, response, noise, wander, drift, unevenness, reading_time
         What was identified beside it; the noise is of drive and response.
     offset : float
         Standard deviation of the response from session to session, output units.
@@ -69,6 +70,7 @@ class IdentifiedTwin:
     noise: tuple[Noise, Noise]
     wander: Wander
     drift: Wander
+    unevenness: Unevenness
     reading_time: ReadingTime | None
     offset: float
     signals: Mapping[str, dict[str, Any]]
@@ -130,6 +132,7 @@ class IdentifiedTwin:
             rows.append((name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one"))
         for name, wander, unit in (("wander of the drive", self.wander, drive), ("drift of the response", self.drift, response)):
             rows.append((name, f"{number(wander.deviation, unit)} in {number(wander.time, 's')}"))
+        rows.append(("unknown to the model", f"{number(self.unevenness.deviation, drive)} of the drive, within {number(self.unevenness.length, drive)}"))
         if len(self.recordings) > 1:
             rows.append(("from run to run", f"{number(self.offset, response)} of the response"))
         taken = self.reading_time
@@ -160,6 +163,7 @@ class IdentifiedTwin:
             "noise": {"drive": vars(self.noise[0]), "response": vars(self.noise[1])},
             "wander": vars(self.wander),
             "drift": vars(self.drift),
+            "unevenness": vars(self.unevenness),
             "session_offset": self.offset,
             "reading_time": None if self.reading_time is None else vars(self.reading_time),
         }  # fmt: skip
@@ -202,6 +206,8 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     operators = [operator] if response.correction is None else [operator, response.correction]
     dynamics = Dynamics(grid_step(actuator.dynamics), actuator.dynamics, response.dynamics)
     noise, wander, drift = identify_disturbances(recordings, operators, dynamics, first.response)
+    disturbed = replace(dynamics, wander=wander, drift=drift)
+    unevenness = identify_unevenness(recordings, response.unknown, operators, disturbed, noise)
     drive_noise = noise_of(recordings, first.drive)
     return IdentifiedTwin(
         recordings=recordings,
@@ -212,6 +218,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
         noise=(drive_noise, noise),
         wander=wander,
         drift=drift,
+        unevenness=unevenness,
         reading_time=time_readings(recordings, file),
         offset=float(np.std(response.offsets, ddof=1)) if len(recordings) > 1 else 0.0,
         signals=_signals(recordings, file, drive_noise, noise, source, conversion),
@@ -298,6 +305,7 @@ def _signals(
     """Return how each signal of a device is read."""
     first = recordings[0]
     units = {signal.name: signal.unit for signal in first.signals}
+    driving = slots_of_twin(file)[0].device
     found: dict[str, dict[str, Any]] = {}
     for device, signals in measured_signals(first, file).items():
         followed = False
@@ -310,7 +318,7 @@ def _signals(
                 noise = response if not conversion else _converted(response, conversion, noise)
             table: dict[str, Any] = {"level": float(np.median(values)) if values.size else 0.0}
             setpoint = f"{device}_setpoint"
-            if name not in (first.drive, source) and not followed and units.get(setpoint) == signal.unit:
+            if device != driving and not followed and units.get(setpoint) == signal.unit:
                 table["follows"], followed = device, True
             found[name] = table | vars(noise)
     return found

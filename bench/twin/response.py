@@ -52,6 +52,8 @@ class IdentifiedResponse:
     rms_model, rms : float
         Error of the model with its dynamics over the readings of steps, and what is left over with the correction,
         output units.
+    unknown : tuple of ndarray
+        By run, the error at each reading of a step, of a correction that was made without it, output units.
     """
 
     dynamics: ResponseDynamics
@@ -60,6 +62,7 @@ class IdentifiedResponse:
     lag_uncertainty: float
     rms_model: float
     rms: float
+    unknown: tuple[Floats, ...]
 
 
 def seen_by_specimen(
@@ -72,8 +75,8 @@ def seen_by_specimen(
     out = np.empty((2, setpoints.size))
     lagged = math.copysign(abs(initial) ** response.power, initial)
     _kernels.follow(
-        np.array([initial, 0.0, lagged, 0.0]), setpoints, np.zeros(setpoints.size), out, step, actuator.frequency,
-        actuator.damping, actuator.rate, response.lag, response.power, 0.0, 1.0,
+        np.array([initial, 0.0, lagged, 0.0, 0.0]), setpoints, np.zeros((2, setpoints.size)), out, step,
+        actuator.frequency, actuator.damping, actuator.rate, response.lag, response.power, 0.0, 1.0, 0.0, 1.0,
     )  # fmt: skip
     return np.asarray(actuator.gain * out[1] + actuator.offset)
 
@@ -111,8 +114,11 @@ def identify_response(
     chosen = np.concatenate(readings)
     left = np.concatenate(errors)
     rms_model = float(np.sqrt(np.mean(left[chosen] ** 2)))
-    correction, rms = _identify_correction(model, inputs, left, chosen)
-    return IdentifiedResponse(dynamics, correction, tuple(offsets), uncertainty, rms_model, rms)
+    correction, rms, unknown = _identify_correction(model, inputs, left, chosen)
+    ends = np.cumsum([int(each.sum()) for each in readings])[:-1]
+    return IdentifiedResponse(
+        dynamics, correction, tuple(offsets), uncertainty, rms_model, rms, tuple(np.split(unknown, ends))
+    )
 
 
 def _identify_dynamics(
@@ -200,8 +206,9 @@ def _weights(recording: Recording) -> Floats:
 
 def _identify_correction(
     model: Operator[Any], inputs: Sequence[Floats], errors: Floats, chosen: Any
-) -> tuple[Operator[Any] | None, float]:
-    """Return an operator that gives what of the errors repeats, None if nothing does, and the RMS that is left."""
+) -> tuple[Operator[Any] | None, float, Floats]:
+    """Return an operator that gives what of the errors repeats, None if nothing does; the RMS that is left; and what
+    is left at each chosen row of an operator that was made without it."""
     low, high = min(each.min() for each in inputs), max(each.max() for each in inputs)
     plane = model.plane or (float(low), float(high))
     template = Preisach(
@@ -216,18 +223,20 @@ def _identify_correction(
     rows = np.column_stack([rows, np.ones(target.size)])
     scale = float(np.mean(rows[:, :-1] ** 2)) * target.size or 1.0
     folds = (np.arange(target.size) // _BLOCK) % _FOLDS
-    losses = np.zeros(_PENALTIES.size)
+    unknown = np.zeros((_PENALTIES.size, target.size))
     for fold in range(_FOLDS):
         kept = folds != fold
         gram, right = rows[kept].T @ rows[kept], rows[kept].T @ target[kept]
         values, vectors = np.linalg.eigh(gram)
         turned, tests = vectors.T @ right, rows[~kept] @ vectors
         for i, penalty in enumerate(_PENALTIES):
-            losses[i] += float(np.sum((target[~kept] - tests @ (turned / (np.maximum(values, 0.0) + penalty * scale))) ** 2))
+            unknown[i, ~kept] = target[~kept] - tests @ (turned / (np.maximum(values, 0.0) + penalty * scale))
+    losses = np.sum(unknown**2, axis=1)
     if losses.min() >= float(target @ target):
-        return None, float(np.sqrt(np.mean(target**2)))
+        return None, float(np.sqrt(np.mean(target**2))), target
     penalty = float(_PENALTIES[int(np.argmin(losses))])
     gram = rows.T @ rows + penalty * scale * np.eye(rows.shape[1])
     solution = np.linalg.solve(gram, rows.T @ target)
     left = target - rows @ solution
-    return template.with_coefficients(solution[:-1], float(solution[-1])), float(np.sqrt(np.mean(left**2)))
+    correction = template.with_coefficients(solution[:-1], float(solution[-1]))
+    return correction, float(np.sqrt(np.mean(left**2))), unknown[int(np.argmin(losses))]

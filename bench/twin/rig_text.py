@@ -145,6 +145,9 @@ def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
     )
     for name, wander, unit in (("wander", twin.wander, drive.replace("°C", "K")), ("drift", twin.drift, output)):
         yield from _wander(name, wander, unit)
+    unit = drive.replace("°C", "K")
+    uneven = {"deviation": twin.unevenness.deviation, "length": twin.unevenness.length}
+    yield from _table("emulation.unevenness", uneven, {"deviation": unit, "length": unit})
     for name, table in twin.signals.items():
         yield from _table(f"emulation.signals.{name}", table)
 

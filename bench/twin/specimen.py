@@ -96,6 +96,24 @@ class Wander:
 
 
 @dataclass(frozen=True)
+class Unevenness:
+    """What the model does not know of the specimen: a shift of the drive that changes as the drive moves.
+
+    It is different in each session, as the error of a model is on a new history; it stands while the drive stands.
+
+    Attributes
+    ----------
+    deviation : float
+        Standard deviation, input units; 0 for none.
+    length : float
+        Travel of the drive after which it is forgotten, input units.
+    """
+
+    deviation: float = 0.0
+    length: float = 1.0
+
+
+@dataclass(frozen=True)
 class Dynamics:
     """All that a specimen has beside its operators.
 
@@ -111,6 +129,8 @@ class Dynamics:
         Of the drive as the specimen sees it, beside what is read of it, input units.
     drift : Wander
         Of the response, output units.
+    unevenness : Unevenness
+        Of the drive as the specimen sees it.
     """
 
     step: float
@@ -118,6 +138,7 @@ class Dynamics:
     response: ResponseDynamics = field(default_factory=ResponseDynamics)
     wander: Wander = field(default_factory=Wander)
     drift: Wander = field(default_factory=Wander)
+    unevenness: Unevenness = field(default_factory=Unevenness)
 
 
 class Specimen:
@@ -133,8 +154,6 @@ class Specimen:
         Drive at the beginning, input units.
     rng : numpy.random.Generator or None
         Its wander and drift; without one there is neither.
-    offset : float
-        Of the drive as the specimen sees it, constant, input units.
     """
 
     def __init__(
@@ -143,19 +162,19 @@ class Specimen:
         dynamics: Dynamics,
         start: float,
         rng: np.random.Generator | None = None,
-        offset: float = 0.0,
     ) -> None:
         self._operators = operators
         self._dynamics = dynamics
         self._rng = rng
-        self._offset = offset
         actuator, response = dynamics.actuator, dynamics.response
         position = (start - actuator.offset) / actuator.gain
         wander = rng.standard_normal() * dynamics.wander.deviation if rng is not None else 0.0
         self._drift = rng.standard_normal() * dynamics.drift.deviation if rng is not None else 0.0
         lagged = math.copysign(abs(position) ** response.power, position)
-        self._state = np.array([position, 0.0, lagged, wander])
-        seen = start + wander + offset
+        place = rng.standard_normal() * dynamics.unevenness.deviation if rng is not None else 0.0
+        gain = actuator.gain
+        self._state = np.array([position, 0.0, lagged, wander / gain, place / gain])
+        seen = start + wander + place
         self._memories = [operator.step(operator.initial_state(), seen)[0] for operator in operators]
         output = sum(operator.value(memory) for operator, memory in zip(operators, self._memories, strict=True))
         self._slow = np.full(len(response.times), output)
@@ -170,16 +189,18 @@ class Specimen:
         """
         dynamics, count = self._dynamics, setpoints.size
         actuator, response = dynamics.actuator, dynamics.response
-        normals = np.zeros((2, count)) if self._rng is None else self._rng.standard_normal((count, 2)).T.copy()
+        normals = np.zeros((3, count)) if self._rng is None else self._rng.standard_normal((count, 3)).T.copy()
+        scale = 0.0 if self._rng is None else 1.0 / abs(actuator.gain)
+        unevenness = dynamics.unevenness
         moved = np.empty((2, count))
         _kernels.follow(
-            self._state, setpoints, normals[0], moved, dynamics.step, actuator.frequency, actuator.damping,
-            actuator.rate, response.lag, response.power, dynamics.wander.deviation / abs(actuator.gain),
-            dynamics.wander.time,
+            self._state, setpoints, normals[:2], moved, dynamics.step, actuator.frequency, actuator.damping,
+            actuator.rate, response.lag, response.power, scale * dynamics.wander.deviation, dynamics.wander.time,
+            scale * unevenness.deviation, unevenness.length / abs(actuator.gain),
         )  # fmt: skip
         moved *= actuator.gain
         moved += actuator.offset
-        seen = moved[1] + self._offset
+        seen = moved[1]
         outputs = np.zeros((2, count))
         for number, operator in enumerate(self._operators):
             outputs[0] += operator.evaluate(seen, self._memories[number])
@@ -188,7 +209,7 @@ class Specimen:
         if self._times.size:
             _kernels.creep(self._slow, outputs, dynamics.step, self._shares, self._times)
         if dynamics.drift.deviation and self._rng is not None:
-            outputs[1] += self._drifts(normals[1])
+            outputs[1] += self._drifts(normals[2])
         self.drive, self.response = float(moved[0, -1]), float(outputs[1, -1])
         return moved[0], outputs[1]
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from bench.devices import Signal
 from bench.hysteresis import Operator, operator_from_json
 from bench.rig_file import LaboratorySettings
-from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Wander
+from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Unevenness, Wander
 
 
 class _Table(BaseModel):
@@ -57,6 +57,13 @@ class WanderTable(_Table):
     def wander(self) -> Wander:
         """What the specimen takes."""
         return Wander(self.deviation, self.time)
+
+
+class UnevennessTable(_Table):
+    """What the model does not know, as a shift of the drive: `[emulation.unevenness]`."""
+
+    deviation: float = Field(default=0.0, ge=0, description="standard deviation, input units")
+    length: float = Field(default=1.0, gt=0, description="travel after which it is forgotten, input units")
 
 
 class NoiseTable(_Table):
@@ -138,6 +145,7 @@ class TwinTable(LaboratorySettings):
     response: ResponseTable
     wander: WanderTable = WanderTable()
     drift: WanderTable = WanderTable()
+    unevenness: UnevennessTable = UnevennessTable()
     signals: dict[str, NoiseTable] = Field(default_factory=dict, description="how each signal is read")
     tasks: dict[str, str] = Field(
         default_factory=dict, description="what may be asked of an operator, and the signal that shows it"
@@ -158,7 +166,14 @@ class TwinTable(LaboratorySettings):
     @property
     def dynamics(self) -> Dynamics:
         """What the specimen takes beside the operators."""
-        return Dynamics(self.step, self.drive.dynamics, self.response.dynamics, self.wander.wander, self.drift.wander)
+        return Dynamics(
+            self.step,
+            self.drive.dynamics,
+            self.response.dynamics,
+            self.wander.wander,
+            self.drift.wander,
+            Unevenness(self.unevenness.deviation, self.unevenness.length),
+        )
 
 
 def _operator(text: str) -> Operator[Any]:
