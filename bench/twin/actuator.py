@@ -138,10 +138,11 @@ def grid_step(dynamics: ActuatorDynamics) -> float:
 
 def _candidates(slow: float, recordings: Sequence[Recording]) -> list[dict[str, float]]:
     """Return the numbers of each candidate with their first guesses."""
-    first = {"frequency": 1.0 / slow, "delay": 0.0}
-    second = {"frequency": 2.0 / slow, "damping": 0.8, "delay": 0.0}
     rate = {"rate": _fastest(recordings)}
-    return [{}, {"delay": 0.0}, first, first | rate, second, second | rate]
+    lags = [{"frequency": frequency / slow, "delay": 0.0} for frequency in (1.0, 3.0)]
+    pairs = [{**lag, "damping": damping} for lag in lags for damping in (0.5, 1.0)]
+    plain: list[dict[str, float]] = [{}, {"delay": 0.0}, *lags, *pairs]
+    return [*plain, *(each | rate for each in (*lags, *pairs))]
 
 
 def _weights(recording: Recording) -> Floats:
@@ -167,5 +168,11 @@ def _time_scale(recordings: Sequence[Recording]) -> float:
 
 
 def _fastest(recordings: Sequence[Recording]) -> float:
-    rates = [np.abs(np.diff(r.driven)) / np.maximum(np.diff(r.times), 1e-3) for r in recordings]
-    return float(max(rate.max() for rate in rates)) or 1.0
+    """Return the fastest change that was seen over a time that is long beside the uncertainty of instants."""
+    found = []
+    for r in recordings:
+        spacing = np.diff(r.times)
+        long = spacing > 5.0 * _INSTANT
+        found.append(np.abs(np.diff(r.driven))[long] / spacing[long])
+    rates = np.concatenate(found)
+    return float(rates.max()) if rates.size and rates.max() > 0.0 else 1.0

@@ -34,6 +34,12 @@ _SETTLED = 4.0
 """Time constants of actuator and lag after which the set-point counts as reached."""
 _NEAR = 2e-3
 """Share of the range of the drive over which the slope is taken."""
+_LEAST_OF_HOLD = 3
+_FAR = 6.0
+"""Readings of a hold whose middle counts; distance of an outlier in standard deviations."""
+_RARE = 0.05
+_QUANTILES = 9
+"""Greatest share of outliers, and how many of their quantiles are kept."""
 _SEED = 0
 """Of the simulations, the same for each trial."""
 
@@ -48,11 +54,17 @@ class Noise:
         Standard deviation of a reading, and of a quick one.
     resolution : float
         Last digit; 0 for none.
+    outlier_share : float
+        Share of readings that are further off than noise and last digit explain.
+    outliers : tuple of float
+        By how much these are off: quantiles.
     """
 
     reading: float = 0.0
     quick: float = 0.0
     resolution: float = 0.0
+    outlier_share: float = 0.0
+    outliers: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +78,30 @@ class _Pairs:
     is_reading: NDArray[np.bool_]
 
 
-def noise_of(recordings: Sequence[Recording], signal: str) -> Noise:
+def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
     """Return the noise of a signal that stands still within holds, such as what is read of the drive."""
     found: dict[bool, list[Floats]] = {True: [], False: []}
+    middles, deviations = [], []
     for r in recordings:
         values = r.columns[signal]
-        late = r.since_change > _settled_after(r)
+        late = (r.since_change > _settled_after(r, dynamics)) & np.isfinite(values)
         for kind, differences in found.items():
-            rows = np.flatnonzero((r.is_reading == kind) & late & np.isfinite(values))
+            rows = np.flatnonzero((r.is_reading == kind) & late)
             same = np.diff(r.last_change[rows]) == 0
             differences.append(np.diff(values[rows])[same])
-    every = np.concatenate([r.columns[signal] for r in recordings])
-    return _noise([_deviation(np.concatenate(found[kind])) for kind in (True, False)], every)
+        rows = np.flatnonzero(late)
+        for hold in np.split(values[rows], np.flatnonzero(np.diff(r.last_change[rows])) + 1):
+            if hold.size >= _LEAST_OF_HOLD:
+                middles.append(float(np.median(hold)))
+                deviations.append(hold - middles[-1])
+    noise = _noise([_deviation(np.concatenate(found[kind])) for kind in (True, False)], np.array(middles))
+    off = np.concatenate(deviations) if deviations else np.empty(0)
+    far = off[np.abs(off) > max(_FAR * max(noise.reading, noise.quick), 0.75 * noise.resolution)]
+    # What wanders through a hold is no outlier.
+    if not outliers or not 3 <= far.size <= _RARE * off.size:
+        return noise
+    levels = np.quantile(far, np.linspace(0.0, 1.0, _QUANTILES))
+    return replace(noise, outlier_share=far.size / off.size, outliers=tuple(levels.tolist()))
 
 
 def identify_disturbances(
@@ -240,13 +264,17 @@ def _noise(found: Sequence[float | None], values: Floats) -> Noise:
     )
 
 
-def _settled_after(recording: Recording, dynamics: Dynamics | None = None) -> float:
+def _settled_after(recording: Recording, dynamics: Dynamics) -> float:
     """Return the time after a change of the set-point from which the rest counts as still, s."""
-    if dynamics is None:
-        return 1.0
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency
-    return max(0.5, _SETTLED * (constant + response.lag) + actuator.delay)
+    longest = float(np.abs(np.diff(recording.setpoints, prepend=recording.driven[0])).max()) / actuator.rate
+    return max(0.5, _SETTLED * (constant + response.lag) + actuator.delay + min(longest, 0.3 * _hold(recording)))
+
+
+def _hold(recording: Recording) -> float:
+    """Return the usual time between two changes of the set-point, s."""
+    return float(np.median(np.diff(recording.changes)))
 
 
 def _deviation(differences: Floats) -> float | None:
@@ -259,7 +287,7 @@ def _deviation(differences: Floats) -> float | None:
 def _resolution(values: Floats) -> float:
     """Return the last digit of readings that are multiples of one; 0 if they are not."""
     distinct = np.unique(values)
-    if not 3 <= distinct.size <= max(values.size // 3, 3):
+    if distinct.size < 3 or distinct.size > 0.9 * values.size:
         return 0.0
     gaps = np.diff(distinct)
     gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]

@@ -130,6 +130,8 @@ class IdentifiedTwin:
             rows.append(("late part", f"{100.0 * share:.2g} % of the response, {time:g} s"))
         for name, noise, unit in (("noise of the drive", self.noise[0], drive), ("noise of the response", self.noise[1], response)):
             rows.append((name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one"))
+            if noise.outliers:
+                rows.append(("  outliers", f"{100.0 * noise.outlier_share:.2g} %, up to {number(max(map(abs, noise.outliers)), unit)}"))
         for name, wander, unit in (("wander of the drive", self.wander, drive), ("drift of the response", self.drift, response)):
             rows.append((name, f"{number(wander.deviation, unit)} in {number(wander.time, 's')}"))
         rows.append(("unknown to the model", f"{number(self.unevenness.deviation, drive)} of the drive, within {number(self.unevenness.length, drive)}"))
@@ -208,7 +210,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     noise, wander, drift = identify_disturbances(recordings, operators, dynamics, first.response)
     disturbed = replace(dynamics, wander=wander, drift=drift)
     unevenness = identify_unevenness(recordings, response.unknown, operators, disturbed, noise)
-    drive_noise = noise_of(recordings, first.drive)
+    drive_noise = noise_of(recordings, first.drive, dynamics, outliers=True)
     return IdentifiedTwin(
         recordings=recordings,
         model_name=name,
@@ -221,7 +223,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
         unevenness=unevenness,
         reading_time=time_readings(recordings, file),
         offset=float(np.std(response.offsets, ddof=1)) if len(recordings) > 1 else 0.0,
-        signals=_signals(recordings, file, drive_noise, noise, source, conversion),
+        signals=_signals(recordings, file, dynamics, drive_noise, noise, source, conversion),
         conversion=conversion,
         source=source,
     )
@@ -297,6 +299,7 @@ def _identify_model(recording: Recording, file: RigFile, units: Mapping[str, str
 def _signals(
     recordings: Sequence[Recording],
     file: RigFile,
+    dynamics: Dynamics,
     drive: Noise,
     response: Noise,
     source: str,
@@ -313,14 +316,14 @@ def _signals(
             name = signal.name
             values = np.concatenate([r.columns[name] for r in recordings])
             values = values[np.isfinite(values)]
-            noise = drive if name == first.drive else noise_of(recordings, name)
+            noise = drive if name == first.drive else noise_of(recordings, name, dynamics)
             if name == source:
                 noise = response if not conversion else _converted(response, conversion, noise)
             table: dict[str, Any] = {"level": float(np.median(values)) if values.size else 0.0}
             setpoint = f"{device}_setpoint"
             if device != driving and not followed and units.get(setpoint) == signal.unit:
                 table["follows"], followed = device, True
-            found[name] = table | vars(noise)
+            found[name] = table | {key: list(each) if isinstance(each, tuple) else each for key, each in vars(noise).items()}
     return found
 
 

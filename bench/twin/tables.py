@@ -74,6 +74,8 @@ class NoiseTable(_Table):
     reading: float = Field(default=0.0, ge=0, description="noise of a reading, standard deviation")
     quick: float = Field(default=0.0, ge=0, description="noise of a quick reading, standard deviation")
     resolution: float = Field(default=0.0, ge=0, description="last digit of a reading; 0 for none")
+    outlier_share: float = Field(default=0.0, ge=0, le=1, description="share of readings that are further off")
+    outliers: tuple[float, ...] = Field(default=(), description="by how much these are off, quantiles")
 
 
 class DriveTable(_Table):

@@ -39,7 +39,8 @@ class EmulatedTwin(EmulatedInstrument):
         rng: np.random.Generator,
         act: Callable[[float], None],
     ) -> None:
-        super().__init__(name, world, rng)
+        own, self._rng = rng.spawn(2)
+        super().__init__(name, world, own)
         self._settings = settings
         self._meters = dict(meters)
         self._act = act
@@ -96,6 +97,9 @@ class EmulatedTwin(EmulatedInstrument):
     def _read(self, name: str, *, quick: bool) -> float:
         true, noise = self._meters[name]
         value = true() + self._draw(noise.quick if quick else noise.reading)
+        if noise.outliers and self._rng.random() < noise.outlier_share:
+            value += self._rng.choice(noise.outliers)
+            return float(value)
         return round(value / noise.resolution) * noise.resolution if noise.resolution else value
 
 
