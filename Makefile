@@ -13,7 +13,7 @@ MAKEFLAGS += --jobs=2
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix clean
+.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -65,6 +65,14 @@ busy: $(SETUP)
 # Each fault of each rig with five seeds, and a table of what passed.
 fault-matrix: $(SETUP)
 	$(BIN)/python tests/faults/matrix.py
+
+# Disks that are full, fail or are slow, journals that are locked, removed or overwritten, on each rig.
+journal-faults: $(SETUP)
+	$(BIN)/python tests/faults/journal_faults.py
+
+# Benches killed at random moments on each rig: no step that was acknowledged is lost.
+journal-kills: $(SETUP)
+	$(BIN)/python tests/faults/journal_kills.py --times 200
 
 # Benches and guardians killed, stopped or hanging, and lines cut, on each rig: when every output is off, read in the
 # instruments.

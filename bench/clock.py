@@ -46,6 +46,8 @@ class Clock(ABC):
     ----------
     epoch : datetime
         Time of day (UTC) at which `now()` was zero.
+    factor : float
+        Laboratory seconds in a second of the wall clock, at most; infinite if only the computer limits them.
     sleep_waits : bool
         Whether `sleep` takes wall-clock time, so that a loop of sleeps lasts until someone acts.
     interrupted : callable
@@ -53,6 +55,7 @@ class Clock(ABC):
     """
 
     epoch: datetime
+    factor: float = 1.0
     sleep_waits: bool = True
 
     def __init__(self) -> None:
@@ -183,6 +186,7 @@ class VirtualClock(Clock):
     """
 
     sleep_waits = False
+    factor = math.inf
 
     def __init__(self) -> None:
         super().__init__()

@@ -29,12 +29,11 @@ from bench.errors import (
     SettleTimeoutError,
 )
 from bench.interrupts import Interrupts
-from bench.journal import Journal
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
 from bench.protocol.vocabulary import Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
 from bench.rig import Look
-from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, traced
+from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, RunRecord, traced
 from bench.safety import SAFE
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.station.interface import Station
@@ -85,7 +84,7 @@ class Engine:
     def __init__(
         self,
         station: Station,
-        journal: Journal,
+        journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None = None,
@@ -110,7 +109,7 @@ class Engine:
 
     def run(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> Outcome:
         """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception."""
-        start = self._clock.now()
+        self._run.zero = self._clock.now()
         self._clock.interrupted = self._interrupts.abort_requested
         if isinstance(self._clock, PacedClock):
             self._clock.restart_pace()
@@ -128,7 +127,7 @@ class Engine:
             self._interrupts.acknowledge()
             self._clock.interrupted = lambda: False
             safe_state = self._station.end()
-        return self._finish(error, start, safe_state)
+        return self._finish(error, safe_state)
 
     def _carry_out(self, definition: ProtocolDefinition, parameters: ProtocolParameters) -> None:
         run = self._run
@@ -292,7 +291,7 @@ class Engine:
             run.tick()
             latest += run.pause_if_asked()
 
-    def _finish(self, error: Exception | None, start: float, safe_state: Mapping[str, str]) -> Outcome:
+    def _finish(self, error: Exception | None, safe_state: Mapping[str, str]) -> Outcome:
         if error is None:
             status, reason = "completed", ""
         elif isinstance(error, AbortError):
@@ -300,9 +299,10 @@ class Engine:
         else:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
-        finished = self._clock.now()
+        finished = self._clock.now() - self._run.zero
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
+            self._journal.make_room()
             self._run.take_news()
             if error is not None:
                 self._run.event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)
@@ -317,7 +317,7 @@ class Engine:
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._run.steps, finished - start, safe_state, error, pace)
+        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace)
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:

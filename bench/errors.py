@@ -6,6 +6,8 @@ allowed. The command line prints the message alone; a traceback is for defects o
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class BenchError(Exception):
     """Base of everything that the bench raises on purpose.
@@ -17,6 +19,16 @@ class BenchError(Exception):
     """
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By its content, as a constructor may take something else: errors travel between processes.
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[BenchError], arguments: tuple[object, ...], attributes: dict[str, object]) -> BenchError:
+    error = kind.__new__(kind, *arguments)
+    error.__dict__.update(attributes)
+    return error
 
 
 class ConfigurationError(BenchError):
@@ -77,6 +89,12 @@ class GuardianError(BenchError):
     """The process that holds the lines of the instruments was lost, or ended the run as its bench did not answer."""
 
     exit_code = 7
+
+
+class RecordError(BenchError):
+    """The journal of a run is damaged, or rows are missing in it; `bench recover-journal` says how far it is good."""
+
+    exit_code = 8
 
 
 class AbortError(BenchError):

@@ -25,6 +25,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,23 @@ def load_model(path: Path, kind: str | None = None) -> ModelFile:
 def is_model(content: object) -> bool:
     """Return whether something is the content of a model file of any version."""
     return isinstance(content, dict) and content.get("format") in list(_FORMER_FORMATS)
+
+
+def models_among(files: Mapping[str, bytes], source: str) -> dict[str, ModelFile]:
+    """Return the model files among the files of a run, by their names there; what is none is left out.
+
+    Raises DataError as `parse_model`.
+    """
+    found: dict[str, ModelFile] = {}
+    for name, content in files.items():
+        # A first look, as others may be long tables.
+        if content.lstrip()[:1] != b"{":
+            continue
+        with suppress(ValueError, RecursionError):
+            parsed = json.loads(content)
+            if is_model(parsed):
+                found[name] = parse_model(parsed, f"{source}: {name}")
+    return found
 
 
 def parse_model(content: object, source: str) -> ModelFile:

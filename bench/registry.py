@@ -15,6 +15,7 @@ cannot be imported is an error only for those who ask for it.
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ GROUPS: tuple[Group, ...] = get_args(Group)
 
 OWN_PACKAGE = "actuator-bench"
 _OWN_FOLDERS = ("protocols", "drivers", "sim_devices", "rigs")
+_OWN = ("bench", *_OWN_FOLDERS)
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,23 @@ def import_beside(file: Path) -> None:
         sys.path.append(str(folder))
 
 
+def modules_beside() -> dict[str, Path]:
+    """Return the imported modules in the folders of rig and protocol files that were read: each by its path there."""
+    folders = tuple(f"{folder}{os.sep}" for folder in _beside)
+    found: dict[str, Path] = {}
+    for name, module in sorted(sys.modules.items()):
+        file = getattr(module, "__file__", None) or ""
+        # By text first: there are thousands of modules.
+        if not file.startswith(folders) or not file.endswith(".py") or name.partition(".")[0] in _OWN:
+            continue
+        path = Path(file)
+        within = Path(*name.split("."), "__init__.py" if path.stem == "__init__" else "").with_suffix(".py")
+        # A file that was loaded under another name, or lies deeper, is not beside; what is gone cannot be read.
+        if any(path == folder / within for folder in _beside) and path.is_file():
+            found[within.as_posix()] = path
+    return found
+
+
 def check_import(module: str) -> None:
     """Check that a file may have a module imported, as importing runs its code.
 
@@ -154,7 +173,7 @@ def check_import(module: str) -> None:
     Raises ConfigurationError if it may not; says how to register it.
     """
     top = module.partition(".")[0]
-    if not top or module in sys.modules or top in ("bench", *_OWN_FOLDERS):
+    if not top or module in sys.modules or top in _OWN:
         return
     try:
         spec = importlib.util.find_spec(top)

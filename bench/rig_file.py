@@ -7,6 +7,7 @@ A rig file is TOML::
 
     [rig]
     title = "a heated plate"
+    twin = "twin.toml"                             # optional: the emulated rig on which runs are rehearsed
 
     [devices.plate]                                # any name; its signals are named after it
     driver = "drivers.meerstetter:MeerstetterTEC"  # module:Class, or a name registered in `bench.devices`
@@ -90,6 +91,9 @@ class RigTable(_Table):
 
     title: str = Field(min_length=1, description="what the rig is, in one line")
     description: str = Field(default="", description="more about it, shown on the run card")
+    twin: str = Field(
+        default="", description="emulated rig on which runs are rehearsed; the one that it extends if not given"
+    )
 
 
 class TelemetryTable(_Table):
@@ -229,6 +233,8 @@ class RigFile:
         The file as it is, kept with every run.
     content : mapping
         Everything in it, bases and overrides included.
+    bases : tuple of str
+        The rigs that it extends, names or paths, the nearest first.
     """
 
     name: str
@@ -246,6 +252,7 @@ class RigFile:
     dashboard: DashboardLayout | None
     laboratory: Any | None
     laboratory_settings: LaboratorySettings | None
+    bases: tuple[str, ...] = ()
 
     @property
     def emulated(self) -> bool:
@@ -305,10 +312,27 @@ def load_rig(name: str, overrides: Mapping[str, str] | None = None) -> RigFile:
         If there is no such rig, or the file is wrong: names file, key, value and what is allowed.
     """
     path, text = _read(name)
-    content = _merged(path, text, (_identity(name),))
+    bases: list[str] = []
+    content = _merged(path, text, (_identity(name),), bases)
     for key, value in (overrides or {}).items():
         _override(content, key, value, path)
-    return _validate(path, text, content)
+    return replace(_validate(path, text, content), bases=tuple(bases))
+
+
+def rig_of(path: str, content: Mapping[str, Any]) -> RigFile:
+    """Return the rig of a content that was put together; `path` says for messages from what.
+
+    Raises ConfigurationError as `load_rig`.
+    """
+    return _validate(path, "", content)
+
+
+def rig_of_content(name: str, text: str, content: Mapping[str, Any]) -> RigFile:
+    """Return a rig from what `RigFile.name`, `text` and `content` of it were, as the record of a run keeps them.
+
+    Raises ConfigurationError if something in it is wrong, or no longer there.
+    """
+    return _validate(f"{name}.toml", text, content)
 
 
 def _read(name: str) -> tuple[str, str]:
@@ -332,12 +356,17 @@ def _identity(name: str) -> str:
     return str(Path(name).resolve()) if name.endswith(".toml") else name
 
 
-def _merged(path: str, text: str, extending: tuple[str, ...]) -> dict[str, Any]:
-    """Return the content of a file over those that it extends; `extending` are the rigs on the way to it."""
+def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) -> dict[str, Any]:
+    """Return the content of a file over those that it extends, which join `bases`.
+
+    `extending` are the rigs on the way to it.
+    """
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+    if isinstance(rig := content.get("rig"), dict) and str(rig.get("twin", "")).endswith(".toml"):
+        rig["twin"] = str(Path(path).parent / rig["twin"])
     base, without = content.pop("extends", None), content.pop("without", [])
     if base is None and not without:
         return content
@@ -351,8 +380,9 @@ def _merged(path: str, text: str, extending: tuple[str, ...]) -> dict[str, Any]:
     identity = _identity(beside)
     if identity in extending:
         raise ConfigurationError(f"{path}: extends = {base!r}: the rigs extend each other in a circle")
+    bases.append(beside)
     base_path, base_text = _read(beside)
-    merged = _merged(base_path, base_text, (*extending, identity))
+    merged = _merged(base_path, base_text, (*extending, identity), bases)
     for key in without:
         *parents, last = str(key).split(".")
         table = _table(merged, parents)

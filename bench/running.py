@@ -8,9 +8,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from bench.control.tracking import Trace
+from bench.devices import Signal
 from bench.errors import AbortError, ConfigurationError
 from bench.interrupts import Interrupts
-from bench.journal import Event, Journal, StepRecord
+from bench.journal import Event, StepRecord
 from bench.protocol.vocabulary import LATENESS, TRACES, Reading
 from bench.rig import Look
 from bench.settling import Settled
@@ -24,6 +25,30 @@ NOT_AT_WORK = dict.fromkeys((*TRACE_NAMES, LATENESS.name), math.nan)
 
 _GRACE = 2.0
 """Wall-clock time beyond the next tick by which the station expects to hear from a hold, s."""
+
+
+class RunRecord(Protocol):
+    """Where a run is written down before anybody is notified: a `Journal`; a rehearsal keeps less."""
+
+    signals: tuple[Signal, ...]
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """Keep one tick of a hold: time from the start of the run in s, step number, one value a signal."""
+
+    def step(self, record: StepRecord) -> None:
+        """Keep a finished step."""
+
+    def event(self, event: Event) -> None:
+        """Keep something that happened."""
+
+    def take_notices(self) -> list[str]:
+        """Return what happened to the record itself since the last call."""
+
+    def make_room(self) -> None:
+        """Give back the space that is kept for the end of the run."""
+
+    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
+        """Keep how the run ended."""
 
 
 class Observer(Protocol):
@@ -42,11 +67,13 @@ class Observer(Protocol):
 class RunAtHand:
     """What all parts of a run share: its station and clock, its record, its observers, and the operator.
 
+    What is recorded and shown counts from the start of the run; all other times are those of the clock.
+
     Parameters
     ----------
     station : Station
         Connected devices.
-    journal : Journal
+    journal : RunRecord
         Written before any observer is notified.
     observers : iterable of Observer
         Notified after the journal.
@@ -65,12 +92,14 @@ class RunAtHand:
         Number of finished steps.
     trace : dict of str to float
         What a controller thinks, for the record.
+    zero : float
+        Time of the clock at which the run started, s.
     """
 
     def __init__(
         self,
         station: Station,
-        journal: Journal,
+        journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None,
@@ -82,6 +111,7 @@ class RunAtHand:
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
+        self.zero = self.clock.now()
         self.ask = ask
         self._journal = journal
         self._observers = tuple(observers)
@@ -106,8 +136,9 @@ class RunAtHand:
     def record_tick(self, t: float, values: Mapping[str, float]) -> None:
         """Record quick readings, and have them judged by the interlocks."""
         row = tuple(values[name] for name in self.names)
-        self._journal.telemetry(t, self.steps, row)
-        self._tell(lambda observer: observer.telemetry(t, self.steps, row))
+        passed = t - self.zero
+        self._journal.telemetry(passed, self.steps, row)
+        self._tell(lambda observer: observer.telemetry(passed, self.steps, row))
         self.judge(t, values)
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
@@ -121,9 +152,11 @@ class RunAtHand:
         self._is_demanded = bool(self._pause_reason) or self.station.is_holding
 
     def take_news(self) -> None:
-        """Record what happened at the station since the last call."""
+        """Record what happened at the station, and to the journal itself, since the last call."""
         for news in self.station.news():
             self.event(news.level, news.kind, news.text)
+        for text in self._journal.take_notices():
+            self.event("WARN", "journal", text)
 
     def tick_after(self, tick: float) -> float:
         """Return when the tick after one is due; missed ticks are skipped, not caught up."""
@@ -166,11 +199,10 @@ class RunAtHand:
         settled: Settled,
     ) -> Reading:
         """Write a step down, then notify the observers."""
-        finished = self.clock.now()
         record = StepRecord(
             step=self.steps,
-            started=started,
-            finished=finished,
+            started=started - self.zero,
+            finished=self.clock.now() - self.zero,
             phase=self.phase,
             label=label,
             settled=settled,
@@ -180,11 +212,11 @@ class RunAtHand:
         self._journal.step(record)
         self.steps += 1
         self._tell(lambda observer: observer.step(record))
-        return Reading(record.step, finished, record.settled, values)
+        return Reading(record.step, record.finished, record.settled, values)
 
     def event(self, level: str, kind: str, text: str) -> None:
         """Write down that something happened, then notify the observers."""
-        event = Event(self.clock.now(), level, kind, text)
+        event = Event(self.clock.now() - self.zero, level, kind, text)
         self._journal.event(event)
         self._tell(lambda observer: observer.event(event))
 

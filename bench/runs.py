@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import getpass
-import importlib.metadata
 import os
-import platform
-import shutil
-import subprocess
 import sys
 import threading
 from collections.abc import Mapping
@@ -19,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.attachment import AttachedClock, Attachment, attach
+from bench.attachment import Attachment, attach
 from bench.binding import Slots
-from bench.clock import Clock, Stopwatch, wall_time
+from bench.clock import Clock, Stopwatch
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
+from bench.emulated_twin import twin_of
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
@@ -32,22 +28,27 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
+from bench.model_file import models_among
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.recorded_files import RIG_FILE_NAME, Original, given_files
+from bench.rehearsal import Rehearsal, rehearse
+from bench.remaining_time import Expectation
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
+from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start
 from bench.station.interface import Station
 from bench.station.local import LocalStation
-from bench.terminal import ProgressDisplay, ask_operator
+from bench.terminal import ProgressDisplay, RehearsalDisplay, ask_operator
 
 if TYPE_CHECKING:
     from bench.dashboard import Dashboard
 
 RECORDING_NAME = "run.rrd"
-RIG_FILE_NAME = "rig.toml"
+_DEFINITE = 1.1
+"""Longest time of a plan over its shortest, up to which it says when the run ends."""
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
-_PACKAGES = ("actuator-bench", "numba", "numpy", "pymodbus", "pyserial", "rerun-sdk", "scipy")
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,12 @@ class Run:
         hardware the rig file says it, `[safety] rate`.
     faults : Path, optional
         Faults of the emulated laboratory, at instants from the start of the run; see `bench.faults`.
+    original : Original, optional
+        The run that this one repeats: its files are read in the place of those that `settings` name, and its rig is
+        taken if it has one.
+    rehearse : bool
+        Whether the run is rehearsed on the emulated twin of the rig before anything moves. A run on the virtual clock
+        is not, as it would take as long itself.
     """
 
     protocol: ProtocolDefinition
@@ -95,6 +102,8 @@ class Run:
     attach: Path | None = None
     interlock_rate: float | None = None
     faults: Path | None = None
+    original: Original | None = None
+    rehearse: bool = True
 
 
 @dataclass(frozen=True)
@@ -141,14 +150,11 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         If a device cannot be connected; nothing has moved.
     """
     stopwatch = Stopwatch()
-    rig_file = load_rig(run.rig, run.overrides)
-    parameters = run.protocol.parse(
-        run.settings, rig_file.roles, rig_file.protocols.get(run.protocol.name), path=rig_file.path
-    )
+    rig_file, stated, parameters = _read(run)
+    original = run.original
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
-    guardian: RemoteStation | None = None
     warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         clock, attachment = _clock(run, rig_file, stack)
@@ -157,22 +163,21 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         clock.interrupted = interrupts.abort_requested
         # A guardian makes the devices safe as soon as this process is gone.
         interrupts.leave_by(_leave)
-        if run.attach is None and rig_file.in_process:
-            rig = Rig(rig_file, clock, run.seed)
-            laboratory: object = rig.laboratory
-            station: Station = LocalStation(rig, run.interlock_rate)
-        else:
-            doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
-            guarded = GuardedRig(rig_file, run.rig, run.overrides, run.attach, run.seed, doing)
-            laboratory, station = attachment, RemoteStation(guarded, clock)
-            guardian = station
+        rehearsal = None
+        if run.rehearse and run.clock != "virtual":
+            rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
+        if rehearsal is not None:
+            rehearsal.raise_if_wrong()
+        station, laboratory = _connected(run, rig_file, clock, attachment)
+        guardian = station if isinstance(station, RemoteStation) else None
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
         if run.faults is not None:
             schedule_faults(laboratory, faults, run.faults)
         description = station.description
         slots = description.slots(run.protocol)
-        expected = plan(run.protocol, parameters, slots)
+        planned = plan(run.protocol, parameters, slots)
+        expected = planned if rehearsal is None else rehearsal.widened(planned)
         check_before_moving(description, run.protocol, expected)
         if expected.prompts and not (rig_file.emulated or operator_is_there):
             raise ConfigurationError(
@@ -183,26 +188,39 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
-        folder = _make_folder(run.folder, f"{rig_file.name}-{run.protocol.name}")
+        files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
+        models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
+        meta = _asked(run, attachment, rig_file)
+        meta |= metadata(run.protocol, stated, description, slots, planned, clock.date())
+        if original:
+            meta["repeats"] = original.meta["run"]
+            for difference in differences(original.meta, meta):
+                console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
+        folder = make_folder(run.folder, run_name(run.protocol, meta))
         if guardian is not None:
             guardian.keep_record(folder)
         (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
-        meta = _metadata(run, station, parameters, slots, expected, folder.name)
+        meta["run"] = folder.name
+        meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
-        journal = Journal(folder / FILE_NAME, signals, meta)
+        patience = rig_file.telemetry.period if clock.sleep_waits else None
+        given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
         dashboard = None
         if dashboard_class is not None:
             path = folder / RECORDING_NAME if run.recording else None
-            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live))
+            dashboard = stack.enter_context(dashboard_class(signals, meta, path=path, live=run.live, models=models))
             observers.append(dashboard)
+            journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
         layout = rig_file.dashboard
         shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
-        progress = ProgressDisplay(console, run.protocol.name, signals, shown, expected.steps)
+        length = _expectation(rehearsal, planned)
+        progress = ProgressDisplay(console, run.protocol.name, signals, shown, length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
         engine = Engine(station, journal, observers, interrupts, ask)
@@ -212,6 +230,109 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:
+    """Return what the record says of how the run was asked for."""
+    return {
+        "overrides": dict(run.overrides),
+        "seed": run.seed,
+        "interlock_rate": _interlock_rate(run, rig),
+        "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+    }
+
+
+def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) -> Rehearsal:
+    """Return what a run would do and touch: rehearsed, or planned if its rig has no twin; nothing moves.
+
+    A rig without a twin is connected, to know its limits.
+
+    Raises
+    ------
+    ConfigurationError
+        If anything is wrong before the start.
+    DeviceError
+        If a device of a rig without a twin cannot be connected.
+    AbortError
+        If the rehearsal was asked to end.
+    """
+    rig_file, _, parameters = _read(run)
+    with ExitStack() as stack:
+        if interrupts is None:
+            interrupts = stack.enter_context(Interrupts(say_at_once))
+        interrupts.leave_by(_leave)
+        rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
+        if rehearsal is None:
+            clock, attachment = _clock(run, rig_file, stack)
+            station, _ = _connected(run, rig_file, clock, attachment)
+            stack.callback(station.close)
+            description = station.description
+            expected = plan(run.protocol, parameters, description.slots(run.protocol))
+            check_before_moving(description, run.protocol, expected)
+            rehearsal = Rehearsal.of_plan(description, run.protocol, expected)
+    interrupts.finish()
+    return rehearsal
+
+
+def _read(run: Run) -> tuple[RigFile, ProtocolParameters, ProtocolParameters]:
+    """Return the rig file, the parameters as they are stated, and with the paths of files that can be read."""
+    original = run.original
+    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
+    defaults = rig_file.protocols.get(run.protocol.name)
+    stated = run.protocol.parse(run.settings, rig_file.roles, defaults, path=rig_file.path)
+    return rig_file, stated, original.readable(run.protocol, stated) if original else stated
+
+
+def _rehearsed(
+    run: Run, file: RigFile, parameters: ProtocolParameters, console: Console, interrupts: Interrupts
+) -> Rehearsal | None:
+    """Rehearse a run on the twin of its rig; return None if it has none."""
+    twin = twin_of(file, run.rig)
+    if twin is None:
+        console.print(
+            f"not rehearsed: rig {file.name} has no emulated twin; its file can name one: [rig] twin",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        return None
+    with RehearsalDisplay(console, f"rehearsing {run.protocol.name} on {twin.name}") as display:
+        return rehearse(
+            run.protocol,
+            parameters,
+            twin,
+            rig=file.name,
+            seed=run.seed,
+            interlock_rate=_interlock_rate(run, file),
+            interrupts=interrupts,
+            observers=[display],
+        )
+
+
+def _expectation(rehearsal: Rehearsal | None, planned: Plan) -> Expectation | None:
+    """Return when the steps of a run are expected to end, None if that is not known."""
+    if rehearsal is not None:
+        return Expectation(rehearsal.marks, rehearsal.seconds, rehearsal.at_most, rehearsal.prompted)
+    # A plan with steps that may take much longer than their least time says nothing of the end.
+    if planned.complete and planned.at_most <= _DEFINITE * planned.seconds:
+        marks = tuple(enumerate(planned.finished, 1))
+        return Expectation(marks, planned.seconds, planned.at_most, planned.prompted)
+    return None
+
+
+def _interlock_rate(run: Run, file: RigFile) -> float | None:
+    """Return how often the interlocks of a run are looked at beside its readings, Hz; None for not at all."""
+    return run.interlock_rate if run.attach is None and file.in_process else file.safety.rate
+
+
+def _connected(run: Run, file: RigFile, clock: Clock, attachment: Attachment | None) -> tuple[Station, object]:
+    """Connect the rig of a run; return its station, and the emulated laboratory if there is one."""
+    if run.attach is None and file.in_process:
+        rig = Rig(file, clock, run.seed)
+        return LocalStation(rig, run.interlock_rate), rig.laboratory
+    doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
+    guarded = GuardedRig(file, run.rig, run.overrides, run.attach, run.seed, doing)
+    return RemoteStation(guarded, clock), attachment
 
 
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:
@@ -266,88 +387,3 @@ def trace_signals(protocol: ProtocolDefinition, description: RigDescription, slo
     signal = description.by_name[controlled]
     traces = (replace(trace, unit=signal.unit, precision=signal.precision) for trace in TRACES)
     return (*traces, LATENESS)
-
-
-def _metadata(
-    run: Run, station: Station, parameters: ProtocolParameters, slots: Slots, expected: Plan, name: str
-) -> dict[str, Any]:
-    file, clock = station.description.file, station.clock
-    return {
-        "run": name,
-        "rig": file.name,
-        "rig_title": file.rig.title,
-        "rig_file": file.text,
-        "rig_content": file.content,
-        "overrides": dict(run.overrides),
-        "protocol": run.protocol.name,
-        "protocol_summary": run.protocol.summary,
-        "parameters": parameters.model_dump(mode="json"),
-        "controls": run.protocol.controlled(slots),
-        "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
-        "plan": {"steps": expected.steps, "seconds": expected.seconds, "at_most": expected.at_most},
-        "seed": run.seed,
-        "interlock_rate": run.interlock_rate if file.in_process and run.attach is None else file.safety.rate,
-        "clock": f"attached x{clock.factor:g}" if isinstance(clock, AttachedClock) else run.clock,
-        "epoch": clock.epoch.isoformat(),
-        "devices": {name: str(device.identity) for name, device in station.description.devices.items()},
-        "limits": {name: (limits.low, limits.high) for name, limits in station.description.limits.items()},
-        "calibration": {
-            **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
-            **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
-        },
-        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
-        "operator": _operator(),
-        "command": sys.argv,
-        "packages": {package: _version(package) for package in _PACKAGES},
-        "git": _git_state(),
-        "host": {
-            "name": platform.node(),
-            "system": platform.platform(),
-            "python": platform.python_version(),
-            "started": wall_time().isoformat(),
-        },
-    }
-
-
-def _make_folder(parent: Path, name: str) -> Path:
-    stamp = wall_time().strftime("%Y%m%d-%H%M%S")
-    for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
-        folder = parent / f"{name}-{stamp}{suffix}"
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
-        return folder
-    raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
-
-
-def _operator() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):
-        return "unknown"
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _git_state() -> str:
-    git = shutil.which("git")
-    if git is None:
-        return "unknown"
-    here = Path(__file__).parent
-
-    def ask(*arguments: str) -> str | None:
-        answer = subprocess.run([git, *arguments], cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
-        return answer.stdout.strip() if answer.returncode == 0 else None
-
-    commit = ask("rev-parse", "--short=12", "HEAD")
-    if commit is None:
-        return "unknown"
-    return commit + (" with changes" if ask("status", "--porcelain") else "")

@@ -1,36 +1,38 @@
-"""The terminal during a run: progress with ETA and readings, and the question at a pause."""
+"""The terminal before and during a run: its rehearsal, progress with time left and readings, and questions."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from datetime import timedelta
 from types import TracebackType
 from typing import Self
 
 from rich.console import Console
+from rich.errors import LiveError
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
-from bench.clock import Stopwatch
+from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
+from bench.remaining_time import Expectation, RemainingTime
 from bench.running import ABORT, RESUME
+from bench.units import format_duration
 
 _REFRESH = 0.1
 """Wall-clock seconds between two redraws of the readings."""
 
+_UNSEEN = 2.0
+"""Longest rehearsal that needs no display, s of wall-clock time."""
+
 
 class ProgressDisplay:
-    """A progress bar with ETA and the current readings; an `Observer` of the engine.
+    """A bar with steps, laboratory time, what is left, and the current readings; an `Observer` of the engine.
+
+    Times are laboratory times from the start of the run; the end is a time of day.
 
     Parameters
     ----------
@@ -42,33 +44,44 @@ class ProgressDisplay:
         Signals of the engine's values, in their order.
     shown : sequence of str
         Signals whose readings are shown beside the bar.
-    steps : int
-        Planned number of steps.
+    expectation : Expectation, optional
+        When the steps are expected to end; without it only the time that has passed is shown.
+    factor : float
+        Laboratory seconds in a second of the wall clock; infinite where only the computer limits them.
     """
 
     def __init__(
-        self, console: Console, title: str, signals: Sequence[Signal], shown: Sequence[str], steps: int
+        self,
+        console: Console,
+        title: str,
+        signals: Sequence[Signal],
+        shown: Sequence[str],
+        expectation: Expectation | None = None,
+        factor: float = math.inf,
     ) -> None:
         self._console = console
         self._shown = [(i, signal) for i, signal in enumerate(signals) if signal.name in shown]
+        self._steps = expectation.steps if expectation is not None else 0
+        self._remaining = RemainingTime(expectation, factor) if expectation is not None else None
         self._progress = Progress(
             # Names and phases are the protocol's: no markup.
             TextColumn("{task.description}", style="bold", markup=False),
             TextColumn("{task.fields[phase]}", markup=False),
             BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[steps]}", style="green", markup=False),
+            TextColumn("{task.fields[times]}", markup=False),
             TextColumn("{task.fields[readings]}", style="cyan", markup=False),
             console=console,
             transient=False,
             disable=not console.is_terminal,
         )
-        self._task: TaskID = self._progress.add_task(title, total=steps or None, phase="", readings="")
+        total = 1.0 if self._remaining is not None else None
+        self._task: TaskID = self._progress.add_task(title, total=total, phase="", steps="", times="", readings="")
+        self._since_start = Stopwatch()
         self._since_redraw = Stopwatch()
 
     def __enter__(self) -> Self:
+        self._since_start = Stopwatch()
         self._progress.start()
         return self
 
@@ -83,29 +96,118 @@ class ProgressDisplay:
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Show the readings of a tick, at most ten times a second."""
         if self._since_redraw.seconds() > _REFRESH:
-            self._since_redraw = Stopwatch()
-            self._progress.update(self._task, completed=step, readings=self._readings(t, values))
+            self._show(t, step, values)
 
     def step(self, record: StepRecord) -> None:
         """Advance the bar."""
-        if self._since_redraw.seconds() > _REFRESH or record.step + 1 == self._progress.tasks[0].total:
-            self._since_redraw = Stopwatch()
-            readings = self._readings(record.finished, record.values)
-            self._progress.update(self._task, completed=record.step + 1, readings=readings)
+        if self._remaining is not None:
+            self._remaining.step(record.step + 1, record.finished)
+        if self._since_redraw.seconds() > _REFRESH or record.step + 1 == self._steps:
+            self._show(record.finished, record.step + 1, record.values)
 
     def event(self, event: Event) -> None:
         """Show the phase beside the bar, and print warnings, errors and notes."""
+        if self._remaining is not None:
+            if event.kind == "pause":
+                self._remaining.pause(event.t)
+            elif event.kind == "resume":
+                self._remaining.resume(event.t)
+            elif event.kind == "prompt":
+                self._remaining.prompt(event.t)
         if event.kind == "phase":
             self._progress.update(self._task, phase=event.text)
         elif event.level != "INFO" or event.kind in ("note", "resume"):
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
-                f"{_duration(event.t):>10}  {event.kind}: {event.text}", style=style, highlight=False, markup=False
+                f"{format_duration(event.t):>10}  {event.kind}: {event.text}",
+                style=style,
+                highlight=False,
+                markup=False,
             )
 
-    def _readings(self, t: float, values: Sequence[float]) -> str:
-        parts = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
-        return "  ".join([f"t {_duration(t)}", *parts])
+    def _show(self, t: float, steps: int, values: Sequence[float]) -> None:
+        self._since_redraw = Stopwatch()
+        times, completed = f"t {format_duration(t)}", 0.0
+        if self._remaining is not None:
+            self._remaining.step(steps, t)
+            left = self._remaining.at(t, self._since_start.seconds())
+            completed = left.share
+            times += f"  left {format_duration(left.laboratory)}, ends {_time_of_day(left.wall)}"
+            if math.isfinite(left.at_most):
+                times += f", at most {_time_of_day(left.at_most)}"
+        readings = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
+        self._progress.update(
+            self._task,
+            completed=completed,
+            steps=f"{steps}/{self._steps or '?'}",
+            times=times,
+            readings="  ".join(readings),
+        )
+
+
+class RehearsalDisplay:
+    """Shows from its third second on that a rehearsal goes on, and how far; an `Observer` of the engine.
+
+    Parameters
+    ----------
+    console : Console
+        Console to draw on; if it is no terminal, one line is printed.
+    title : str
+        What is rehearsed, and where.
+    """
+
+    def __init__(self, console: Console, title: str) -> None:
+        self._console = console
+        self._title = title
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TextColumn("{task.fields[times]}", style="green", markup=False),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task(title, total=None, times="")
+        self._since_start = Stopwatch()
+        self._since_redraw = Stopwatch()
+        self._shown = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):
+            self._progress.stop()
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:  # noqa: ARG002 - as of all
+        """Show how far it is."""
+        if self._since_redraw.seconds() < _REFRESH:
+            return
+        self._since_redraw = Stopwatch()
+        if not self._shown and self._since_start.seconds() > _UNSEEN:
+            self._shown = True
+            if not self._console.is_terminal:
+                self._console.print(f"{self._title} …", highlight=False, markup=False, soft_wrap=True)
+            # A compilation draws on the same console.
+            with suppress(LiveError):
+                self._progress.start()
+        self._progress.update(self._task, times=f"{step} steps, {format_duration(t)} of laboratory time; Ctrl-C ends")
+
+    def step(self, record: StepRecord) -> None:
+        """Show how far it is."""
+        self.telemetry(record.finished, record.step + 1, record.values)
+
+    def event(self, event: Event) -> None:
+        """Show nothing: the result of the rehearsal says what it found."""
+
+
+def _time_of_day(seconds: float) -> str:
+    """Return the local time of day that many wall-clock seconds from now; with the date if that is another day."""
+    now = wall_time()
+    end = (now + timedelta(seconds=seconds)).astimezone()
+    return end.strftime("%H:%M:%S" if end.date() == now.astimezone().date() else "%Y-%m-%d %H:%M")
 
 
 def ask_operator(console: Console, question: str) -> str:
@@ -119,9 +221,3 @@ def ask_operator(console: Console, question: str) -> str:
             return ABORT
         console.print("please answer r (resume) or a (abort)")
     return ABORT
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"

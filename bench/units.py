@@ -1,4 +1,4 @@
-"""Units: those that are known, and numbers with fitting SI prefixes for axes, titles and tables."""
+"""Units: those that are known, and numbers and durations as texts for axes, titles and tables."""
 
 from __future__ import annotations
 
@@ -47,6 +47,15 @@ def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -
         digits = min(digits, _DIGITS)
     texts = ["–" if number is None else f"{factor * number:.{digits}f}" for number in numbers]
     return [*texts, "" if shown == "1" else shown]
+
+
+def format_duration(seconds: float) -> str:
+    """Return a time in s as `h:mm:ss`; what is unknown or infinite as `?`."""
+    if not math.isfinite(seconds):
+        return "?"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -24,9 +24,7 @@ class TwinLine:
 
     def __init__(self, device: str, settings: TwinSettings) -> None:
         self._device = device
-        self._settings = SerialSettings(
-            port=settings.port, baudrate=settings.baudrate, timeout=settings.timeout
-        )
+        self._settings = SerialSettings(port=settings.port, baudrate=settings.baudrate, timeout=settings.timeout)
         self._port = open_port(device, self._settings)
 
     def close(self) -> None:

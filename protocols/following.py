@@ -30,7 +30,9 @@ class Parameters(ControlledParameters):
     controller: str = parameter(
         "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("follow")
     )
-    reference: str = parameter("", unit="", help="CSV file with columns `time` and `reference`; a sine if not given")
+    reference: str = parameter(
+        "", unit="", help="CSV file with columns `time` and `reference`; a sine if not given", file=True
+    )
     low: float = parameter(from_slot("response", "low"), unit=unit_of("response"), help="lowest value of the sine")
     high: float = parameter(from_slot("response", "high"), unit=unit_of("response"), help="highest value of the sine")
     period: float = parameter(200.0, unit="s", low=1, high=1e6, help="period of the sine, whose amplitude varies")

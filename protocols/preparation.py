@@ -68,7 +68,7 @@ class RampParameters(SweepParameters):
 class ControlledParameters(LoadedParameters):
     """What can be set where a controller by a model drives the specimen."""
 
-    model: str = parameter(..., unit="", help="model file, as `bench identify` writes it")
+    model: str = parameter(..., unit="", help="model file, as `bench identify` writes it", file=True)
     reset: float = parameter(from_slot("drive", "saturating"), unit=DRIVE, help="where the memory is reset")
     hottest: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point allowed")
     tuning: dict[str, dict[str, Any]] = parameter(

@@ -29,7 +29,7 @@ class Parameters(ControlledParameters):
         "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("target")
     )
     policy: Policy = parameter("nearest", unit="", help="which answer of the inverse, where there are several")
-    targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given")
+    targets: str = parameter("", unit="", help="CSV file with a column `target`; generated if not given", file=True)
     low: float = parameter(
         from_slot("response", "low"), unit=unit_of("response"), help="lowest of the generated targets"
     )

@@ -106,7 +106,7 @@ class TwinLaboratory(EmulatedLaboratory):
         self.plant = SpecimenPlant(self._specimen, settings.step, drive.delay, at_rest)
         self._at_rest = at_rest
         world = World(self.plant, clock)
-        self._outputs = {name: math.nan for name in settings.devices}
+        self._outputs = dict.fromkeys(settings.devices, math.nan)
         pairs = np.array(response.conversion).reshape(-1, 2)
         self._conversion = (pairs[:, 0], pairs[:, 1]) if pairs.size else None
         twins = {name: each for name, each in settings.devices.items() if isinstance(each, TwinSettings)}

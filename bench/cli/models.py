@@ -1,4 +1,4 @@
-"""The commands that identify, compare and apply models."""
+"""The commands that identify and apply models."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ContinueMemory = Annotated[
 ]
 
 
-def _check_figures(folder: Path | None) -> None:
+def check_figures(folder: Path | None) -> None:
     """Check before any computing that figures can be drawn, if they are asked for."""
     if folder is not None:
         from bench.results.figures import check_matplotlib
@@ -90,7 +90,7 @@ def identify_(
     """
     from bench.results.models import certificate_lines, identify_file
 
-    _check_figures(figures)
+    check_figures(figures)
     found = identify_file(
         file,
         input_column=input_column,
@@ -167,55 +167,6 @@ def predict_(
         )
     console.print(f"{inputs.size} rows: {out}", highlight=False, markup=False, soft_wrap=True)
     write_json(json_file, result)
-
-
-@app.command("compare")
-@show_compilation()
-def compare_(
-    models: Annotated[list[Path], typer.Argument(metavar="A.json B.json", help="Model files.")],
-    data: Annotated[
-        Path, typer.Option("--data", metavar="FILE", help="CSV file with a header, or the folder of a run.")
-    ],
-    input_column: Annotated[
-        str | None, typer.Option("--input", metavar="COLUMN", help="Input column; the first model's if not given.")
-    ] = None,
-    output_column: Annotated[
-        str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
-    ] = None,
-    skip: Annotated[
-        int,
-        typer.Option(
-            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
-        ),
-    ] = 0,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Compare models on measurements that they may not have seen.
-
-    Shows each model's errors raw, and after re-zeroing the sensor: between sessions a sensor's offset moves, and
-    what a model is worth then is another number.
-    """
-    from bench.results.models import compare_models
-
-    _check_figures(figures)
-    result = compare_models(models, data, input_column, output_column, skip=skip)
-    table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
-    table.add_column("model")
-    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
-        table.add_column(column, justify="right")
-    for name, entry in result.comparisons.items():
-        raw, mended = entry.raw, entry.rezeroed
-        table.add_row(
-            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
-            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
-        )  # fmt: skip
-    console.print(table)
-    if figures is not None:
-        from bench.results.report import draw_comparison
-
-        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, markup=False, soft_wrap=True)
-    write_json(json_file, result.to_json())
 
 
 @app.command()

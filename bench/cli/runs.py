@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +23,7 @@ from bench.cli.console import (
     warn,
     write_json,
 )
+from bench.cli.rehearse import show_rehearsal
 from bench.errors import BenchError, ConfigurationError
 
 if TYPE_CHECKING:
@@ -146,6 +148,17 @@ def run(
             "hardware the rig file says it ([safety] rate, 5 Hz).",
         ),
     ] = None,
+    rehearse: Annotated[
+        bool,
+        typer.Option(
+            "--rehearse/--no-rehearse",
+            help="Rehearse the run on the emulated twin of the rig first, and refuse it if it would not complete; on "
+            "the virtual clock it is not rehearsed.",
+        ),
+    ] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
+    ] = False,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: Annotated[
         bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
@@ -161,7 +174,7 @@ def run(
 ) -> None:
     """Carry a protocol out on a rig, record it, and leave every device in its safe state.
 
-    The set-points are checked against the rig's limits before anything moves. Ctrl-C pauses at the next
+    The run is rehearsed on the rig's emulated twin before anything moves. Ctrl-C pauses at the next
     step and asks; Ctrl-C again ends at once; so do SIGTERM and SIGHUP. However the run ends, every
     device is brought into its safe state, and what was recorded so far is kept.
     """
@@ -194,15 +207,22 @@ def run(
         attach=attach,
         interlock_rate=interlock_rate,
         faults=faults,
+        rehearse=rehearse,
     )
+    if dry_run:
+        if not rehearse:
+            raise ConfigurationError("--dry-run is a rehearsal; leave --no-rehearse out")
+        show_rehearsal(asked, json_file)
+        return
     # Until the result is printed: a terminal that hangs must not keep the process from being ended.
     with Interrupts(say_at_once) as interrupts:
         with show_compilation():
             result = carry_out(asked, console, interrupts)
-        _print_result(result, json_file)
+        print_result(result, json_file)
 
 
-def _print_result(result: RunResult, json_file: Path | None) -> None:
+def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:
+    """Print how a run ended, write it with `more` for programs, and exit with the code of what ended it."""
     from bench.safety import SAFE
 
     outcome, ratio = result.outcome, result.time_ratio
@@ -226,6 +246,7 @@ def _print_result(result: RunResult, json_file: Path | None) -> None:
             "wall_seconds": result.wall_seconds,
             "safe_state": dict(outcome.safe_state),
             "is_safe": outcome.is_safe,
+            **(more or {}),
         },
     )
     for name, state in outcome.safe_state.items():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from bench.hysteresis import Density
 from bench.journal import Event, StepRecord
+from bench.model_file import ModelFile
 
 
 class Tick(NamedTuple):
@@ -24,6 +25,11 @@ class ModelDensity:
 
     name: str
     density: Density
+
+
+def densities_of(models: Iterable[ModelFile]) -> list[ModelDensity]:
+    """Return the densities of models, in their order; a model without a plane has none."""
+    return [ModelDensity(file.name, density) for file in models for density in file.model.densities()]
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.entries import End, Entry, Tick, densities_of
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
 from bench.journal import Record
-from bench.model_file import is_model, parse_model
+from bench.model_file import is_model, models_among, parse_model
 
 
 def rebuild(record: Record, path: Path) -> None:
@@ -21,12 +21,13 @@ def rebuild(record: Record, path: Path) -> None:
     Raises ConfigurationError if the file exists, and DataError if the journal is damaged.
     """
     meta = record.meta
-    models = [
-        ModelDensity(name, density)
+    # What was identified from the run comes last, and is what its plane shows.
+    identified = (
+        parse_model(content, f"{record.path}: model {name}")
         for name, content in record.models().items()
         if is_model(content)
-        for density in parse_model(content, f"{record.path}: model {name}").model.densities()
-    ]
+    )
+    models = densities_of([*models_among(record.files(), str(record.path)).values(), *identified])
     try:
         writer = Writer(record.signals, meta, models)
     except (ConfigurationError, KeyError, TypeError) as error:

@@ -9,11 +9,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.entries import End, Entry, Tick, densities_of
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
-from bench.hysteresis import Density
 from bench.journal import Event, StepRecord
+from bench.model_file import ModelFile
 
 QUEUED_TICKS = 20_000
 """Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""
@@ -46,6 +46,8 @@ class Dashboard:
         Whether a viewer can connect.
     port : int
         Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any.
+    models : sequence of ModelFile
+        Models whose densities are shown under the memory curve.
 
     Raises
     ------
@@ -56,19 +58,29 @@ class Dashboard:
     """
 
     def __init__(
-        self, signals: Sequence[Signal], meta: Mapping[str, Any], *, path: Path | None, live: bool, port: int = 9876
+        self,
+        signals: Sequence[Signal],
+        meta: Mapping[str, Any],
+        *,
+        path: Path | None,
+        live: bool,
+        port: int = 9876,
+        models: Sequence[ModelFile] = (),
     ) -> None:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
-        self._writer = Writer(signals, meta)
+        densities = densities_of(models)
+        self._writer = Writer(signals, meta, densities)
         self._writer.open(path, port if live else None)
         self.uri = self._writer.recording.uri
         """Address for a viewer, None without a live view."""
         # One counter a thread, as adding is not atomic.
         self._not_queued = self._not_written = self._reported = 0
         self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
+        for density in densities:
+            self._queue.put(density)
         self._wake = threading.Event()
-        self._closing = False
+        self._closing = self._recording_stops = False
         self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
         self._thread.start()
 
@@ -84,9 +96,9 @@ class Dashboard:
         """Show something that happened."""
         self._put(event, QUEUED_ENTRIES)
 
-    def model(self, name: str, density: Density) -> None:
-        """Show the density of the model `name` under the memory curve, from now on."""
-        self._put(ModelDensity(name, density), QUEUED_ENTRIES)
+    def stop_recording(self) -> None:
+        """Write no more into the .rrd file, as the journal needs the space; the live view goes on."""
+        self._recording_stops = True
 
     def finish(self, status: str, reason: str) -> None:
         """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
@@ -139,6 +151,8 @@ class Dashboard:
         self._writer.recording.close()
 
     def _hand_over(self) -> None:
+        if self._recording_stops:
+            self._writer.recording.stop_file()
         # In portions, so that turning them into columns does not keep the interpreter from other threads.
         while waiting := min(self._queue.qsize(), CHUNK_ROWS):
             entries = [self._queue.get() for _ in range(waiting)]

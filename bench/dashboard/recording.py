@@ -57,7 +57,14 @@ class Recording:
             stream.send_recording_name(title)
             self._streams.append(stream)
         self._live = self._streams[-1] if port is not None else None
+        self._file = self._streams[0] if path is not None else None
         self._unseen = 0
+
+    def stop_file(self) -> None:
+        """Complete the file now; the live view goes on."""
+        if self._file in self._streams:
+            self._streams.remove(self._file)
+            self._file.disconnect()
 
     @property
     def viewer_keeps_up(self) -> bool:

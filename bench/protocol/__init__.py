@@ -1,7 +1,7 @@
 """Protocols: the vocabulary of operator scripts, their parameters, their dry run, and their discovery."""
 
 from bench.binding import Slot, Slots
-from bench.protocol.discovery import Packaged, find_protocol, packaged_protocols
+from bench.protocol.discovery import Packaged, find_protocol, is_installed, packaged_protocols, source_of
 from bench.protocol.parameters import (
     ParameterHelp,
     ProtocolDefinition,
@@ -53,9 +53,11 @@ __all__ = [
     "UntilSteady",
     "find_protocol",
     "from_slot",
+    "is_installed",
     "packaged_protocols",
     "parameter",
     "plan",
     "protocol",
+    "source_of",
     "unit_of",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import pkgutil
 import sys
 from collections.abc import Iterator
@@ -91,6 +92,19 @@ def find_protocol(name: str) -> ProtocolDefinition:
             f"(or a file of your own, path/to/file.py){left_out}"
         )
     return packaged.protocols[name]
+
+
+def source_of(definition: ProtocolDefinition) -> Path | None:
+    """Return the file in which a protocol is written; None if there is none, as in a notebook."""
+    file = inspect.getsourcefile(definition.generator)
+    return Path(file) if file and Path(file).is_file() else None
+
+
+def is_installed(definition: ProtocolDefinition) -> bool:
+    """Return whether a protocol is of an installed package, so that its name is enough to find it."""
+    module = definition.generator.__module__
+    packages = (entry.reference.partition(":")[0] for entry in registry.entries("protocols").values())
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
 def _protocol_from_file(path: Path, wanted: str) -> ProtocolDefinition:

@@ -73,6 +73,7 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     choices: Callable[[], Sequence[str]] | None = None,
+    file: bool = False,
 ) -> Any:  # noqa: ANN401 - stands for a field's default
     """Declare a parameter of a protocol.
 
@@ -88,8 +89,11 @@ def parameter(
         The allowed range, both ends included.
     choices : callable, optional
         Returns the texts that are allowed, where these are registered by name.
+    file : bool
+        Whether it is the path of a file that the protocol reads; the content is then kept with the run. An empty text
+        stands for no file.
     """
-    extra: dict[str, Any] = {"unit": unit, "choices": choices}
+    extra: dict[str, Any] = {"unit": unit, "choices": choices, "file": file}
     if isinstance(default, FromSlot):
         extra["default"] = default
         default = ...
@@ -159,6 +163,33 @@ class ProtocolDefinition:
         """Whether a model file has to be given."""
         info = self.parameters.model_fields.get("model")
         return info is not None and info.is_required()
+
+    @property
+    def file_parameters(self) -> tuple[str, ...]:
+        """The names of the parameters that name files."""
+        return tuple(name for name in self.parameters.model_fields if self._extra(name).get("file"))
+
+    def files(self, parameters: ProtocolParameters) -> dict[str, str]:
+        """Return the paths of the files that the parameters name, by the name of the parameter."""
+        return {name: path for name in self.file_parameters if (path := str(getattr(parameters, name)))}
+
+    def changed(
+        self, parameters: ProtocolParameters, roles: Mapping[str, RoleTable], defaults: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return the parameters that differ from their defaults on a rig, as JSON holds them, by name.
+
+        `roles` and `defaults` are those of `parse`. A parameter that must be given differs always.
+        """
+        given = parameters.model_dump(mode="json")
+        own = {name: info.default for name, info in self.parameters.model_fields.items() if not info.is_required()}
+        usual = own | self._from_roles(roles) | dict(defaults)
+        try:
+            validated = self.parameters.model_validate(given | usual).model_dump(mode="json")
+            usual = {name: validated[name] for name in usual}
+        except ValidationError:
+            # Defaults that do not fit the others are compared as they are written.
+            pass
+        return {name: value for name, value in given.items() if name not in usual or value != usual[name]}
 
     def controlled(self, slots: Slots) -> str:
         """Return the signal that its controllers control; empty if it has none."""
@@ -263,6 +294,8 @@ class ProtocolDefinition:
             allowed = "true, false"
         elif get_origin(info.annotation) is tuple:
             allowed = "numbers with commas between them"
+        elif extra.get("file"):
+            allowed = "a file"
         else:
             allowed = "any text" if info.annotation is str else "any number"
         source = extra.get("default")

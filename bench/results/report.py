@@ -17,7 +17,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.extras import needed_for
 from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
-from bench.journal import Record, Table, run_card
+from bench.journal import Record, Table, expected_steps, run_card
 from bench.model_file import ModelFile, parse_model
 from bench.results.data import write_csv
 from bench.results.figures import (
@@ -60,6 +60,8 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         folder = _make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
+        if record.remark:
+            console.print(record.remark, highlight=False, markup=False, soft_wrap=True)
         _print_status(record, len(steps), console)
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
@@ -175,9 +177,9 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
 def _print_status(record: Record, steps: int, console: Console) -> None:
     reason = record.meta.get("reason")
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
-    console.print(
-        f"[{style}]{record.status}[/] after {steps} of {record.meta['plan']['steps']} steps", highlight=False
-    )
+    expected = expected_steps(record.meta)
+    of = f" of {expected}" if expected is not None else ""
+    console.print(f"[{style}]{record.status}[/] after {steps}{of} steps", highlight=False)
     if reason:
         console.print(f"  {reason}", highlight=False, markup=False)
     for device, state in record.meta.get("safe_state", {}).items():

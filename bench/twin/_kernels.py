@@ -31,9 +31,9 @@ def follow(
 ) -> None:
     """Move the drive by as many grid steps as there are set-points; write what the operator sees to `out`.
 
-    A frequency of 0 is an actuator that follows at once, a damping of 0 one of first order. Rows of `out`: what the
-    actuator did, and that with the lag before the operator, the wander and the unevenness. Rows of `normals`: standard
-    normal numbers for wander, another for unevenness.
+    A frequency of 0 is an actuator that follows at once, a damping of 0 one of first order. Rows of `out`: what
+    the actuator did, and that with the lag before the operator, the wander and the unevenness. Rows of `normals` are
+    standard normal numbers: for the wander, and for the unevenness.
     """
     decay = math.exp(-step / wander_time)
     kick = wander * math.sqrt(1.0 - decay * decay)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def at_rows(recording: Recording, values: Floats, first: float, step: float, del
     """
     grid = step * np.arange(values.size + 1)
     times = recording.times[recording.times <= step * (values.size - 1)]
-    return np.interp(times - delay, grid, np.concatenate([[first], values]))
+    return np.asarray(np.interp(times - delay, grid, np.concatenate([[first], values])))
 
 
 def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float, end: float) -> Floats:
@@ -89,7 +90,9 @@ def identify_actuator(recordings: Sequence[Recording]) -> IdentifiedActuator:
 
     def simulated(dynamics: ActuatorDynamics) -> Floats:
         step = grid_step(dynamics)
-        return np.concatenate([simulate_drive(r, dynamics, step, end) for r, end in zip(recordings, ends, strict=True)])
+        return np.concatenate(
+            [simulate_drive(r, dynamics, step, end) for r, end in zip(recordings, ends, strict=True)]
+        )
 
     measured = np.concatenate([r.driven[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
     weights = np.concatenate([_weights(r)[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
@@ -102,21 +105,37 @@ def identify_actuator(recordings: Sequence[Recording]) -> IdentifiedActuator:
         return weights * measured - columns @ (gain, offset), float(gain), float(offset)
 
     def dynamics_of(names: Sequence[str], values: Floats) -> ActuatorDynamics:
-        numbers = {name: value * slow if name == "delay" else math.exp(value) for name, value in zip(names, values.tolist(), strict=True)}
+        numbers = {
+            name: value * slow if name == "delay" else math.exp(value)
+            for name, value in zip(names, values.tolist(), strict=True)
+        }
         return ActuatorDynamics(**numbers)
+
+    def left_over(names: Sequence[str], values: Floats) -> Floats:
+        return fitted(dynamics_of(names, values))[0]
 
     found: list[tuple[float, ActuatorDynamics, dict[str, float]]] = []
     for start in _candidates(slow, recordings):
         names, values = [*start], np.array([v / slow if n == "delay" else math.log(v) for n, v in start.items()])
         spread = np.empty(0)
         if names:
-            low = [-_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)]
-            high = [values[0] + 10.0 if name == "delay" else value + 3.0 for name, value in zip(names, values, strict=True)]
+            low = [
+                -_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)
+            ]
+            high = [
+                values[0] + 10.0 if name == "delay" else value + 3.0
+                for name, value in zip(names, values, strict=True)
+            ]
             solved = least_squares(
-                lambda v, names=names: fitted(dynamics_of(names, v))[0], values, bounds=(low, high), diff_step=1e-3, max_nfev=40
+                partial(left_over, names),
+                values,
+                bounds=(low, high),
+                diff_step=[1e-3],
+                max_nfev=40,
             )
             values = solved.x
-            spread = np.sqrt(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)))
+            jacobian = np.asarray(solved.jac)
+            spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
         dynamics = dynamics_of(names, values)
         left, gain, offset = fitted(dynamics)
         score = left.size * math.log(float(left @ left) / left.size) + len(names) * math.log(left.size)

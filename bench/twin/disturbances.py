@@ -145,7 +145,10 @@ def identify_disturbances(
     start = np.log([3e-4, 5.0, 1e-4, 100.0])
     simplex = np.vstack([start, start + np.diag([1.0, 1.0, 1.0, 1.0])])
     solved = minimize(
-        cost, start, method="Nelder-Mead", options={"maxfev": 90, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.1}
+        cost,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": 90, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.1},
     )
     wander, drift = trial(solved.x)
     return noise, wander, drift
@@ -155,7 +158,11 @@ class Part:
     """A run, simulated without disturbances, and the pairs of its rows within holds."""
 
     def __init__(
-        self, recording: Recording, operators: tuple[Operator[Any], ...], dynamics: Dynamics, longest: float = _LONGEST
+        self,
+        recording: Recording,
+        operators: tuple[Operator[Any], ...],
+        dynamics: Dynamics,
+        longest: float = _LONGEST,
     ) -> None:
         self._recording, self._operators, self._dynamics = recording, operators, dynamics
         self._end = min(longest, float(recording.times[-1]))
@@ -193,7 +200,9 @@ class Part:
                 place = float(r.driven[row]) if last < 0 else float(r.setpoints[last])
                 state = model.advance(state, [place])
                 here = model.value(state)
-                slope = max(abs(float(model.evaluate([place + each], state)[0]) - here) for each in (near, -near)) / near
+                slope = (
+                    max(abs(float(model.evaluate([place + each], state)[0]) - here) for each in (near, -near)) / near
+                )
             slopes[row] = slope
         return slopes
 
@@ -231,7 +240,7 @@ def _squares(pairs: _Pairs, values: Floats) -> tuple[Floats, Floats]:
     squares = (values[pairs.second] - values[pairs.first]) ** 2
     size = math.prod(shape)
     return (
-        np.bincount(place, squares, size).reshape(shape),
+        np.asarray(np.bincount(place, squares, size), dtype=np.float64).reshape(shape),
         np.bincount(place, minlength=size).astype(float).reshape(shape),
     )
 
@@ -260,7 +269,9 @@ def _noise(found: Sequence[float | None], values: Floats) -> Noise:
     reading, quick = found
     known = reading if reading is not None else quick if quick is not None else 0.0
     return Noise(
-        known if reading is None else reading, known if quick is None else quick, _resolution(values[np.isfinite(values)])
+        known if reading is None else reading,
+        known if quick is None else quick,
+        _resolution(values[np.isfinite(values)]),
     )
 
 
@@ -293,4 +304,6 @@ def _resolution(values: Floats) -> float:
     gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]
     digit = float(gaps.min())
     multiples = gaps / digit
-    return digit if float(np.abs(multiples - np.round(multiples)).max()) < 0.02 * float(multiples.max()) ** 0.5 else 0.0
+    return (
+        digit if float(np.abs(multiples - np.round(multiples)).max()) < 0.02 * float(multiples.max()) ** 0.5 else 0.0
+    )

@@ -125,25 +125,46 @@ class IdentifiedTwin:
         rows.append(("  at rest", f"{dynamics.gain:.5g} × set-point {dynamics.offset:+.3g} {units[first.drive]}"))
         slow = found.dynamics
         if slow.lag:
-            rows.append(("lag of the specimen", f"{number(slow.lag, 's', found.lag_uncertainty)}, of the drive to the power {slow.power:g}"))
+            rows.append(
+                (
+                    "lag of the specimen",
+                    f"{number(slow.lag, 's', found.lag_uncertainty)}, of the drive to the power {slow.power:g}",
+                )
+            )
         for share, time in zip(slow.shares, slow.times, strict=True):
             rows.append(("late part", f"{100.0 * share:.2g} % of the response, {time:g} s"))
-        for name, noise, unit in (("noise of the drive", self.noise[0], drive), ("noise of the response", self.noise[1], response)):
-            rows.append((name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one"))
+        for name, noise, unit in (
+            ("noise of the drive", self.noise[0], drive),
+            ("noise of the response", self.noise[1], response),
+        ):
+            rows.append(
+                (name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one")
+            )
             if noise.outliers:
-                rows.append(("  outliers", f"{100.0 * noise.outlier_share:.2g} %, up to {number(max(map(abs, noise.outliers)), unit)}"))
-        for name, wander, unit in (("wander of the drive", self.wander, drive), ("drift of the response", self.drift, response)):
+                rows.append(
+                    (
+                        "  outliers",
+                        f"{100.0 * noise.outlier_share:.2g} %, up to {number(max(map(abs, noise.outliers)), unit)}",
+                    )
+                )
+        for name, wander, unit in (
+            ("wander of the drive", self.wander, drive),
+            ("drift of the response", self.drift, response),
+        ):
             rows.append((name, f"{number(wander.deviation, unit)} in {number(wander.time, 's')}"))
-        rows.append(("unknown to the model", f"{number(self.unevenness.deviation, drive)} of the drive, within {number(self.unevenness.length, drive)}"))
+        uneven = self.unevenness
+        text = f"{number(uneven.deviation, drive)} of the drive, within {number(uneven.length, drive)}"
+        rows.append(("unknown to the model", text))
         if len(self.recordings) > 1:
             rows.append(("from run to run", f"{number(self.offset, response)} of the response"))
         taken = self.reading_time
-        rows.append(
-            ("time of a reading", "not known, as the protocols of the runs cannot be followed; 0 s taken")
-            if taken is None
-            else ("time of a reading", f"{number(taken.reading, 's')}; quick {number(taken.quick, 's')}; of a set-point {number(taken.setpoint, 's')}")
-        )
-        return rows
+        text = "not known, as the protocols of the runs cannot be followed; 0 s taken"
+        if taken is not None:
+            text = ", ".join(
+                f"{number(each, 's')} {what}".strip()
+                for each, what in ((taken.reading, ""), (taken.quick, "quick"), (taken.setpoint, "of a set-point"))
+            )
+        return [*rows, ("time of a reading", text)]
 
     def summary(self) -> dict[str, Any]:
         """Return what was identified, for programs."""
@@ -202,7 +223,9 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
             ("output", operator.output_unit, units[first.response]),
         ):
             if unit != expected:
-                raise DataError(f"model file {model}: its {what} is in {unit or 'no unit'}, that of the runs in {expected}")
+                raise DataError(
+                    f"model file {model}: its {what} is in {unit or 'no unit'}, that of the runs in {expected}"
+                )
     actuator = identify_actuator(recordings)
     response = identify_response(recordings, actuator.dynamics, operator)
     operators = [operator] if response.correction is None else [operator, response.correction]
@@ -250,7 +273,9 @@ def _source(recordings: Sequence[Recording], file: RigFile) -> tuple[str, tuple[
     first = recordings[0]
     response, drive = first.response, first.drive
     if not device_of(drive, file):
-        raise DataError(f"{first.path}: the drive {drive} is a derived signal; a twin needs one that a device measures")
+        raise DataError(
+            f"{first.path}: the drive {drive} is a derived signal; a twin needs one that a device measures"
+        )
     if device_of(response, file):
         return response, ()
     outputs = np.concatenate([r.responded for r in recordings])
@@ -270,8 +295,8 @@ def _source(recordings: Sequence[Recording], file: RigFile) -> tuple[str, tuple[
         if float(np.ptp(values)) > 0.0 and float(np.abs(left).max()) < 2e-3 * float(np.ptp(values)):
             return source, tuple(zip(nodes.tolist(), found.tolist(), strict=True))
     raise DataError(
-        f"{first.path}: the response {response} is derived from {', '.join(sorted(sources))}, and follows from none of "
-        "them alone; a twin needs a response that a device measures, or one that is derived from one signal"
+        f"{first.path}: the response {response} is derived from {', '.join(sorted(sources))}, and follows from none "
+        "of them alone; a twin needs a response that a device measures, or one that is derived from one signal"
     )
 
 
@@ -323,7 +348,9 @@ def _signals(
             setpoint = f"{device}_setpoint"
             if device != driving and not followed and units.get(setpoint) == signal.unit:
                 table["follows"], followed = device, True
-            found[name] = table | {key: list(each) if isinstance(each, tuple) else each for key, each in vars(noise).items()}
+            found[name] = table | {
+                key: list(each) if isinstance(each, tuple) else each for key, each in vars(noise).items()
+            }
     return found
 
 

@@ -14,6 +14,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.hysteresis import Operator, Preisach, uniform_levels
 from bench.hysteresis._checks import Floats
@@ -205,10 +206,12 @@ def _weights(recording: Recording) -> Floats:
 
 
 def _identify_correction(
-    model: Operator[Any], inputs: Sequence[Floats], errors: Floats, chosen: Any
+    model: Operator[Any], inputs: Sequence[Floats], errors: Floats, chosen: NDArray[np.bool_]
 ) -> tuple[Operator[Any] | None, float, Floats]:
-    """Return an operator that gives what of the errors repeats, None if nothing does; the RMS that is left; and what
-    is left at each chosen row of an operator that was made without it."""
+    """Return an operator that gives what of the errors repeats, the RMS that is left, and the errors held out.
+
+    There is no operator if nothing repeats. The last are those at each chosen row of an operator made without it.
+    """
     low, high = min(each.min() for each in inputs), max(each.max() for each in inputs)
     plane = model.plane or (float(low), float(high))
     template = Preisach(

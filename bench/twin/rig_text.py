@@ -35,12 +35,12 @@ def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
         f"# A twin of the present specimen on the rig {file.name}, made by `bench twin` from the runs",
         *(f"#   {recording.path.name}" for recording in twin.recordings),
         "# Its slots, derived signals, interlocks, parameters of protocols and telemetry are those of that rig. Its",
-        "# devices have the same names, signals, units and limits, but are emulated: the drive follows its set-points",
-        "# and the response follows the drive as was identified. Other signals stand at the level that was measured,",
-        "# with the noise that was measured, or follow the set-point of their device at once.",
+        "# devices have the same names, signals, units and limits, but are emulated: the drive follows its",
+        "# set-points, and the response follows the drive as was identified. Other signals stand at the level that",
+        "# was measured, with the noise that was measured, or follow the set-point of their device at once.",
         "",
         f"extends = {_value(_base(rig, out))}",
-        f"without = {_value([key for key in ('devices', 'emulation', 'twin') if key in file.content])}",
+        f"without = {_value(_left_out(file))}",
         "",
         "[rig]",
         f"title = {_value(f'{file.rig.title}: twin')}",
@@ -49,6 +49,12 @@ def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
         *_emulation(twin, file),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _left_out(file: RigFile) -> list[str]:
+    """Return the keys of the rig that its twin does not have."""
+    named = ["rig.twin"] if "twin" in file.content["rig"] else []
+    return [key for key in ("devices", "emulation") if key in file.content] + named
 
 
 def _base(rig: str, out: Path) -> str:
@@ -93,7 +99,8 @@ def _devices(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
                 noise = twin.noise[0]
                 tolerance["tolerance"] = max(6.0 * noise.quick, 2.0 * noise.resolution, 1e-3 * (high - low))
             yield from _table(
-                f"devices.{device}.setpoint", described | {"precision": setpoint.precision, "limits": [low, high]} | tolerance
+                f"devices.{device}.setpoint",
+                described | {"precision": setpoint.precision, "limits": [low, high]} | tolerance,
             )
 
 

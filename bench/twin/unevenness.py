@@ -1,8 +1,8 @@
 """What the model does not know of the specimen: its error on a history that it was not identified from.
 
-The error of a model changes as the drive moves, and stands while that stands. It is taken as a shift of the drive with
-an exponential correlation over the travel: that with which a simulation shows the mean squares that the errors of
-held-out readings have, by the travel between two readings and by the slope of the response.
+The error of a model changes as the drive moves, and stands while that stands. It is taken as a shift of the drive
+with an exponential correlation over the travel: that with which a simulation shows the mean squares that the errors
+of held-out readings have, by the number of readings between two and by the slope of the response.
 """
 
 from __future__ import annotations
@@ -97,6 +97,11 @@ def identify_unevenness(
         cost,
         start,
         method="Nelder-Mead",
-        options={"maxfev": 40, "initial_simplex": np.vstack([start, start + np.diag([1.0, 1.0])]), "xatol": 0.05, "fatol": 0.01},
+        options={
+            "maxfev": 40,
+            "initial_simplex": np.vstack([start, start + np.diag([1.0, 1.0])]),
+            "xatol": 0.05,
+            "fatol": 0.01,
+        },
     )
     return trial(solved.x)

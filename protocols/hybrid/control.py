@@ -25,7 +25,9 @@ REACH = 199e-6
 class Parameters(ProtocolParameters):
     """What can be set."""
 
-    model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
+    model: str = parameter(
+        ..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it", file=True
+    )
     controller: ControllerName = parameter("hybrid", unit="", help="which controller")
     reference: ReferenceName = parameter("moves", unit="", help="what is followed")
     positions: NumberList = parameter(
@@ -69,7 +71,9 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
 class StepParameters(ProtocolParameters):
     """What can be set."""
 
-    model: str = parameter(..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it")
+    model: str = parameter(
+        ..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it", file=True
+    )
     step: float = parameter(5e-6, unit="m", low=-9e-6, high=9e-6, help="height of the step")
     rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
     duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")

@@ -47,7 +47,9 @@ _GRACE = 60.0
 class Controlled(ProtocolParameters):
     """Parameters of either task."""
 
-    model: str = parameter(..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it")
+    model: str = parameter(
+        ..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it", file=True
+    )
     controller: str = parameter(
         "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("coupled-length")
     )

@@ -69,7 +69,7 @@ class EmulatedTwin(EmulatedInstrument):
 
     def obey(self, request: str) -> str:
         """Carry a request out; return the answer."""
-        if request == MEASURE or request == GLANCE:
+        if request in (MEASURE, GLANCE):
             return " ".join(repr(self._read(name, quick=request == GLANCE)) for name in self._meters)
         if request == IDENTITY:
             identity = self._identity

@@ -10,7 +10,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -18,15 +18,13 @@ from rich.table import Table
 from bench.cli import JsonOption, console
 from bench.cli.console import parse_assignments, parse_numbers, warn
 from bench.errors import ConfigurationError
-from bench.interrupts import Interrupts
-from bench.rig_file import RigFile, load_rig
-from sim_devices.laboratory import EmulatedLaboratory
-from sim_devices.serving.clock import make_served_clock
-from sim_devices.serving.control import ControlSocket
-from sim_devices.serving.endpoints import Listener
-from sim_devices.serving.served import ServedLaboratory, Serving
-from sim_devices.serving.server import Server
-from sim_devices.serving.state_log import StateLog
+
+if TYPE_CHECKING:
+    # Imported by the functions, as `bench --help` imports this module for its help text.
+    from bench.rig_file import RigFile
+    from sim_devices.laboratory import EmulatedLaboratory
+    from sim_devices.serving.endpoints import Listener
+    from sim_devices.serving.served import ServedLaboratory
 
 _LOOPBACK = "127.0.0.1"
 
@@ -75,6 +73,14 @@ def emulate(
     of the laboratory, injects faults such as {"do": "fault", "fault": "tec.delay", "duration": 5}, and lists them by
     {"do": "help"}; the file of `--state` says when each began and ended. Ctrl-C and SIGTERM end it.
     """
+    from bench.interrupts import Interrupts
+    from bench.rig_file import load_rig
+    from sim_devices.serving.clock import make_served_clock
+    from sim_devices.serving.control import ControlSocket
+    from sim_devices.serving.served import ServedLaboratory, Serving
+    from sim_devices.serving.server import Server
+    from sim_devices.serving.state_log import StateLog
+
     replaced = parse_assignments("--override", overrides or [])
     files = [load_rig(rig, replaced) for rig in rigs]
     given_ports = parse_numbers("--port", ports or [])
@@ -121,6 +127,8 @@ def emulate(
 
 def _check_rigs(files: Sequence[RigFile]) -> None:
     """Check that the rigs can be served, each under a name of its own."""
+    from sim_devices.laboratory import EmulatedLaboratory
+
     for index, file in enumerate(files):
         if file.laboratory is None:
             raise ConfigurationError(f"rig {file.name} has no emulated laboratory (table [emulation]) to be served")
@@ -148,6 +156,8 @@ def _check_ports(ports: Mapping[str, int | float], laboratories: Mapping[str, Em
 
 
 def _control_listener(address: str) -> Listener:
+    from sim_devices.serving.endpoints import Listener
+
     scheme, _, rest = address.partition(":")
     host, _, port = rest.removeprefix("//").rpartition(":")
     try:

@@ -129,7 +129,7 @@ class TestHelp:
             "import sys\n"
             "from bench.cli import main\n"
             "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-            "heavy = {'numba', 'scipy', 'rerun', 'matplotlib', 'pymodbus', 'filterpy', 'pyarrow'}\n"
+            "heavy = {'numpy', 'pydantic', 'numba', 'scipy', 'rerun', 'matplotlib', 'pymodbus', 'pyarrow'}\n"
             "heavy &= set(sys.modules)\n"
             "assert not heavy, heavy\n"
         )

@@ -5,7 +5,7 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +31,9 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
+from bench.hysteresis.documents import Model
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
+from bench.journal.rows import Entry
 from bench.layout import DashboardLayout, XYPlot
 from bench.model_file import ModelFile
 from bench.protocol import TRACES
@@ -263,7 +265,8 @@ def keep_journal(
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
-    journal._db.execute("BEGIN")
+    rows: list[Entry] = []
+    journal._keeper.keep, keep = rows.extend, journal._keeper.keep  # type: ignore[method-assign]
     for entry in entries:
         if isinstance(entry, StepRecord):
             journal.step(entry)
@@ -271,7 +274,8 @@ def keep_journal(
             journal.event(entry)
         else:
             journal.telemetry(*entry)
-    journal._db.execute("COMMIT")
+    journal._keeper.keep = keep  # type: ignore[method-assign]
+    keep(rows)
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
     if models is None:
@@ -315,9 +319,10 @@ def make_dashboard(
     layout: DashboardLayout | None = LAYOUT,
     signals: tuple[Signal, ...] = SIGNALS,
     controls: str = "",
+    models: Sequence[ModelFile] = (),
 ) -> Dashboard:
     meta = {**META, "run": "run", "controls": controls, "dashboard": layout and to_table(layout)}
-    return Dashboard(signals, meta, path=path, live=live, port=port)
+    return Dashboard(signals, meta, path=path, live=live, port=port, models=models)
 
 
 def read(path: Path) -> dict[str, dict[str, list[object]]]:
@@ -612,13 +617,12 @@ def test_live_and_rebuilt_recordings_are_equal(tmp_path: Path, request: pytest.F
         rebuilt = request.getfixturevalue("control_folder") / "rebuilt.rrd"
     else:
         entries, signals, rebuilt = request.getfixturevalue("entries"), SIGNALS, request.getfixturevalue("rebuilt")
-    with make_dashboard(tmp_path / "live.rrd", signals=signals, controls=controls) as dashboard:
+    path, models = tmp_path / "live.rrd", [make_model()]
+    with make_dashboard(path, signals=signals, controls=controls, models=models) as dashboard:
         tell(dashboard, entries[:777])
         # Whatever is handed over at once makes no difference.
         wait_until(lambda: not dashboard._queue.qsize())
         tell(dashboard, entries[777:])
-        (density,) = make_model().operator.densities()
-        dashboard.model("preisach", density)
         dashboard.finish("completed", "")
     assert dashboard.dropped == 0
     live, again = read(tmp_path / "live.rrd"), read(rebuilt)
@@ -960,8 +964,12 @@ def test_closing_is_bounded_when_rerun_stands_still(tmp_path: Path, monkeypatch:
 
 
 def test_a_refused_entry_does_not_end_the_view(tmp_path: Path) -> None:
-    with make_dashboard(tmp_path / "run.rrd") as dashboard:
-        dashboard.model("of the wrong shape", Density("", np.array([0.0, 1.0, 2.0]), np.array([[1.0]]), "°C"))
+    class OfTheWrongShape(Model):
+        def densities(self) -> tuple[Density, ...]:
+            return (Density("", np.array([0.0, 1.0, 2.0]), np.array([[1.0]]), "°C"),)
+
+    models = [ModelFile("of the wrong shape", OfTheWrongShape())]
+    with make_dashboard(tmp_path / "run.rrd", models=models) as dashboard:
         wait_until(lambda: dashboard.dropped == 1)
         feed(dashboard, 10)
     found = read(tmp_path / "run.rrd")

@@ -16,10 +16,12 @@ from bench.errors import (
     DeviceError,
     InterlockError,
     LimitError,
+    RecordError,
     SettleTimeoutError,
 )
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal, Record
+from bench.journal.store import Store
 from bench.protocol import (
     TRACES,
     Control,
@@ -444,31 +446,20 @@ class TestFaults:
         assert b.run(define(go)).status == "failed"
         b.assert_safe()
 
-    def test_a_full_disk_does_not_hide_the_safe_state(self, bench):
+    def test_a_full_disk_does_not_hide_the_safe_state(self, bench, monkeypatch):
         b = bench()
-        execute = b.journal._db
+        write = Store.write
 
-        class Full:
-            def execute(self, *arguments):
-                if b.clock.now() > 3.0:
-                    raise sqlite3.OperationalError("database or disk is full")
-                return execute.execute(*arguments)
+        def full(store, entries):
+            if b.clock.now() > 3.0:
+                raise sqlite3.OperationalError("database or disk is full")
+            write(store, entries)
 
-            @property
-            def in_transaction(self):
-                return execute.in_transaction
-
-            def executemany(self, statement, rows):
-                for row in rows:
-                    self.execute(statement, row)
-
-            def close(self):
-                execute.close()
-
-        b.journal._db = Full()
+        monkeypatch.setattr(Store, "write", full)
         outcome = b.run(stairs)
         assert outcome.status == "failed"
         assert "disk is full" in outcome.reason
+        assert isinstance(outcome.error, RecordError)
         assert outcome.is_safe
         b.assert_safe()
 
@@ -676,7 +667,7 @@ class TestControl:
 
     @pytest.mark.timeout(60)
     def test_a_protocol_that_controls_for_ever_has_no_plan(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "_LONGEST_PLAN", 10_000)
+        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
 
         def endless(parameters):
             message = next(control(Integrator(50.0)).generator(parameters))

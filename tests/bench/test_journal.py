@@ -40,6 +40,14 @@ def write(path, steps=3, signals=SIGNALS, meta=None, finish=True, ticks=2):
     journal.close()
 
 
+def change(path, *statements):
+    db = sqlite3.connect(path)
+    for statement in statements:
+        db.execute(statement)
+    db.commit()
+    db.close()
+
+
 def digest(folder):
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
@@ -175,8 +183,8 @@ class TestDurability:
 
     def test_settings_of_the_database(self, tmp_path):
         journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
-        assert journal._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-        assert journal._db.execute("PRAGMA synchronous").fetchone() == (2,)
+        assert journal._keeper.store._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        assert journal._keeper.store._db.execute("PRAGMA synchronous").fetchone() == (2,)
         journal.close()
 
     def test_survives_the_death_of_the_process(self, tmp_path):
@@ -344,10 +352,8 @@ class TestUnusable:
         db.close()
         with pytest.raises(DataError, match="is not a readable journal"):
             Record(path)
-        with pytest.raises(DataError, match="damaged"):
-            add_model(path, "m", 0.0, {})
 
-    @pytest.mark.parametrize("version", [0, 3, "1", None])
+    @pytest.mark.parametrize("version", [0, 4, "1", None])
     def test_another_schema(self, tmp_path, version):
         path = tmp_path / FILE_NAME
         write(path)
@@ -358,7 +364,7 @@ class TestUnusable:
             db.execute("UPDATE meta SET value = ? WHERE key = 'schema'", (json.dumps(version),))
         db.commit()
         db.close()
-        with pytest.raises(DataError, match=r"schema version .*; this bench reads versions 1 and 2"):
+        with pytest.raises(DataError, match=r"schema version .*; this bench reads versions 1 to 3"):
             Record(path)
 
     @pytest.mark.parametrize(
@@ -406,12 +412,119 @@ class TestUnusable:
 
 
 class TestModels:
-    def test_a_model_is_kept_with_its_run(self, tmp_path):
+    def test_a_model_is_kept_beside_its_run(self, tmp_path):
         write(tmp_path / FILE_NAME)
+        before = digest(tmp_path)
         add_model(tmp_path, "preisach", 3.0, {"order": 20})
+        add_model(tmp_path, "a/b: ü", 3.0, {"order": 1})
         add_model(tmp_path / FILE_NAME, "preisach", 4.0, {"order": 21})
-        db = sqlite3.connect(tmp_path / FILE_NAME)
-        assert db.execute("SELECT name, t, model FROM models").fetchall() == [("preisach", 4.0, '{"order": 21}')]
-        db.close()
+        assert before == {FILE_NAME: hashlib.sha256((tmp_path / FILE_NAME).read_bytes()).hexdigest()}
+        assert json.loads((tmp_path / "models" / "preisach.json").read_text())["order"] == 21
+        assert len(list((tmp_path / "models").iterdir())) == 2
         with Record(tmp_path) as run:
+            # The newest last.
+            assert list(run.models().items()) == [("a/b: ü", {"order": 1}), ("preisach", {"order": 21})]
             assert len(run.steps()) == 3
+
+    @pytest.mark.parametrize("content", ["{", '{"kept": 3}', '{"kept": {"position": "x"}}'])
+    def test_a_damaged_one_is_named(self, tmp_path, content):
+        write(tmp_path / FILE_NAME)
+        add_model(tmp_path, "good", 1.0, {})
+        (tmp_path / "models" / "bad.json").write_text(content)
+        with Record(tmp_path) as run, pytest.raises(DataError, match=r"model file .*bad\.json is damaged"):
+            run.models()
+
+
+class TestFiles:
+    def test_what_a_run_was_given_comes_back(self, tmp_path):
+        files = {"rig.toml": b"[rig]\n", "reference": bytes(range(256)) * 40, "empty": b""}
+        Journal(tmp_path / FILE_NAME, SIGNALS, {}, files).close()
+        with Record(tmp_path) as run:
+            assert run.files() == files
+            assert list(run.files()) == list(files)
+
+    def test_a_changed_one_is_named(self, tmp_path):
+        Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"a": b"1", "b": b"2"}).close()
+        change(tmp_path / FILE_NAME, "UPDATE files SET content = x'33' WHERE name = 'b'")
+        with Record(tmp_path) as run, pytest.raises(DataError, match="table files, row b: its checksum does not fit"):
+            run.files()
+
+
+class TestChecksums:
+    @pytest.mark.parametrize(
+        ("statement", "row"),
+        [
+            ("UPDATE steps SET force = force + 1e-12 WHERE step = 1", "table steps, row 1"),
+            ("UPDATE steps SET label = 'x' WHERE step = 2", "table steps, row 2"),
+            ("UPDATE steps SET phase = label, label = phase WHERE step = 2", "table steps, row 2"),
+            ("UPDATE steps SET force = NULL WHERE step = 0", "table steps, row 0"),
+            ("UPDATE telemetry SET t = t + 0.1 WHERE tick = 3", "table telemetry, row 3"),
+            ("UPDATE telemetry SET checksum = checksum + 1 WHERE tick = 4", "table telemetry, row 4"),
+            ("UPDATE events SET text = 'fall'", "table events, row 1"),
+            ("UPDATE meta SET value = '\"sma\"' WHERE key = 'rig'", "table meta, row rig"),
+            ("UPDATE signals SET unit = 'mN' WHERE position = 1", "table signals, row 1"),
+        ],
+    )
+    def test_a_row_that_was_changed_is_named(self, tmp_path, statement, row):
+        write(tmp_path / FILE_NAME)
+        change(tmp_path / FILE_NAME, statement)
+        with pytest.raises(DataError, match=f"is damaged: {row}: its checksum does not fit"), Record(tmp_path) as run:
+            run.steps(), run.telemetry(), run.events(), list(run.step_records())
+
+    def test_rows_are_checked_however_they_are_read(self, tmp_path):
+        write(tmp_path / FILE_NAME)
+        change(tmp_path / FILE_NAME, "UPDATE steps SET force = 0 WHERE step = 1")
+        with Record(tmp_path) as run:
+            for read in (run.steps, lambda: list(run.step_records())):
+                with pytest.raises(DataError, match="table steps, row 1"):
+                    read()
+            assert len(run.telemetry()) == 6
+
+    def test_older_schemas_are_still_read(self, tmp_path):
+        path = tmp_path / FILE_NAME
+        write(path)
+        with Record(path) as run:
+            steps, ticks, events = list(run.step_records()), repr(run.telemetry()), run.events()
+        change(path, *(f"ALTER TABLE {t} DROP COLUMN checksum" for t in ("signals", "steps", "telemetry", "events")))
+        change(path, "CREATE TABLE old (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
+        change(path, "INSERT INTO old SELECT key, value FROM meta WHERE key != 'counts'")
+        change(path, "DROP TABLE meta", "ALTER TABLE old RENAME TO meta", "DROP TABLE files")
+        change(path, "UPDATE meta SET value = '2' WHERE key = 'schema'")
+        change(path, "CREATE TABLE models (name TEXT PRIMARY KEY, t REAL NOT NULL, model TEXT NOT NULL)")
+        change(path, """INSERT INTO models VALUES ('preisach', 4.0, '{"order": 21}')""")
+        with Record(path) as run:
+            assert (list(run.step_records()), repr(run.telemetry()), run.events()) == (steps, ticks, events)
+            assert run.models() == {"preisach": {"order": 21}}
+            assert run.files() == {}
+            assert run.meta["rig"] == "vo2"
+        with pytest.raises(DataError, match="schema version 2; only one of 3 is written on"):
+            Journal.reopen(path)
+
+
+class TestReopening:
+    def test_rows_are_numbered_on(self, tmp_path):
+        write(tmp_path / FILE_NAME, finish=False)
+        journal = Journal.reopen(tmp_path)
+        assert (journal.steps, journal.ticks, journal.signals) == (3, 6, SIGNALS)
+        journal.event(Event(3.0, "INFO", "note", "resumed"))
+        journal.telemetry(3.0, 3, (23.0, 23.0))
+        journal.step(record(3, 23.0, 23.0))
+        journal.finish(status="completed", reason="", finished=4.0, safe_state={})
+        journal.close()
+        with Record(tmp_path) as run:
+            assert run.status == "completed"
+            assert [entry.step for entry in run.step_records()] == [0, 1, 2, 3]
+            assert len(run.telemetry()) == 7
+            assert [event.text for event in run.events()] == ["rise", "resumed"]
+            assert run.meta["counts"] == {"steps": 4, "telemetry": 7, "events": 2}
+
+    def test_a_run_that_has_ended_is_not_written_on(self, tmp_path):
+        write(tmp_path / FILE_NAME)
+        with pytest.raises(ConfigurationError, match="has ended: completed"):
+            Journal.reopen(tmp_path)
+
+    def test_a_damaged_one_is_not_written_on(self, tmp_path):
+        write(tmp_path / FILE_NAME, finish=False)
+        change(tmp_path / FILE_NAME, "UPDATE steps SET force = 1 WHERE step = 1")
+        with pytest.raises(DataError, match="table steps, row 1"):
+            Journal.reopen(tmp_path)

@@ -12,8 +12,10 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.journal import Event, Record, StepRecord, run_card
 from bench.protocol import Dwell, Step, find_protocol, protocol
+from bench.recorded_files import RIG_FILE_NAME
+from bench.remaining_time import Expectation
 from bench.rig_file import load_rig
-from bench.runs import RIG_FILE_NAME, Run, carry_out
+from bench.runs import Run, carry_out
 from bench.settling import Settled
 from bench.terminal import ProgressDisplay, ask_operator
 
@@ -192,12 +194,13 @@ class TestCarryOut:
 
 
 SIGNALS = (Signal("tec_temperature", "°C", "t", 2), Signal("force", "N", "f"))
+EXPECTED = Expectation(((1, 4.0), (2, 8.0)), 8.0, at_most=90.0)
 
 
 class TestDisplay:
     def show(self, **keys):
         console = Console(file=io.StringIO(), width=160, **keys)
-        with ProgressDisplay(console, "x[/red].py", SIGNALS, ("tec_temperature",), 2) as display:
+        with ProgressDisplay(console, "x[/red].py", SIGNALS, ("tec_temperature",), EXPECTED) as display:
             display.event(Event(0.0, "INFO", "phase", "climb [/red]"))
             display.event(Event(3661.0, "INFO", "note", "there [bold]now"))
             display.event(Event(5.0, "WARN", "pause", "paused"))
@@ -219,6 +222,8 @@ class TestDisplay:
     def test_at_a_terminal_a_bar_with_readings(self):
         shown = self.show(force_terminal=True)
         assert "2/2" in shown
+        assert "t 0:00:08  left 0:00:00, ends " in shown
+        assert "at most " in shown
         assert "x[/red].py" in shown
         assert "climb [/red]" in shown
         assert "tec_temperature 20.12 °C" in shown
@@ -234,7 +239,7 @@ class TestDisplay:
                 return super().write(text)
 
         file = Gone()
-        with ProgressDisplay(Console(file=file, force_terminal=True), "stairs", SIGNALS, (), 2):
+        with ProgressDisplay(Console(file=file, force_terminal=True), "stairs", SIGNALS, (), EXPECTED):
             file.lost = True
 
 

@@ -142,7 +142,9 @@ def recording_of(dynamics, noise=0.0):
         np.zeros(5), held, np.zeros((2, held.size)), out, grid, dynamics.frequency, dynamics.damping, dynamics.rate,
         0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
     )  # fmt: skip
-    drive = np.interp(times, grid * np.arange(1, held.size + 1), out[0], left=0.0) + noise * rng.standard_normal(times.size)
+    drive = np.interp(times, grid * np.arange(1, held.size + 1), out[0], left=0.0) + noise * rng.standard_normal(
+        times.size
+    )
     return Recording(
         path=Path("run"), meta={}, signals=(), steps=(), times=times, is_reading=np.ones(times.size, dtype=bool),
         columns={"drive": drive, "response": drive}, changes=changes, setpoints=setpoints, drive="drive",

@@ -31,6 +31,14 @@ _LONGEST_START = 120.0
 """Longest wait for what a run does at its start, s."""
 
 
+def hear_signals() -> None:
+    """Let the runs hear signals that a shell has its background jobs ignore."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in ("SIGHUP", "SIGQUIT"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
+
+
 def outputs_on(rig: EmulatedRig) -> dict[str, float]:
     """Return the true outputs of the instruments that are on."""
     return on(rig.control.request("state")["values"])
@@ -101,6 +109,12 @@ class GuardedRun:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def exit_code(self) -> int | None:
+        """Wait until the bench has left; return its exit code, None if it is still there after a minute."""
+        with suppress(subprocess.TimeoutExpired):
+            return self.process.wait(60)
+        return None
 
     @property
     def said(self) -> str:

@@ -25,7 +25,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
-from guarded_run import SETPOINTS, GuardedRun, find_guardian, on, start_busy
+from guarded_run import SETPOINTS, GuardedRun, find_guardian, hear_signals, on, start_busy
 
 from bench.rig_file import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
@@ -317,6 +317,7 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=3, help="trials of each kind")
     parser.add_argument("--busy", type=int, default=0, help="busy processes beside")
     given = parser.parse_args()
+    hear_signals()
     bad = 0
     with ExitStack() as stack:
         start_busy(given.busy, stack)

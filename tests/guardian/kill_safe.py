@@ -24,7 +24,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from guarded_run import SETPOINTS, GuardedRun, outputs_on, start_busy
+from guarded_run import SETPOINTS, GuardedRun, hear_signals, outputs_on, start_busy
 
 from bench.rig_file import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
@@ -142,12 +142,12 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
         problem = found.problem
         if trial.sent is signal.SIGSTOP:
             run.process.send_signal(signal.SIGCONT)
-            if run.process.wait(60) != 7:
-                problem = problem or f"exit code {run.process.returncode} after SIGCONT"
+            if (code := run.exit_code()) != 7:
+                problem = problem or f"exit code {code} after SIGCONT"
             if outputs_on(rig):
                 problem = "switched on again after SIGCONT"
-        elif trial.sent not in (None, signal.SIGKILL) and run.process.wait(60) != 130:
-            problem = problem or f"exit code {run.process.returncode}"
+        elif trial.sent not in (None, signal.SIGKILL) and (code := run.exit_code()) != 130:
+            problem = problem or f"exit code {code}"
         return {"": Found(found.seconds, found.within, problem)}
 
 
@@ -161,8 +161,8 @@ def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[s
         seconds, left = watch(rig, LINES[rig.name], within + 10.0)
         found = Found.judged(max(seconds.values()), within, left)
         problem = found.problem
-        if run.process.wait(60) != 7:
-            problem = problem or f"exit code {run.process.returncode}: {run.said[-300:]}"
+        if (code := run.exit_code()) != 7:
+            problem = problem or f"exit code {code}: {run.said[-300:]}"
         if not run.has_freed_lines():
             problem = problem or "the guardian is still there"
         found = Found(found.seconds, within, problem)
@@ -196,10 +196,10 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
         seconds, left = watch(rig, waited, max([20.0, *(within + 10.0 for _, within in parts.values())]))
         for title, (names, within) in parts.items():
             found[title] = Found.judged(max(seconds[name] for name in names), within, names & left)
-        code = run.process.wait(60)
+        code = run.exit_code()
         said = run.said
         problem = ""
-        if code == 0 or not any(name in said for name in devices):
+        if not code or not any(name in said for name in devices):
             problem = f"exit code {code}, and no device of {instrument} is named: {said[-300:]}"
         rig.control.plug_in(instrument)
         seconds, left = watch(rig, own, 13.0)
@@ -240,6 +240,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the instants")
     given = parser.parse_args()
     instants = random.Random(given.seed)
+    hear_signals()
     bad = 0
     with ExitStack() as stack:
         start_busy(given.busy, stack)

@@ -1,0 +1,119 @@
+"""The command that compares: models on measurements, or two runs with each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from bench.cli.console import JsonOption, console, show_compilation, write_json
+from bench.cli.models import check_figures
+from bench.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from bench.results.run_comparison import RunComparison
+
+app = typer.Typer()
+
+
+@app.command("compare")
+@show_compilation()
+def compare_(
+    compared: Annotated[list[Path], typer.Argument(metavar="A B", help="Model files with --data; or two runs.")],
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="FILE", help="For models: CSV file with a header, or the folder of a run."),
+    ] = None,
+    input_column: Annotated[
+        str | None, typer.Option("--input", metavar="COLUMN", help="Input column; the first model's if not given.")
+    ] = None,
+    output_column: Annotated[
+        str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
+    ] = None,
+    skip: Annotated[
+        int,
+        typer.Option(
+            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+        ),
+    ] = 0,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare models on measurements that they may not have seen; or, without `--data`, two runs with each other.
+
+    `bench compare A.json B.json --data FILE` shows each model's errors raw, and after re-zeroing the sensor: between
+    sessions a sensor's offset moves, and what a model is worth then is another number.
+
+    `bench compare RUN RUN` shows what differs in parameters, rig, instruments, versions and files, how both ended,
+    and how far each signal is apart at equal steps.
+    """
+    if data is None:
+        if input_column or output_column or skip or figures:
+            raise ConfigurationError("--input, --output, --skip and --figures are for models, with --data FILE")
+        _compare_runs(compared, json_file)
+        return
+    from bench.results.models import compare_models
+
+    check_figures(figures)
+    result = compare_models(compared, data, input_column, output_column, skip=skip)
+    table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
+    table.add_column("model")
+    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
+        table.add_column(column, justify="right")
+    for name, entry in result.comparisons.items():
+        raw, mended = entry.raw, entry.rezeroed
+        table.add_row(
+            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
+            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+        )  # fmt: skip
+    console.print(table)
+    if figures is not None:
+        from bench.results.report import draw_comparison
+
+        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, markup=False, soft_wrap=True)
+    write_json(json_file, result.to_json())
+
+
+def _compare_runs(runs: list[Path], json_file: Path | None) -> None:
+    from bench.journal import Record
+    from bench.results.run_comparison import compare_runs
+
+    if any(path.suffix == ".json" for path in runs):
+        raise ConfigurationError("model files are compared on measurements: add --data FILE")
+    if len(runs) != 2:
+        raise ConfigurationError(f"expected two runs to compare, or model files with --data; got {len(runs)}")
+    with Record(runs[0]) as first, Record(runs[1]) as second:
+        found = compare_runs(first, second)
+    _print_runs(found)
+    write_json(json_file, found.to_json())
+
+
+def _print_runs(found: RunComparison) -> None:
+    first, second = found.outcomes
+    table = Table("", "first", "second", title="outcome", title_justify="left")
+    for name in ("run", "status", "reason", "steps", "seconds", "result"):
+        values = getattr(first, name), getattr(second, name)
+        if values != ("", ""):
+            table.add_row(name, *(Text("" if value is None else str(value)) for value in values))
+    console.print(table)
+    if found.differences:
+        table = Table("key", "first", "second", title="what differs", title_justify="left")
+        for each in found.differences:
+            table.add_row(
+                *(Text("none" if text is None else str(text)) for text in (each.key, each.first, each.second))
+            )
+        console.print(table)
+    else:
+        console.print("nothing differs in what they were given", highlight=False)
+    table = Table(
+        "signal", "RMS", "max", "unit", "at step", title=f"second less first, {found.common_steps} common steps",
+        title_justify="left",
+    )  # fmt: skip
+    for signal, apart in found.signals.items():
+        table.add_row(signal, f"{apart.rms:.3g}", f"{apart.maximum:.3g}", apart.unit, str(apart.step))
+    console.print(table)
+    same = [name for name, equal in found.equal.items() if equal]
+    console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)

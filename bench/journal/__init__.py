@@ -1,0 +1,63 @@
+"""The durable record of a run: one SQLite file, written before any observer is notified.
+
+The file is in WAL mode with synchronous=FULL, and every telemetry tick, step and event is committed when
+it is handed over; what `Journal` has returned from survives a crash of the process and of the machine.
+Everything else (the .rrd, tables, figures) is derived from it and can be made again. When it is closed it
+becomes one self-contained file, which can be read where nothing can be written.
+
+Schema, version 3
+-----------------
+`meta(key, value, checksum)`
+    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
+    extends and the overrides), `overrides`, `protocol`, `protocol_source` (its module, whether that is of an
+    installed package, and the checksum of its file), `parameters`, `changed` (those that differ from their defaults),
+    `repeats` (the run that this one repeats), `slots` (device and signal by name), `seed`,
+    `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at t =
+    0), `devices` (identity by name), `limits` (set-points that each takes), `calibration`, `operator`, `command`,
+    `packages` (versions), `git` (commit and whether it was clean), `host` (with the wall-clock time at the start),
+    `controls` (the signal under control),
+    `plan`, `dashboard`, and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished`
+    (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is of a run
+    that is going on or whose process died.
+`signals(position, name, unit, description, precision, checksum)`
+    One row a signal column of the two tables below.
+`steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, checksum)`
+    One row a finished step, numbered from 0; times are laboratory s; `settled` says how (`dwell`, `steady`,
+    `arrived`, `controlled`; `not steady` or `not arrived` in the step that ended a run); `setpoints` is JSON by
+    device; then one REAL column a signal, the reading.
+`telemetry(tick, t, step, "<signal>", …, checksum)`
+    One row a tick of a hold, numbered from 1: quick readings.
+`events(event, t, level, kind, text, checksum)`
+    Phases, notes, pauses, suspensions of the machine, interlocks, errors, safe state, the factor that a paced clock
+    reached; numbered from 1; level is `INFO`, `WARN` or `ERROR`.
+`files(name, sha256, content)`
+    The content of every file that the run was given.
+
+`checksum` is the CRC-32 of the other columns of a row, see `bench.journal.rows.checksum`; a row whose checksum does
+not fit is damaged.
+
+Versions 1 and 2, which are still read, have neither checksums nor files, and a table `models(name, t, model)`; now
+models stand in files beside the journal, see `add_model`. Version 1 has 1 for each `settled`.
+"""
+
+from bench.journal.card import expected_steps, run_card
+from bench.journal.models import add_model
+from bench.journal.record import Record
+from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
+from bench.journal.table import Table
+from bench.journal.writing import Journal, abandon
+
+__all__ = [
+    "FILE_NAME",
+    "SCHEMA",
+    "Event",
+    "Journal",
+    "Record",
+    "StepRecord",
+    "Table",
+    "abandon",
+    "add_model",
+    "check_names",
+    "expected_steps",
+    "run_card",
+]

@@ -1,0 +1,114 @@
+"""The second file of a journal: every row once more, appended, until the journal is closed whole.
+
+It is written before the journal. Where the journal cannot be written for a while, as another program has it locked or
+the disk is full, a row is durable as soon as this file is; where the journal is damaged, the rows come from here.
+
+An entry is a mark, a head (table, quantity of numbers, length and CRC-32 of the rest), and the row's numbers
+and texts as in `bench.journal.rows.Entry`. What is damaged or cut off is left out when it is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from bench.journal.rows import TABLES, Entry, unpacked
+
+NAME = "journal.mirror"
+_MARK = b"\xb5row"
+_HEAD = struct.Struct("<BHII")
+_sync = getattr(os, "fdatasync", os.fsync)
+
+
+def elsewhere(journal: Path) -> tuple[Path, Path]:
+    """Return second files in the folder for temporary files, for a journal whose own folder cannot be written.
+
+    The first is for rows which that folder does not take, the second for those which it does not take in time.
+    """
+    digest = hashlib.sha256(str(journal.absolute()).encode("utf-8", "surrogateescape")).hexdigest()
+    start = Path(tempfile.gettempdir()) / f"bench-{digest[:24]}"
+    return start.with_suffix(".mirror"), start.with_suffix(".late")
+
+
+class Mirror:
+    """A second file to append to; raises OSError where the system does.
+
+    Parameters
+    ----------
+    path : Path
+        The file; what is there already is kept, up to the first entry that is cut off.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = os.fdopen(
+            os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b", buffering=0
+        )
+        self._end = os.fstat(self._file.fileno()).st_size
+
+    def append(self, entries: Iterable[Entry]) -> None:
+        """Append rows, all or none; they are durable after `sync` only."""
+        data = b"".join(map(_encoded, entries))
+        try:
+            self._file.seek(self._end)
+            if self._file.write(data) != len(data):
+                raise OSError(f"{self.path} takes no more")
+        except OSError:
+            # Half of an entry would only be in the way.
+            self._file.truncate(self._end)
+            raise
+        self._end += len(data)
+
+    def sync(self) -> None:
+        """Make what was appended durable."""
+        _sync(self._file.fileno())
+
+    def entries(self) -> list[Entry]:
+        """Return the rows, also of a file that has been removed meanwhile."""
+        self._file.seek(0)
+        return list(_decoded(self._file.read()))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def second_files(journal: Path) -> list[Path]:
+    """Return where second files of a journal may be."""
+    return [journal.parent / NAME, *elsewhere(journal)]
+
+
+def read_mirror(path: Path) -> list[Entry]:
+    """Return the rows of a second file, without those that are damaged; of a file that there is not, none."""
+    try:
+        return list(_decoded(path.read_bytes()))
+    except FileNotFoundError:
+        return []
+
+
+def _encoded(entry: Entry) -> bytes:
+    numbers = sum(not isinstance(value, str | bytes) for value in entry.row)
+    head = _HEAD.pack(TABLES.index(entry.table), numbers, len(entry.payload), zlib.crc32(entry.payload))
+    return b"".join((_MARK, head, entry.payload))
+
+
+def _decoded(data: bytes) -> Iterator[Entry]:
+    start = 0
+    while (start := data.find(_MARK, start)) >= 0:
+        start += len(_MARK)
+        begin = start + _HEAD.size
+        if begin > len(data):
+            return
+        table, numbers, length, crc = _HEAD.unpack_from(data, start)
+        payload = data[begin : begin + length]
+        if len(payload) < length or zlib.crc32(payload) != crc or table >= len(TABLES):
+            continue
+        row = unpacked(TABLES[table], numbers, payload)
+        if row is not None:
+            yield Entry(TABLES[table], row, payload)
+            start = begin + length

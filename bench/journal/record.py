@@ -1,0 +1,208 @@
+"""Reads the journal of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from bench.devices import Signal
+from bench.errors import DataError
+from bench.journal.models import models_beside
+from bench.journal.opening import OpenedJournal
+from bench.journal.rows import FILE_NAME, READABLE, SCHEMA, Event, StepRecord, checksum, checksums, quoted
+from bench.journal.table import Table
+from bench.settling import Settled
+
+_FAILED = {each.value for each in Settled if each.failed}
+
+
+class Record:
+    """Reads the journal of a run, finished or not, without ever changing it.
+
+    Every row is compared with its checksum when it is read; one that does not fit is a DataError which names it.
+
+    Parameters
+    ----------
+    path : Path
+        The journal, or the folder of the run that holds it.
+
+    Raises
+    ------
+    DataError
+        If there is no journal there, it is damaged, or its schema is of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path / FILE_NAME if path.is_dir() else path
+        if not self.path.is_file():
+            raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
+        self._opened = OpenedJournal(self.path)
+        self._db = self._opened.db
+        try:
+            self._read_heading()
+        except DataError:
+            self.close()
+            raise
+
+    @property
+    def remark(self) -> str:
+        """How the journal is read, where that is not the usual way; empty otherwise."""
+        return self._opened.remark
+
+    def _read_heading(self) -> None:
+        try:
+            meta = self._db.execute("SELECT * FROM meta").fetchall()
+            self.meta: dict[str, Any] = {key: json.loads(value) for key, value, *_ in meta}
+            signals = self._db.execute("SELECT * FROM signals ORDER BY position").fetchall()
+            self.signals = tuple(Signal(*row[1:5]) for row in signals)
+        except (sqlite3.DatabaseError, ValueError, TypeError) as error:
+            raise DataError(f"{self.path} is not a readable journal: {error}") from error
+        found = self.meta.get("schema")
+        if found not in READABLE:
+            raise DataError(f"{self.path} has schema version {found}; this bench reads versions 1 to {SCHEMA}")
+        self._is_checked = found == SCHEMA
+        self._check("meta", meta)
+        self._check("signals", signals)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def status(self) -> str:
+        """`completed`, `aborted`, `failed`, or `unfinished` if the run goes on or its process died."""
+        return str(self.meta.get("status", "unfinished"))
+
+    def unit(self, signal: str) -> str:
+        """Return the unit of a column: a signal's own, s for times, 1 for counts."""
+        others = "1" if signal in ("step", "tick", "settled") else "s"
+        return next((s.unit for s in self.signals if s.name == signal), others)
+
+    def steps(self) -> Table:
+        """Return the readings: columns `step`, `started`, `finished`, `settled` (1 or 0), and one a signal."""
+        rows = self._rows("steps")
+        self._check("steps", rows)
+        names = ("step", "started", "finished", "settled", *(signal.name for signal in self.signals))
+        end = 7 + len(self.signals)
+        return self._table("steps", names, [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
+
+    def step_records(self) -> Iterator[StepRecord]:
+        """Yield the finished steps one by one."""
+        rows = self._rows("steps")
+        self._check("steps", rows)
+        end = 7 + len(self.signals)
+        for step, started, finished, phase, label, settled, setpoints, *values in (row[:end] for row in rows):
+            try:
+                record = StepRecord(
+                    step,
+                    started,
+                    finished,
+                    phase,
+                    label,
+                    Settled.UNRECORDED if settled == 1 else Settled(settled),
+                    json.loads(setpoints),
+                    tuple(math.nan if value is None else float(value) for value in values),
+                )
+            except (ValueError, TypeError) as error:
+                raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
+            yield record
+
+    def telemetry(self) -> Table:
+        """Return the ticks: columns `t`, `step`, and one a signal."""
+        names = ("tick", "t", "step", *(signal.name for signal in self.signals))
+        rows = self._rows("telemetry")
+        whole = self._table("telemetry", (*names, "checksum") if self._is_checked else names, rows)
+        if self._is_checked and rows:
+            numbers = np.column_stack([whole[name] for name in names])
+            wrong = np.flatnonzero(np.array(checksums(numbers), dtype=np.float64) != whole["checksum"])
+            if len(wrong):
+                raise self._damaged("telemetry", rows[wrong[0]][0])
+        return Table(
+            {name: whole[name] for name in names if name != "tick"},
+            {name: whole.units[name] for name in names if name != "tick"},
+        )
+
+    def events(self) -> list[Event]:
+        """Return what happened, in its order."""
+        rows = self._rows("events")
+        self._check("events", rows)
+        return [Event(*row[1:5]) for row in rows]
+
+    def files(self) -> dict[str, bytes]:
+        """Return the content of every file that the run was given, by name; schemas before version 3 have none."""
+        if not self._is_checked:
+            return {}
+        result = {}
+        for name, digest, content in self._query("SELECT name, sha256, content FROM files ORDER BY rowid"):
+            if not isinstance(content, bytes) or hashlib.sha256(content).hexdigest() != digest:
+                raise self._damaged("files", name)
+            result[name] = content
+        return result
+
+    def models(self) -> dict[str, Any]:
+        """Return the content of the model files that were identified from this run, by name, the newest last."""
+        if self._is_checked:
+            return models_beside(self.path.parent)
+        rows = self._query("SELECT name, model FROM models ORDER BY rowid")
+        try:
+            return {name: json.loads(model) for name, model in rows} | models_beside(self.path.parent)
+        except (ValueError, TypeError) as error:
+            raise DataError(f"{self.path} is damaged: {error}") from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._opened.close()
+
+    def _rows(self, table: str) -> list[tuple[Any, ...]]:
+        # Columns by name, as only then a missing one is an error.
+        leading = {
+            "steps": ("step", "started", "finished", "phase", "label", "settled", "setpoints"),
+            "telemetry": ("tick", "t", "step"),
+            "events": ("event", "t", "level", "kind", "text"),
+        }[table]
+        signals = () if table == "events" else tuple(signal.name for signal in self.signals)
+        names = (*leading, *signals, *(("checksum",) if self._is_checked else ()))
+        columns = ", ".join(map(quoted, names))
+        return self._query(f"SELECT {columns} FROM {table} ORDER BY 1")  # noqa: S608 - own names
+
+    def _check(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Raise DataError for the first row that its checksum, the last column, does not fit."""
+        if not self._is_checked:
+            return
+        for row in rows:
+            try:
+                fits = checksum(row[:-1]) == row[-1]
+            except (ValueError, TypeError):
+                fits = False
+            if not fits:
+                raise self._damaged(table, row[0])
+
+    def _damaged(self, table: str, row: object) -> DataError:
+        return DataError(
+            f"{self.path} is damaged: table {table}, row {row}: its checksum does not fit; "
+            f"`bench recover-journal {self.path}` says what is good"
+        )
+
+    def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
+        try:
+            data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+        except (ValueError, TypeError) as error:
+            raise DataError(f"{self.path} is damaged: table {table}: {error}") from error
+        values = {name: data[:, i].copy() for i, name in enumerate(names)}
+        return Table(values, {name: self.unit(name) for name in names})
+
+    def _query(self, statement: str) -> list[tuple[Any, ...]]:
+        # All at once: damage may show at any row.
+        try:
+            return self._db.execute(statement).fetchall()
+        except sqlite3.DatabaseError as error:
+            raise DataError(f"{self.path} is damaged: {error}") from error

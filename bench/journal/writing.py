@@ -1,0 +1,283 @@
+"""Writes the journal of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self
+
+from bench.clock import Stopwatch
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DataError, RecordError
+from bench.journal.background import LONGEST_UNWRITTEN, Background
+from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import read_mirror, second_files
+from bench.journal.record import Record
+from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
+from bench.journal.store import Store
+
+
+class Journal:
+    """Writes the record of one run.
+
+    Parameters
+    ----------
+    path : Path
+        File to create; its folder exists.
+    signals : sequence of Signal
+        What is measured, in the order in which values will be handed over.
+    meta : mapping
+        What is known at the start; values that JSON can hold.
+    files : mapping of str to bytes
+        Content of the files that the run was given, by name.
+    patience : float, optional
+        Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
+        it the caller's writes, which is faster where nothing waits, as on the virtual clock.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file exists already: a record is never overwritten. If two signals have one name, or a signal
+        has that of a column which the journal itself needs; case does not count. If the file cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        signals: Sequence[Signal],
+        meta: Mapping[str, Any],
+        files: Mapping[str, bytes] = MappingProxyType({}),
+        patience: float | None = None,
+    ) -> None:
+        if path.exists():
+            raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
+        names = [signal.name for signal in signals]
+        check_names(names)
+        entries = [entry("meta", meta_row(key, value)) for key, value in {"schema": SCHEMA, **meta}.items()]
+        entries += [
+            entry("signals", (position, signal.name, signal.unit, signal.description, signal.precision))
+            for position, signal in enumerate(signals)
+        ]
+        entries += [
+            entry("files", (name, hashlib.sha256(content).hexdigest(), content)) for name, content in files.items()
+        ]
+        for former in second_files(path):
+            former.unlink(missing_ok=True)
+        try:
+            store = Store(path)
+            store.create(names, entries)
+            keeper = Keeper(store)
+            keeper.begin(entries)
+        except (sqlite3.Error, OSError) as error:
+            raise ConfigurationError(f"{path} cannot be made: {error}") from None
+        self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
+
+    @classmethod
+    def reopen(cls, path: Path, patience: float | None = None) -> Self:
+        """Open the record of an unfinished run to write on: its steps, ticks and events are numbered on.
+
+        Parameters
+        ----------
+        path : Path
+            The journal, or the folder of the run that holds it.
+        patience : float, optional
+            As of a new one.
+
+        Raises
+        ------
+        DataError
+            If there is none, it is damaged or of an older schema.
+        ConfigurationError
+            If the run has ended.
+        """
+        with Record(path) as record:
+            file, signals = record.path, record.signals
+            if record.meta["schema"] != SCHEMA:
+                raise DataError(
+                    f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on"
+                )
+            if "status" in record.meta:
+                raise ConfigurationError(f"{file} is the record of a run that has ended: {record.status}")
+            counts = {
+                "steps": len(record.steps()),
+                "telemetry": len(record.telemetry()),
+                "events": len(record.events()),
+            }
+        beside = {
+            (each.table, each.row[0]): each
+            for second in second_files(file)
+            for each in read_mirror(second)
+            # Numbered without a gap, so what the journal lacks is behind its last row.
+            if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
+        }
+        if any(table == "meta" and key == "status" for table, key in beside):
+            raise ConfigurationError(
+                f"{file} is the record of a run that has ended, of which rows wait in a second file; "
+                f"`bench recover-journal {file}` puts them together"
+            )
+        journal = cls.__new__(cls)
+        keeper = Keeper(Store(file))
+        missing = [each for (table, _), each in beside.items() if table in FIRST]
+        keeper.store.write(missing)
+        for each in missing:
+            counts[each.table] += 1
+        journal._begin(keeper, signals, counts, patience)
+        return journal
+
+    def _begin(
+        self, keeper: Keeper, signals: Sequence[Signal], counts: dict[str, int], patience: float | None
+    ) -> None:
+        """Start with rows that are there already, counted by table."""
+        self.signals = tuple(signals)
+        self.when_short: Callable[[], object] = lambda: None
+        """Called once when the disk is nearly full: recordings stop then, as the journal needs the space."""
+        self._is_told = False
+        self._keeper = keeper
+        self._counts = counts
+        self._waiting: list[tuple[float, ...]] = []
+        self._since_write = Stopwatch()
+        self._background = None if patience is None else Background(keeper, patience)
+        self._is_whole = True
+        self._failure: Exception | None = None
+
+    @property
+    def path(self) -> Path:
+        """The journal; another one once the first was removed."""
+        return self._keeper.store.path
+
+    @property
+    def steps(self) -> int:
+        """Number of finished steps that were handed over."""
+        return self._counts["steps"]
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks that were handed over."""
+        return self._counts["telemetry"]
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
+        """Record one tick of a hold: laboratory time in s, step number, one value a signal.
+
+        A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
+        the next tick, step or event.
+        """
+        self._waiting.append((self._number("telemetry"), t, step, *map(float, values)))
+        if self._background is not None:
+            self._background.keep_soon(self._take_ticks())
+        elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
+            self._write(())
+
+    def step(self, record: StepRecord) -> None:
+        """Record a finished step."""
+        self._counts["steps"] += 1
+        row = (
+            record.step,
+            record.started,
+            record.finished,
+            record.phase,
+            record.label,
+            record.settled.value,
+            json.dumps({name: float(value) for name, value in record.setpoints.items()}),
+            *map(float, record.values),
+        )
+        self._write([entry("steps", row)])
+
+    def event(self, event: Event) -> None:
+        """Record something that happened."""
+        self._write([entry("events", (self._number("events"), event.t, event.level, event.kind, event.text))])
+
+    def take_notices(self) -> list[str]:
+        """Return what happened to the journal itself since the last call."""
+        taken = []
+        while self._keeper.notices:
+            taken.append(self._keeper.notices.pop(0))
+        return taken
+
+    def make_room(self) -> None:
+        """Give back the space that is kept for the end of a run on a full disk."""
+        self._stop_background()
+        self._keeper.make_room()
+
+    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
+        """Record how the run ended: status, reason, laboratory time in s, safe state by device.
+
+        Raises RecordError if rows are missing or damaged; the status is `failed` then at best.
+        """
+        self._stop_background()
+        if self._waiting:
+            self._write(())
+        problem = self._keeper.end(self._counts) or (str(self._failure) if self._failure else "")
+        if problem:
+            status = "failed" if status == "completed" else status
+            reason = "; ".join(filter(None, (reason, f"the record is not whole: {problem}")))
+        end = {
+            "status": status,
+            "reason": reason,
+            "finished": finished,
+            "safe_state": dict(safe_state),
+            "counts": self._counts,
+        }
+        self._keeper.keep([entry("meta", meta_row(key, value)) for key, value in end.items()])
+        problem = problem or self._keeper.why
+        if problem:
+            self._is_whole = False
+            raise RecordError(
+                f"{self.path} is not whole: {problem}; every row is in {self._keeper.second_file}; "
+                f"`bench recover-journal {self.path}` puts them together"
+            )
+
+    def close(self) -> None:
+        """Close the files; what was recorded stays."""
+        with suppress(RecordError, sqlite3.Error):
+            self._stop_background()
+            if self._waiting:
+                self._write(())
+        # Otherwise its disk does not answer.
+        if self._background is None:
+            self._keeper.close(is_whole=self._is_whole)
+
+    def _number(self, table: str) -> int:
+        """Return the number of the next row of a table."""
+        number = FIRST[table] + self._counts[table]
+        self._counts[table] += 1
+        return number
+
+    def _take_ticks(self) -> list[Entry]:
+        """Return the ticks that wait, which wait no longer."""
+        waiting, self._waiting = self._waiting, []
+        return ticks(waiting) if waiting else []
+
+    def _write(self, entries: Sequence[Entry]) -> None:
+        """Make rows durable, and before them the ticks that wait."""
+        entries = [*self._take_ticks(), *entries]
+        if self._background is not None:
+            self._background.keep(entries)
+        else:
+            self._keeper.keep(entries)
+        self._since_write = Stopwatch()
+        if self._keeper.is_short and not self._is_told:
+            self._is_told = True
+            self.when_short()
+
+    def _stop_background(self) -> None:
+        """Write in the caller's thread from now on."""
+        if self._background is not None:
+            if not self._background.stop():
+                raise RecordError(f"{self.path}: its disk does not answer")
+            self._failure = self._background.failure
+            self._background = None
+
+
+def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
+    """Record the end of a run whose own thread hangs, if its file can be written within a second."""
+    with suppress(OSError):
+        (path.parent / RESERVE_NAME).unlink(missing_ok=True)
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
+        for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
+            row = entry("meta", meta_row(key, value)).columns()
+            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", row)

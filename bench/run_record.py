@@ -1,0 +1,257 @@
+"""What the record of a run says from its beginning: its folder, its metadata, and the state of the software."""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import importlib.metadata
+import json
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from bench import registry
+from bench.binding import Slots
+from bench.clock import wall_time
+from bench.description import RigDescription
+from bench.errors import ConfigurationError
+from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, is_installed, source_of
+from bench.recorded_files import file_name
+
+_PACKAGES = (
+    "actuator-bench",
+    "llvmlite",
+    "numba",
+    "numpy",
+    "pydantic",
+    "pymodbus",
+    "pyserial",
+    "rerun-sdk",
+    "scipy",
+)
+_LONGEST_NAME = 96
+_LONGEST_PART = 32
+_COMPARED = (
+    "protocol",
+    "protocol_source",
+    "parameters",
+    "rig",
+    "rig_content",
+    "seed",
+    "clock",
+    "interlock_rate",
+    "devices",
+    "packages",
+    "git",
+    "host.python",
+    "host.system",
+)
+"""What tells one run from another; the other keys follow from these, or differ always."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Something that two records say differently: a dotted key of the metadata, and both values; None for none."""
+
+    key: str
+    first: Any
+    second: Any
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.first if self.first is not None else 'none'} → {self.second or 'none'}"
+
+
+def metadata(
+    protocol: ProtocolDefinition,
+    parameters: ProtocolParameters,
+    description: RigDescription,
+    slots: Slots,
+    expected: Plan,
+    epoch: datetime,
+) -> dict[str, Any]:
+    """Return what is known of a run before it starts, by the keys of `bench.journal`.
+
+    Parameters
+    ----------
+    protocol : ProtocolDefinition
+        What is carried out.
+    parameters : ProtocolParameters
+        Of it.
+    description : RigDescription
+        The connected rig.
+    slots : Slots
+        The protocol's, bound.
+    expected : Plan
+        What the protocol will do.
+    epoch : datetime
+        Time of day at laboratory time 0.
+    """
+    file = description.file
+    return {
+        "rig": file.name,
+        "rig_title": file.rig.title,
+        "rig_file": file.text,
+        "rig_content": file.content,
+        "protocol": protocol.name,
+        "protocol_summary": protocol.summary,
+        "protocol_source": _source(protocol),
+        "parameters": parameters.model_dump(mode="json"),
+        "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
+        "controls": protocol.controlled(slots),
+        "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
+        "plan": {
+            "steps": expected.steps,
+            "seconds": expected.seconds,
+            "at_most": expected.at_most if expected.complete else None,
+            "complete": expected.complete,
+        },
+        "epoch": epoch.isoformat(),
+        "devices": {name: str(device.identity) for name, device in description.devices.items()},
+        "limits": {name: (limits.low, limits.high) for name, limits in description.limits.items()},
+        "calibration": {
+            **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
+            **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
+        },
+        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
+        "operator": _operator(),
+        "command": sys.argv,
+        "packages": _versions(),
+        "git": _git_state(),
+        "host": {
+            "name": platform.node(),
+            "system": platform.platform(),
+            "python": platform.python_version(),
+            "started": wall_time().isoformat(),
+        },
+    }
+
+
+def run_name(protocol: ProtocolDefinition, meta: Mapping[str, Any]) -> str:
+    """Return the name of a run without its time: rig, protocol, and what was set differently from the defaults.
+
+    At most 96 letters, digits and `.+_-`, which every file system takes; what is left out counts as `more`. `meta` is
+    what `metadata` returns, with the `overrides`.
+    """
+    name, files = f"{meta['rig']}-{protocol.name}", protocol.file_parameters
+    parts = [f"{key}-{_short(value)}" for key, value in meta["changed"].items() if key not in files]
+    # Last what the runs of a series often share: files by the end of their path, and values of the rig file.
+    for key in filter(meta["changed"].__contains__, files):
+        parts.append(f"{key}-{Path(file_name(meta['changed'][key])).stem}")
+    parts += [f"{key.rpartition('.')[2]}-{value}" for key, value in meta["overrides"].items()]
+    for part in parts:
+        part = re.sub(r"[^A-Za-z0-9.+_-]+", "-", part)[:_LONGEST_PART].rstrip("-.")
+        if len(name) + len(part) + len("--more") > _LONGEST_NAME:
+            return f"{name}-more"
+        name += f"-{part}"
+    return name
+
+
+def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Difference]:
+    """Return what the metadata of two runs say differently of protocol, rig, instruments and software."""
+    ours, theirs = (dict(_leaves("", {key: _at(meta, key) for key in _COMPARED})) for meta in (first, second))
+    return [
+        Difference(key, ours.get(key), theirs.get(key))
+        for key in {**ours, **theirs}
+        if ours.get(key) != theirs.get(key)
+    ]
+
+
+def make_folder(parent: Path, name: str) -> Path:
+    """Make the folder of a run: its name, then the time of day; a counter where two runs start in one second.
+
+    Raises ConfigurationError if it cannot be made.
+    """
+    stamp = wall_time().strftime("%Y%m%d-%H%M%S")
+    for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
+        folder = parent / f"{name}-{stamp}{suffix}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
+        return folder
+    raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
+
+
+def _operator() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "unknown"
+
+
+def _short(value: Any) -> str:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(value, dict):
+        return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:6]
+    if isinstance(value, list):
+        return "+".join(map(_short, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _at(meta: Mapping[str, Any], key: str) -> Any:  # noqa: ANN401 - anything that JSON can hold
+    found: Any = meta
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, dict) else None
+    return found
+
+
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(f"{key}.{name}" if key else name, inner)
+    else:
+        yield key, value
+
+
+def _source(protocol: ProtocolDefinition) -> dict[str, Any]:
+    file = source_of(protocol)
+    return {
+        "module": protocol.generator.__module__,
+        "installed": is_installed(protocol),
+        "sha256": None if file is None else hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
+
+
+@cache
+def _versions() -> Mapping[str, str]:
+    """Return the versions of the packages that compute, talk to instruments, or register parts."""
+    packages = set(_PACKAGES)
+    for group in registry.GROUPS:
+        # Two packages with one name are refused where the name is asked for.
+        with suppress(ConfigurationError):
+            packages |= {entry.package for entry in registry.entries(group).values()}
+    return {package: _version(package) for package in sorted(packages)}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+@cache
+def _git_state() -> str:
+    git = shutil.which("git")
+    if git is None:
+        return "unknown"
+    here = Path(__file__).parent
+
+    def ask(*arguments: str) -> str | None:
+        answer = subprocess.run([git, *arguments], cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    commit = ask("rev-parse", "--short=12", "HEAD")
+    if commit is None:
+        return "unknown"
+    return commit + (" with changes" if ask("status", "--porcelain") else "")

@@ -1,0 +1,50 @@
+"""What a task knows of where it is carried out: a console for its words, and who hears how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from rich.console import Console
+
+Report = Callable[[int, int | None, str], None]
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    console: Console
+    report: Report | None
+
+
+_surroundings: _Surroundings | None = None
+
+
+@contextmanager
+def task_surroundings(console: Console, report: Report | None) -> Iterator[None]:
+    """Let tasks of this process print on a console and report; without `report` they draw their own progress."""
+    global _surroundings
+    former, _surroundings = _surroundings, _Surroundings(console, report)
+    try:
+        yield
+    finally:
+        _surroundings = former
+
+
+def task_console() -> Console:
+    """Return the console for what a task prints: it arrives on the console of the `Workers`."""
+    return Console() if _surroundings is None else _surroundings.console
+
+
+def report(completed: int, total: int | None, text: str) -> None:
+    """Say how far the task of this process is; nothing happens outside of a worker process.
+
+    Parameters
+    ----------
+    completed, total : int
+        Steps that are done, and all of them; None if that is not known.
+    text : str
+        What is being done.
+    """
+    if _surroundings is not None and _surroundings.report is not None:
+        _surroundings.report(completed, total, text)

@@ -1,0 +1,11 @@
+"""A script with two worker processes whose tasks wait for ever."""
+
+import sys
+
+import worker_tasks
+
+from bench.workers import Workers
+
+with Workers(2) as workers:
+    for _ in range(2):
+        workers.submit(worker_tasks.wait, sys.argv[1])

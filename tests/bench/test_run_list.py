@@ -1,0 +1,154 @@
+"""Lists of runs, and two of them side by side."""
+
+import io
+import json
+import sqlite3
+from contextlib import closing
+
+import pytest
+from heater_laboratory import RIG
+from heater_protocols import stairs
+from rich.console import Console
+
+from bench.journal import FILE_NAME, Record
+from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
+from bench.protocol.number_list import NumberList
+from bench.results.run_comparison import compare_runs
+from bench.run_record import run_name
+from bench.runs import Run, carry_out
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs that differ by a parameter and one like the first; one that goes on, and one that is damaged."""
+    folder = tmp_path_factory.mktemp("runs")
+    rig = folder / "heater.toml"
+    rig.write_text(RIG, encoding="utf-8")
+
+    def run(seed=0, **settings):
+        asked = Run(stairs, settings, str(rig), folder / "runs", seed=seed, clock="virtual", recording=False)
+        return carry_out(asked, Console(file=io.StringIO())).folder
+
+    found = {
+        "plain": run(),
+        "hotter": run(increment=7.5, count=3),
+        "again": run(),
+        "unfinished": run(seed=5),
+        "damaged": run(),
+    }
+    with closing(sqlite3.connect(found["unfinished"] / FILE_NAME)) as db, db:
+        db.execute("DELETE FROM meta WHERE key IN ('status', 'finished', 'reason')")
+    (found["damaged"] / FILE_NAME).write_bytes(b"no journal at all" * 99)
+    return found
+
+
+def listed(bench, tmp_path, *options):
+    code, out, err = bench("runs", *options, "--json", tmp_path / "runs.json")
+    assert (code, err) == (0, "")
+    return out, json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))
+
+
+def test_every_run_below_a_folder_is_listed(bench, runs, tmp_path):
+    out, found = listed(bench, tmp_path, runs["plain"].parents[1])
+    by_name = {name: next(run for run in found if run["folder"] == str(path)) for name, path in runs.items()}
+    assert len(found) == len(runs)
+    assert [run["started"] for run in found] == sorted(run["started"] for run in found)
+    plain, hotter = by_name["plain"], by_name["hotter"]
+    assert (plain["status"], plain["protocol"], plain["rig"]) == ("completed", "stairs", "heater")
+    assert (plain["steps"], plain["seconds"], plain["changed"]) == (4, 8.0, {})
+    assert hotter["changed"] == {"count": 3, "increment": 7.5}
+    assert by_name["unfinished"]["status"] == "unfinished"
+    assert by_name["damaged"]["status"] == "damaged"
+    assert "is not a readable journal" in by_name["damaged"]["result"]
+    assert "count=3, increment=7.5" in out
+    assert "5 runs" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--where", "increment=7.50"], {"hotter"}),
+        (["--where", "count=4", "--where", "seed=5"], {"unfinished"}),
+        (["--where", "count=4", "--status", "completed"], {"plain", "again"}),
+        (["--status", "damaged"], {"damaged"}),
+        (["--protocol", "stairs", "--rig", "heater", "--where", "increment=7.5"], {"hotter"}),
+        (["--rig", "vo2"], set()),
+    ],
+)
+def test_runs_are_found_by_what_was_set(bench, runs, tmp_path, options, expected):
+    _, found = listed(bench, tmp_path, runs["plain"].parent, *options)
+    assert {run["folder"] for run in found} == {str(runs[name]) for name in expected}
+
+
+def test_what_cannot_be_found_is_named(bench, runs, tmp_path):
+    code, _, err = bench("runs", runs["plain"].parent, "--where", "incremnt=7.5")
+    assert code == 2
+    assert "--where incremnt: no run has such a parameter; they have: clock, count, dwell, increment" in err
+    code, _, err = bench("runs", tmp_path / "nowhere")
+    assert code == 2
+    assert "nowhere is not a folder" in err
+
+
+def test_the_folder_tells_the_parameters_that_differ(runs):
+    assert runs["hotter"].name.startswith("heater-stairs-count-3-increment-7.5-2")
+    assert runs["plain"].name.startswith("heater-stairs-2")
+
+
+def test_two_runs_are_compared(bench, runs, tmp_path):
+    result = tmp_path / "result.json"
+    code, out, _ = bench("compare", runs["plain"], runs["hotter"], "--json", result)
+    assert code == 0
+    found = json.loads(result.read_text(encoding="utf-8"))
+    different = {each["key"]: (each["first"], each["second"]) for each in found["differences"]}
+    assert different == {"parameters.count": (4, 3), "parameters.increment": (5.0, 7.5)}
+    assert found["common_steps"] == 3
+    setpoint = found["signals"]["tec_setpoint"]
+    assert (setpoint["maximum"], setpoint["step"], setpoint["unit"]) == (5.0, 2, "°C")
+    assert setpoint["rms"] == pytest.approx(((0 + 2.5**2 + 5**2) / 3) ** 0.5)
+    assert found["equal"] == {"steps": False, "telemetry": False, "events": False}
+    assert [each["steps"] for each in found["outcomes"]] == [4, 3]
+    assert "parameters.increment" in out
+    with Record(runs["plain"]) as first, Record(runs["again"]) as second:
+        same = compare_runs(first, second)
+    assert same.differences == ()
+    assert all(same.equal.values())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["a.json", "b.json"], "model files are compared on measurements: add --data FILE"),
+        (["a"], "expected two runs to compare, or model files with --data; got 1"),
+        (["a", "b"], "a is not a run"),
+        (["a", "b", "--skip", "3"], "are for models, with --data FILE"),
+    ],
+)
+def test_a_comparison_of_neither_models_nor_runs_is_refused(bench, arguments, expected):
+    code, _, err = bench("compare", *arguments)
+    assert code in (2, 3)
+    assert expected in err
+
+
+def test_the_name_of_a_folder_is_short_and_fits_every_file_system():
+    class Parameters(ProtocolParameters):
+        model: str = parameter("", unit="", help="file", file=True)
+        levels: NumberList = parameter("1", unit="1", help="some")
+        text: str = parameter("", unit="", help="any")
+        more: float = parameter(0.0, unit="1", help="any")
+
+    @protocol(needs=("tec",))
+    def try_out(parameters: Parameters) -> Messages:
+        """Try."""
+        yield Note("x")
+
+    def name(overrides, **settings):
+        changed = try_out.changed(try_out.parse(settings), {}, {})
+        return run_name(try_out, {"rig": "heater", "changed": changed, "overrides": overrides})
+
+    assert name({}) == name({}, more="0") == "heater-try-out"
+    assert name({}, model="C:\\models\\m 1.json", more="-2.50") == "heater-try-out-more--2.5-model-m-1"
+    assert name({"emulation.offset": "0.3"}, levels="1,2.5") == "heater-try-out-levels-1+2.5-offset-0.3"
+    assert name({}, text='a/b:c*"<|>?\n. ') == "heater-try-out-text-a-b-c"
+    long = name({f"table.key{i}": "0123456789" for i in range(20)}, text="x" * 500)
+    assert len(long) <= 96
+    assert long.endswith("-more")

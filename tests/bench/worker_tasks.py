@@ -1,0 +1,59 @@
+"""Tasks of the tests, in a module that worker processes can import."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from bench.errors import DeviceError
+from bench.protocol import find_protocol
+from bench.runs import Run, carry_out
+from bench.workers import report, task_console
+
+
+def process(value):
+    """Return the process as well."""
+    return value, os.getpid()
+
+
+def product(size):
+    """Return a product of matrices, which BLAS shares out among its threads if it has several."""
+    matrix = np.random.default_rng(size).normal(size=(size, size))
+    return matrix @ matrix.T
+
+
+def speak(text):
+    report(1, 2, text)
+    task_console().print(f"{text} is said")
+    print("This is not for the bench.")
+
+
+def fail(device):
+    raise DeviceError(device, "answers with an error")
+
+
+def break_down():
+    raise ValueError("a defect")
+
+
+def die(folder):
+    """Be killed while there is a file left; each time one less is there."""
+    left = sorted(Path(folder).iterdir())
+    if left:
+        left[0].unlink()
+        os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
+    return "done"
+
+
+def wait(folder):
+    """Write down which process waits, for ever."""
+    Path(folder, str(os.getpid())).touch()
+    threading.Event().wait()
+
+
+def run(folder):
+    """Carry out a run of hours."""
+    run = Run(find_protocol("damped-oscillation"), {}, "vo2", Path(folder), clock="x1", recording=False)
+    return carry_out(run, task_console())

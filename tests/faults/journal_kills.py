@@ -1,0 +1,128 @@
+"""Kill runs at random moments on each rig: no step and no event that the journal has acknowledged is lost.
+
+    python tests/faults/journal_kills.py [--rig RIG] [--times N] [--seed N]
+
+Each run is in process, by turns on the virtual clock, where the control thread writes the journal, and on a paced one,
+where a thread of its own does. It is killed by SIGKILL up to 30 ms after a random step was acknowledged. POSIX, as the
+runs are forks. The exit code is 1 if anything is lost.
+"""
+
+import argparse
+import io
+import os
+import random
+import select
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from bench.journal import Journal, Record
+from bench.protocol import find_protocol
+from bench.runs import Run, carry_out
+
+HERE = Path(__file__).parent
+RIGS = ("vo2", "sma", "hybrid")
+CLOCKS = ("virtual", "x20")
+STEPS = 16
+"""Steps of an excursion."""
+LONGEST_DELAY = 0.03
+LONGEST = 120.0
+"""Wall-clock time after which a run hangs, s."""
+
+
+@dataclass(frozen=True)
+class Killed:
+    """A run that was killed: its folder, and how many steps and events the journal had acknowledged."""
+
+    folder: Path
+    steps: int
+    events: int
+
+
+def killed_run(rig, clock, folder, steps, delay):
+    """Start a run below a folder, and kill it some seconds after a number of steps was acknowledged."""
+    reader, writer = os.pipe()
+    process = os.fork()
+    if process == 0:
+        try:
+            _run(rig, clock, folder, writer)
+        finally:
+            os._exit(0)
+    os.close(writer)
+    told = b""
+    deadline = time.monotonic() + LONGEST
+    while told.count(b"s") < steps and time.monotonic() < deadline:
+        if select.select([reader], [], [], 1.0)[0]:
+            more = os.read(reader, 4096)
+            if not more:
+                break
+            told += more
+    time.sleep(delay)
+    os.kill(process, signal.SIGKILL)
+    while more := os.read(reader, 4096):
+        told += more
+    os.close(reader)
+    os.waitpid(process, 0)
+    (found,) = folder.iterdir()
+    return Killed(found, told.count(b"s"), told.count(b"e"))
+
+
+def _run(rig, clock, folder, writer):
+    """Carry an excursion out, and say what the journal has acknowledged."""
+    step, event = Journal.step, Journal.event
+
+    def told_step(journal, record):
+        step(journal, record)
+        os.write(writer, b"s")
+
+    def told_event(journal, entry):
+        event(journal, entry)
+        os.write(writer, b"e")
+
+    Journal.step, Journal.event = told_step, told_event
+    run = Run(
+        protocol=find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}"), settings={}, seed=0, clock=clock, rig=rig,
+        folder=folder, recording=False,
+    )  # fmt: skip
+    carry_out(run, Console(file=io.StringIO(), width=200))
+
+
+def lost(killed):
+    """Return how many acknowledged steps and events a killed run lacks, and whether it claims to be complete."""
+    with Record(killed.folder) as record:
+        steps = set(record.steps()["step"].astype(int).tolist())
+        events = len(record.events())
+        claims = record.status == "completed" and len(steps) < STEPS
+    return len(set(range(killed.steps)) - steps), max(0, killed.events - events), claims
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rig", choices=RIGS, action="append")
+    parser.add_argument("--times", type=int, default=200, help="trials in all")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    rigs = asked.rig or RIGS
+    chance = random.Random(asked.seed)
+    rows = {(rig, clock): [0] * 5 for rig in rigs for clock in CLOCKS}
+    for trial in range(asked.times):
+        rig, clock = rigs[trial % len(rigs)], CLOCKS[trial // len(rigs) % len(CLOCKS)]
+        with tempfile.TemporaryDirectory(prefix="journal-kills-") as folder:
+            killed = killed_run(
+                rig, clock, Path(folder), chance.randint(1, STEPS - 1), LONGEST_DELAY * chance.random()
+            )
+            found = (1, killed.steps, killed.events, *lost(killed)[:2])
+            rows[rig, clock] = [a + b for a, b in zip(rows[rig, clock], found, strict=True)]
+    print(f"{'rig':8} {'clock':8} {'kills':>6} {'steps':>6} {'events':>7} {'lost steps':>11} {'lost events':>12}")
+    for (rig, clock), row in rows.items():
+        print(f"{rig:8} {clock:8} {row[0]:6} {row[1]:6} {row[2]:7} {row[3]:11} {row[4]:12}")
+    return 1 if any(row[3] or row[4] for row in rows.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
