@@ -1,5 +1,5 @@
 """The twin of a specimen: an emulated laboratory made from what was measured on it.
 
-`recording` reads the runs; `actuator`, `response`, `disturbances`, `unevenness` and `reading_time` identify its
-parts; `specimen` computes what it does; `tables` and `rig_text` keep it. Numbers in, numbers out: no device is touched.
+`recording` reads the runs, from which `actuator`, `response`, `disturbances`, `unevenness` and `reading_time` identify
+its parts; `specimen` computes what it does; `tables` and `rig_text` keep it. No device is touched.
 """

@@ -20,7 +20,7 @@ from bench.twin.specimen import ActuatorDynamics, Dynamics, Specimen, Unevenness
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
 
-CREEP = {"hot": 70.0, "cool": 50.0, "duration": 20.0}
+CREEP = {"hot": 70.0, "cool": 50.0, "duration": 60.0}
 
 
 @pytest.fixture(scope="module")
