@@ -26,6 +26,7 @@ from bench.cli import (
     resume,
     run_list,
     runs,
+    twin,
     upkeep,
 )
 from bench.cli.console import error_console, fail
@@ -62,6 +63,7 @@ for group in (
     comparisons.app,
     records.app,
     journals.app,
+    twin.app,
 ):
     app.add_typer(group)
 reproduce_ = typer.Typer(

@@ -17,9 +17,10 @@ Schema, version 3
     installed package, and the checksum of its file), `parameters`, `changed` (those that differ from their defaults),
     `repeats` (the run that this one repeats), `slots` (device and signal by name), `seed`,
     `interlock_rate` (looks in a second beside the readings; null for none), `clock`, `epoch` (time of day at the
-    start), `devices` (identity by name), `calibration`, `operator`, `command`, `packages` (versions), `git` (commit
-    and whether it was clean), `host` (with the wall-clock time at the start), `controls` (the signal under control),
-    `plan` (as far as no reading decides), `rehearsal` (null if there was none), `dashboard`,
+    start), `devices` (identity by name), `limits` (set-points that each takes), `calibration`, `operator`, `command`,
+    `packages` (versions), `git` (commit and whether it was clean), `host` (with the wall-clock time at the start),
+    `controls` (the signal under control), `plan` (as far as no reading decides), `rehearsal` (null if there was
+    none), `dashboard`,
     `rig_given` (name or path of the rig), `laboratory_epoch` (of a served laboratory), `resumes` (what each process
     was that took the run up after its death), and at the end `status` (`completed`, `aborted`, `failed`), `reason`,
     `finished` (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is
