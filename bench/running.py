@@ -183,9 +183,12 @@ class RunAtHand:
 
         Raises AbortError if the run has to end, and what has tripped the station meanwhile.
         """
-        self.raise_if_aborted()
+        interrupts = self._interrupts
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         self.station.sleep_until(instant)
-        self.raise_if_aborted()
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         if (seconds := self.clock.suspension()) > 0:
             # The next reading finds what the watchdogs have done meanwhile.
             self.event(

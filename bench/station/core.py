@@ -44,6 +44,8 @@ class StationCore:
     ----------
     state : State
         How far it is.
+    over : bool
+        Whether it is in its safe state for good.
     cause : BenchError or None
         What tripped it.
     late : bool
@@ -64,16 +66,12 @@ class StationCore:
         self._asked = False
         self._seen: float | None = None
         self.state = State.IDLE
+        self.over = False
         self.cause: BenchError | None = None
         self.late = False
         self.holding = False
         self.pause = ""
         self._acts_at = math.inf
-
-    @property
-    def over(self) -> bool:
-        """Whether the station is in its safe state for good."""
-        return self.state in (State.TRIPPED, State.ENDED)
 
     def begin(self, now: float) -> None:
         """Begin to look at the interlocks, every interval from `now` on."""
@@ -193,12 +191,12 @@ class StationCore:
     def trip(self, cause: BenchError) -> None:
         """End the run in the safe state; the first cause counts."""
         if not self.over:
-            self.state, self.cause = State.TRIPPED, cause
+            self.state, self.over, self.cause = State.TRIPPED, True, cause
 
     def end(self) -> None:
         """End the run in the safe state, as the bench asks for it."""
         if not self.over:
-            self.state = State.ENDED
+            self.state, self.over = State.ENDED, True
 
     def _lease(self) -> float:
         # While a request is carried out the bench waits, and cannot be late.

@@ -192,6 +192,8 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._reads_blocks = False
         self._names = tuple(signal.name for signal in self.signals)
+        self._limits: dict[TECMode, Limits] = {}
+        """Those of the modes so far, as each set-point is compared with them."""
 
     @classmethod
     def _open_line(cls, name: str, settings: TECSettings, clock: Clock) -> TECLine:  # noqa: ARG003
@@ -219,9 +221,14 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     @property
     def limits(self) -> Limits:
         """The allowed set-points: the settings' `temperature_limits` in °C, or ± `current_limit` in A."""
-        if self._mode is TECMode.TEMPERATURE:
-            return Limits(*self._settings.temperature_limits, "°C")
-        return Limits(-self._settings.current_limit, self._settings.current_limit, "A")
+        limits = self._limits.get(self._mode)
+        if limits is None:
+            if self._mode is TECMode.TEMPERATURE:
+                limits = Limits(*self._settings.temperature_limits, "°C")
+            else:
+                limits = Limits(-self._settings.current_limit, self._settings.current_limit, "A")
+            self._limits[self._mode] = limits
+        return limits
 
     def set(self, value: float) -> Status:
         """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
