@@ -110,7 +110,7 @@ class RunAtHand:
         self.clock = station.clock
         self.period = station.description.file.telemetry.period
         self.names = tuple(signal.name for signal in journal.signals)
-        self._row = _row_of(self.names)
+        self._row = row_of(self.names)
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
@@ -309,7 +309,7 @@ def traced(trace: Trace) -> dict[str, float]:
     return dict(zip(_TRACE_AND_LATENESS, thoughts, strict=True))
 
 
-def _row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+def row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
     """Return what takes the values of some signals out of those of all, in their order."""
     if len(names) == 1:
         (name,) = names

@@ -30,6 +30,9 @@ class State(Enum):
     """In the safe state, as the bench asked for it."""
 
 
+_ARMED = State.ARMED
+
+
 class StationCore:
     """The state of a station.
 
@@ -114,7 +117,11 @@ class StationCore:
         """Return when there is something to do next: a look, or the end of the promise."""
         if self.over:
             return math.inf
-        return min(self._next_look, self._acts_at, self._lease())
+        # Plain comparisons: this is asked with each sample of a fast loop.
+        due = self._next_look if self._next_look < self._acts_at else self._acts_at
+        if self.state is _ARMED and not self._asked and self._lease_end < due:
+            due = self._lease_end
+        return due
 
     def look_due(self, now: float) -> bool:
         """Return whether the interlocks have to be looked at; the next look is an interval later then."""
