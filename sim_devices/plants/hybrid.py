@@ -75,6 +75,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
     def __init__(self, parameters: HybridParameters, rng: np.random.Generator) -> None:
         super().__init__(parameters, rng)
+        self._ambient = parameters.ambient_temperature
         self._numbers = np.zeros(sum(kernels.PARTS))
         (
             self._rise,
@@ -180,7 +181,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         rise: float = self._rise.item(node)
         if self._ahead:
             rise += self._pending / self._step * self._increment.item(node)
-        return self._parameters.ambient_temperature + rise
+        return self._ambient + rise
 
     def _bending(self) -> tuple[float, float]:
         parts: tuple[float, float] = kernels.bending(self._fraction, self._numbers)
