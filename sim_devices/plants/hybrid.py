@@ -19,6 +19,7 @@ the classic piezo cantilever this plant without `drive`.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +78,25 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         super().__init__(parameters, rng)
         self._ambient = parameters.ambient_temperature
         self._numbers = np.zeros(sum(kernels.PARTS))
+        self._divide()
+        share, shape, coefficients = self._constants
+        share[:] = _shares()
+        shape[:] = _shape(parameters)
+        self._fast_coefficients[:] = _fast_coefficients(parameters)
+        coefficients[:] = _coefficients(parameters)
+        self._nodes[:] = _node_table(parameters)
+        # Whether the change over the step under way is known, and the time since the voltage last changed.
+        self._ahead = False
+        self._elapsed = 0.0
+
+        deviation = parameters.ambient_sd * float(self._noise.standard_normal())
+        self._rise[:] = deviation
+        self._state[kernels.FLUCTUATION] = deviation
+        self._state[kernels.FACTORED] = math.nan
+        self._take_commands()
+
+    def _divide(self) -> None:
+        """Make the parts of the numbers, which are views."""
         (
             self._rise,
             self._increment,
@@ -90,21 +110,13 @@ class HybridCantilever(CooledPlant[HybridParameters]):
             nodes,
             _,
         ) = np.split(self._numbers, np.cumsum(kernels.PARTS)[:-1])
-        share[:] = _shares()
-        shape[:] = _shape(parameters)
-        self._fast_coefficients[:] = _fast_coefficients(parameters)
-        coefficients[:] = _coefficients(parameters)
         self._nodes = nodes.reshape(kernels.NODE_ROWS, kernels.NODES)
-        self._nodes[:] = _node_table(parameters)
-        # Whether the change over the step under way is known, and the time since the voltage last changed.
-        self._ahead = False
-        self._elapsed = 0.0
+        self._constants = share, shape, coefficients
 
-        deviation = parameters.ambient_sd * float(self._noise.standard_normal())
-        self._rise[:] = deviation
-        self._state[kernels.FLUCTUATION] = deviation
-        self._state[kernels.FACTORED] = math.nan
-        self._take_commands()
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of another; its parts are views of the own numbers."""
+        self.__dict__.update(state)
+        self._divide()
 
     def advance(self, dt: float) -> None:
         """Advance the plant in time; see `GridPlant.advance`."""
