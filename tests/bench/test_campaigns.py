@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from bench import registry
-from bench.campaign import Study, StudyResult
 from bench.campaigns.cluster import ClusterExecutor, check_address
 from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
 from bench.campaigns.expansion import expand
@@ -24,6 +23,7 @@ from bench.errors import ConfigurationError
 from bench.journal import Record
 from bench.locks import Holder, Locks
 from bench.runs import carry_out
+from bench.studies import Study, StudyResult
 from bench.workers import Workers
 
 PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
