@@ -97,7 +97,8 @@ def _print_runs(found: RunComparison) -> None:
     for name in ("run", "status", "reason", "steps", "seconds", "result"):
         values = getattr(first, name), getattr(second, name)
         if values != ("", ""):
-            table.add_row(name, *(Text("" if value is None else str(value)) for value in values))
+            texts = (f"{value:.1f} s" if name == "seconds" and value is not None else value for value in values)
+            table.add_row("duration" if name == "seconds" else name, *(Text("" if text is None else str(text)) for text in texts))
     console.print(table)
     if found.differences:
         table = Table("key", "first", "second", title="what differs", title_justify="left")
