@@ -307,7 +307,7 @@ class TestTasks:
     def test_nothing_is_done_in_a_dry_run(self, campaign, tmp_path, capsys):
         assert start(campaign(STAIRS), "--out", tmp_path / "out", "--dry-run") == 0
         said = capsys.readouterr().out
-        assert said.startswith("4 runs to do; 0.0 h of laboratory time, about 0 s on ")
+        assert said.startswith("4 runs to do; 0.0 h of laboratory time, less than a minute on ")
         assert said.count("climb/increment=") == 4
         assert not (tmp_path / "out").exists()
 
