@@ -113,7 +113,7 @@ class RunAtHand:
         self.clock = station.clock
         self.period = station.description.file.telemetry.period
         self.names = tuple(signal.name for signal in journal.signals)
-        self._row = _row_of(self.names)
+        self._row = row_of(self.names)
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
@@ -186,9 +186,12 @@ class RunAtHand:
 
         Raises AbortError if the run has to end, and what has tripped the station meanwhile.
         """
-        self.raise_if_aborted()
+        interrupts = self._interrupts
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         self.station.sleep_until(instant)
-        self.raise_if_aborted()
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         if (seconds := self.clock.suspension()) > 0:
             # The next reading finds what the watchdogs have done meanwhile.
             self.event(
@@ -309,7 +312,7 @@ def traced(trace: Trace) -> dict[str, float]:
     return dict(zip(_TRACE_AND_LATENESS, thoughts, strict=True))
 
 
-def _row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+def row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
     """Return what takes the values of some signals out of those of all, in their order."""
     if len(names) == 1:
         (name,) = names
