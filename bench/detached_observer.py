@@ -15,8 +15,8 @@ from bench.running import Observer
 _INTERVAL = 0.1
 """Wall-clock time between two notifications, s."""
 
-_MOST_EVENTS = 1000
-"""Events that wait for an observer that hangs; the journal has them all."""
+_MOST = 10_000
+"""Steps and events that wait for an observer that hangs; the journal has them all."""
 
 _END = 2.0
 """Longest wait for an observer at the end, s of wall-clock time."""
@@ -27,7 +27,7 @@ class _ObserverInContext(Observer, AbstractContextManager["_ObserverInContext"],
 
 
 class DetachedObserver:
-    """Passes on to another observer, ten times a second, the newest tick and step and all events.
+    """Passes on to another observer, ten times a second, all steps and events and the newest tick.
 
     Use it as a context manager; the thread enters and leaves the context of the observer. At the end what waits is
     passed on for 2 s at most. What the observer raises is raised at the next notification.
@@ -41,8 +41,7 @@ class DetachedObserver:
     def __init__(self, observer: _ObserverInContext) -> None:
         self._observer = observer
         self._tick: tuple[float, int, Sequence[float]] | None = None
-        self._step: StepRecord | None = None
-        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self._happened: deque[StepRecord | Event] = deque(maxlen=_MOST)
         self._failure: Exception | None = None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name=type(observer).__name__, daemon=True)
@@ -64,12 +63,12 @@ class DetachedObserver:
 
     def step(self, record: StepRecord) -> None:
         """Note a finished step."""
-        self._step = record
+        self._happened.append(record)
         self._raise_failure()
 
     def event(self, event: Event) -> None:
         """Note that something happened."""
-        self._events.append(event)
+        self._happened.append(event)
         self._raise_failure()
 
     def _raise_failure(self) -> None:
@@ -88,11 +87,13 @@ class DetachedObserver:
             self._failure = error
 
     def _pass_on(self) -> None:
-        while self._events:
-            self._observer.event(self._events.popleft())
+        # First of all, so that the steps before the tick are passed on before it.
         tick, self._tick = self._tick, None
+        while self._happened:
+            each = self._happened.popleft()
+            if isinstance(each, StepRecord):
+                self._observer.step(each)
+            else:
+                self._observer.event(each)
         if tick is not None:
             self._observer.telemetry(*tick)
-        step, self._step = self._step, None
-        if step is not None:
-            self._observer.step(step)

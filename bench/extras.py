@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
 from bench.errors import ConfigurationError
 
-Extra = Literal["dashboard", "report"]
+Extra = Literal["cluster", "dashboard", "report"]
 
 
 class MissingExtraError(ConfigurationError):
@@ -27,3 +28,13 @@ def needed_for(purpose: str, extra: Extra) -> Iterator[None]:
         raise MissingExtraError(
             f"{purpose} needs a library that is not installed ({error}): pip install 'actuator-bench[{extra}]'"
         ) from error
+
+
+def check_extra(purpose: str, module: str, extra: Extra) -> None:
+    """Check that a library of an extra is installed, without the time that importing it takes.
+
+    Raises MissingExtraError as `needed_for` does.
+    """
+    with needed_for(purpose, extra):
+        if importlib.util.find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named {module!r}")

@@ -209,6 +209,8 @@ class InterlockWatch:
 
     def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
+        # Those with something that may act or is not over: mostly none.
+        self._restless: list[_Course] = []
         self._latest = -math.inf
         self._tripped: Finding | None = None
         watched = [course.interlock for course in self._courses]
@@ -241,7 +243,9 @@ class InterlockWatch:
 
     def due_after(self, t: float) -> float:
         """Return the first such time after `t`, s; one before it waits for a signal that was not read last."""
-        return min((due for course in self._courses if (due := course.due()) > t), default=math.inf)
+        if not self._restless:
+            return math.inf
+        return min((due for course in self._restless if (due := course.due()) > t), default=math.inf)
 
     def look(
         self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None = None
@@ -276,6 +280,7 @@ class InterlockWatch:
         found: list[Finding] = []
         for course in self._courses:
             course.look(t, values, setpoints, found)
+        self._restless = [course for course in self._courses if course.restless]
         if found and self._tripped is None:
             self._tripped = next((finding for finding in found if finding.level is Level.SAFE), None)
         return tuple(found)
@@ -321,13 +326,16 @@ class _Criterion(ABC):
 
 
 class _Range(_Criterion):
+    def __init__(self, interlock: Interlock, units: Mapping[str, str], seconds: float) -> None:
+        super().__init__(interlock, units, seconds)
+        self._low, self._high = interlock.low, interlock.high
+
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
-        interlock = self._interlock
         if self.since is None:
-            if not interlock.low <= value <= interlock.high:
+            if not self._low <= value <= self._high:
                 self.since = t
             return
-        low, high = interlock.resume
+        low, high = self._interlock.resume
         if low <= value <= high:
             self.since = None
 
@@ -491,7 +499,10 @@ class _Course:
 
     def __init__(self, interlock: Interlock, units: Mapping[str, str]) -> None:
         self.interlock = interlock
+        self.restless = False
+        """Whether a criterion is violated, or has acted and is not over."""
         self._units = units
+        self._signal = interlock.signal
         self._settling = _Settling(interlock) if interlock.settle else None
         self._follows = f"{interlock.setpoint}{SETPOINT}" if interlock.stuck is not None else ""
         self._criteria = self._make_criteria()
@@ -541,9 +552,9 @@ class _Course:
         if self._settling is not None:
             self._settling.look(t, _setpoints(values) if setpoints is None else setpoints)
         setpoint = _reading(self._follows, values, setpoints) if self._follows else None
-        value = values.get(interlock.signal)
+        value = values.get(self._signal)
         if value is None:
-            value = _reading(interlock.signal, values, setpoints)
+            value = _reading(self._signal, values, setpoints)
         if interlock.minus and value is not None:
             other = _reading(interlock.minus, values, setpoints)
             value = None if other is None else value - other
@@ -554,9 +565,16 @@ class _Course:
         else:
             for criterion in self._criteria:
                 criterion.look(t, value, setpoint)
-        for i, criterion in enumerate(self._criteria):
-            if criterion.since is not None or self.active[i] is not None:
-                self._act(t, value, criterion, i, found)
+                if criterion.since is not None:
+                    self.restless = True
+        if self.restless:
+            for i, criterion in enumerate(self._criteria):
+                if criterion.since is not None or self.active[i] is not None:
+                    self._act(t, value, criterion, i, found)
+            self.restless = any(
+                criterion.since is not None or finding is not None
+                for criterion, finding in zip(self._criteria, self.active, strict=True)
+            )
 
     def _is_off(self, values: Mapping[str, float], setpoints: Mapping[str, float] | None) -> bool:
         """Return whether a set-point that is compared is none, as the output is off."""

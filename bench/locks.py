@@ -136,7 +136,14 @@ class Locks:
             what = f"{identity.maker} {identity.model}, serial number {number}"
             self._take({f"instrument {what}".lower(): what})
 
-    def _take(self, wanted: dict[str, str]) -> None:
+    def take_folder(self, folder: Path) -> None:
+        """Take a folder in which one process at a time works.
+
+        Raises ConfigurationError if another process holds it.
+        """
+        self._take({f"folder {folder.resolve()}": "it"}, f"folder {folder}")
+
+    def _take(self, wanted: dict[str, str], what: str = "") -> None:
         with ExitStack() as taken:
             # Two benches that ask in the same order cannot refuse each other.
             for name in sorted(wanted.keys() - self._taken):
@@ -146,9 +153,9 @@ class Locks:
                     WallClock().sleep(_WRITING)
                     file = _take_file(_path(name))
                 if file is None:
+                    what = what or f"rig {self._holder.rig}"
                     raise ConfigurationError(
-                        f"rig {self._holder.rig} is in use: {wanted[name]} is held by {_holder(name)}; wait for it, "
-                        "or end it"
+                        f"{what} is in use: {wanted[name]} is held by {_holder(name)}; wait for it, or end it"
                     )
                 taken.callback(_free, _path(name), file)
                 _write(file, self._holder)

@@ -153,6 +153,13 @@ def import_beside(file: Path) -> None:
         sys.path.append(str(folder))
 
 
+def forget_beside(folder: Path) -> None:
+    """Take back `import_beside` for all files below a folder."""
+    gone = {each for each in _beside if each.is_relative_to(folder.resolve())}
+    _beside.difference_update(gone)
+    sys.path[:] = [entry for entry in sys.path if not entry or Path(entry) not in gone]
+
+
 def modules_beside() -> dict[str, Path]:
     """Return the imported modules in the folders of rig and protocol files that were read: each by its path there."""
     folders = tuple(f"{folder}{os.sep}" for folder in _beside)

@@ -22,14 +22,11 @@ class Expectation:
         Laboratory time of the whole run, s.
     at_most : float
         Longest laboratory time of the whole run, s; infinite where no bound is known.
-    prompted : tuple of int
-        Numbers of the steps in which the run waits for the operator, in order.
     """
 
     marks: tuple[tuple[int, float], ...]
     seconds: float
     at_most: float = math.inf
-    prompted: tuple[int, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -90,9 +87,7 @@ class RemainingTime:
 
     def step(self, steps: int, t: float) -> None:
         """Note that so many steps are finished, the last one at laboratory time `t` (s from the start)."""
-        if steps <= self._steps:
-            return
-        if self._prompt is not None and steps > self._prompt[0]:
+        if self._prompt is not None:
             self._waited += self._waiting(t)
             self._prompt = None
         self._steps, self._since = steps, t
@@ -111,8 +106,7 @@ class RemainingTime:
 
     def prompt(self, t: float) -> None:
         """Note that the run waits for the operator from laboratory time `t` on, s."""
-        step = next((each for each in self._expectation.prompted if each >= self._steps), self._steps)
-        self._prompt = step, t
+        self._prompt = self._steps, t
 
     def at(self, t: float, wall: float) -> Remaining:
         """Return what is left at laboratory time `t` and after `wall` seconds of the wall clock from the start."""

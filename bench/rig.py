@@ -48,6 +48,8 @@ class Rig:
         The clock of the run.
     seed : int
         Seed of everything random in an emulated laboratory.
+    when_built : callable, optional
+        Called between the making of an emulated laboratory and the connecting of the first device.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class Rig:
         If a device does not answer; those connected before are closed again.
     """
 
-    def __init__(self, file: RigFile, clock: Clock, seed: int) -> None:
+    def __init__(self, file: RigFile, clock: Clock, seed: int, when_built: Callable[[], None] | None = None) -> None:
         self.file = file
         self.clock = clock
         self.devices: dict[str, Device] = {}
@@ -66,6 +68,8 @@ class Rig:
                 self.laboratory = file.laboratory(file.laboratory_settings, clock, seed)
                 ports = self.laboratory.open()
                 stack.callback(self.laboratory.close)
+            if when_built is not None:
+                when_built()
             for entry in file.devices:
                 settings = entry.wired(ports, file.path)
                 device = entry.driver.connect(entry.name, settings, clock)
@@ -73,6 +77,8 @@ class Rig:
                 self.devices[entry.name] = device
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
+            self._setpoint_names = {name: f"{name}_setpoint" for name in self.actuators}
+            self._read_before: dict[tuple[Look, frozenset[str]], list[tuple[str, Device, bool]]] = {}
             self.description = RigDescription(file, self._describe_devices(), self.signals)
             self._check_references()
             self._stack = stack.pop_all()
@@ -137,15 +143,23 @@ class Rig:
 
         Devices on different lines may be asked at the same time.
         """
+        key = look, frozenset(wanted)
+        read = self._read_before.get(key)
+        if read is None:
+            # The same few looks are taken again and again.
+            read = self._read_before[key] = self._devices_to_read(*key)
+        return {name: device.measure if best else device.glance for name, device, best in read}
+
+    def _devices_to_read(self, look: Look, wanted: Collection[str]) -> list[tuple[str, Device, bool]]:
+        """Return which devices a look reads, and whether it takes the best reading."""
         sources = self.sources(wanted)
-        readers = {}
+        read = []
         for name, device in self.devices.items():
             is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
-            if look is Look.MEASURE or (look is Look.SAMPLE and is_wanted):
-                readers[name] = device.measure
-            elif look is not Look.PART or is_wanted:
-                readers[name] = device.glance
-        return readers
+            best = look is Look.MEASURE or (look is Look.SAMPLE and is_wanted)
+            if best or is_wanted or look is not Look.PART:
+                read.append((name, device, best))
+        return read
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
         """Return a function that takes a quick reading of the devices that some signals come from, and of no other.
@@ -202,13 +216,14 @@ class Rig:
         Set-points and readings are those of these devices, derived signals those whose sources are among them.
         """
         values: dict[str, float] = {}
+        setpoint_names = self._setpoint_names
         for name, reading in readings.items():
             values.update(reading)
-            device = self.devices[name]
-            if isinstance(device, Actuator):
-                values[f"{name}_setpoint"] = device.setpoint
+            if name in setpoint_names:
+                values[setpoint_names[name]] = self.actuators[name].setpoint
+        is_whole = len(readings) == len(self.devices)
         for name, derived in self.derived.items():
-            if len(readings) == len(self.devices) or all(source in values for source in derived.sources):
+            if is_whole or all(source in values for source in derived.sources):
                 values[name] = derived.compute(values)
         return values
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Protocol
 
 from bench.control.tracking import Trace
@@ -21,7 +22,8 @@ RESUME = "resume"
 ABORT = "abort"
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
-NOT_AT_WORK = dict.fromkeys((*TRACE_NAMES, LATENESS.name), math.nan)
+_TRACE_AND_LATENESS = (*TRACE_NAMES, LATENESS.name)
+NOT_AT_WORK = dict.fromkeys(_TRACE_AND_LATENESS, math.nan)
 
 _GRACE = 2.0
 """Wall-clock time beyond the next tick by which the station expects to hear from a hold, s."""
@@ -108,6 +110,7 @@ class RunAtHand:
         self.clock = station.clock
         self.period = station.description.file.telemetry.period
         self.names = tuple(signal.name for signal in journal.signals)
+        self._row = _row_of(self.names)
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
@@ -125,7 +128,9 @@ class RunAtHand:
 
     def look(self, look: Look = Look.GLANCE, wanted: Collection[str] = ()) -> dict[str, float]:
         """Read the signals; return the values together with what a controller thinks."""
-        return self.station.look(look, wanted) | self.trace
+        values = self.station.look(look, wanted)
+        values.update(self.trace)
+        return values
 
     def tick(self) -> dict[str, float]:
         """Take a quick reading of all signals, record it, and have it judged by the interlocks."""
@@ -135,10 +140,10 @@ class RunAtHand:
 
     def record_tick(self, t: float, values: Mapping[str, float]) -> None:
         """Record quick readings, and have them judged by the interlocks."""
-        row = tuple(values[name] for name in self.names)
-        passed = t - self.zero
+        row, passed = self._row(values), t - self.zero
         self._journal.telemetry(passed, self.steps, row)
-        self._tell(lambda observer: observer.telemetry(passed, self.steps, row))
+        if self._observers:
+            self._tell(lambda observer: observer.telemetry(passed, self.steps, row))
         self.judge(t, values)
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
@@ -197,8 +202,9 @@ class RunAtHand:
         setpoints: Mapping[str, float],
         values: Mapping[str, float],
         settled: Settled,
+        seen: Sequence[float] = (),
     ) -> Reading:
-        """Write a step down, then notify the observers."""
+        """Write a step down, then notify the observers; a controller was given the ticks of the times `seen`, s."""
         record = StepRecord(
             step=self.steps,
             started=started - self.zero,
@@ -207,7 +213,8 @@ class RunAtHand:
             label=label,
             settled=settled,
             setpoints=setpoints,
-            values=tuple(values[name] for name in self.names),
+            values=self._row(values),
+            seen=tuple(seen),
         )
         self._journal.step(record)
         self.steps += 1
@@ -295,5 +302,13 @@ class RunAtHand:
 
 def traced(trace: Trace) -> dict[str, float]:
     """Return what a controller thinks, for the record."""
-    thoughts = (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty)
-    return dict(zip(TRACE_NAMES, thoughts, strict=True)) | {LATENESS.name: math.nan}
+    thoughts = (trace.reference, trace.predicted, trace.disturbance, trace.uncertainty, math.nan)
+    return dict(zip(_TRACE_AND_LATENESS, thoughts, strict=True))
+
+
+def _row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """Return what takes the values of some signals out of those of all, in their order."""
+    if len(names) == 1:
+        (name,) = names
+        return lambda values: (values[name],)
+    return itemgetter(*names) if names else lambda _: ()

@@ -21,6 +21,7 @@ from bench.journal import Event, StepRecord
 from bench.remaining_time import Expectation, RemainingTime
 from bench.running import ABORT, RESUME
 from bench.units import format_duration
+from bench.workers import report
 
 _REFRESH = 0.1
 """Wall-clock seconds between two redraws of the readings."""
@@ -32,7 +33,8 @@ _UNSEEN = 2.0
 class ProgressDisplay:
     """A bar with steps, laboratory time, what is left, and the current readings; an `Observer` of the engine.
 
-    Times are laboratory times from the start of the run; the end is a time of day.
+    Times are laboratory times from the start of the run; the end is a time of day. A worker process has the bar drawn
+    by its bench.
 
     Parameters
     ----------
@@ -129,7 +131,6 @@ class ProgressDisplay:
         self._since_redraw = Stopwatch()
         times, completed = f"t {format_duration(t)}", 0.0
         if self._remaining is not None:
-            self._remaining.step(steps, t)
             left = self._remaining.at(t, self._since_start.seconds())
             completed = left.share
             times += f"  left {format_duration(left.laboratory)}, ends {_time_of_day(left.wall)}"
@@ -143,6 +144,7 @@ class ProgressDisplay:
             times=times,
             readings="  ".join(readings),
         )
+        report(steps, self._steps or None, "  ".join([times, *readings]))
 
 
 class RehearsalDisplay:

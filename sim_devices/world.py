@@ -55,6 +55,7 @@ class World:
         self._now = clock.now
         self._timed: list[tuple[Callable[[], float], Timed]] = []
         self._deadlines: list[Callable[[], float]] = []
+        self._late: list[Callable[[], None]] = []
         self._advancing = False
 
     @property
@@ -62,17 +63,29 @@ class World:
         """Laboratory time (s) at which plant and instruments stand."""
         return self._time
 
-    def add(self, timed: Timed) -> None:
-        """Keep the deadlines of an instrument."""
+    def add(self, timed: Timed, *, catch_up: Callable[[], None] | None = None) -> None:
+        """Keep the deadlines of an instrument; `catch_up` does what it has put off, before anybody interferes."""
         self._timed.append((timed.deadline, timed))
         self._deadlines.append(timed.deadline)
+        if catch_up is not None:
+            self._late.append(catch_up)
 
     @contextmanager
     def at_present(self) -> Iterator[None]:
         """Hold the lock, with plant and instruments at the clock's present time."""
         with self.lock:
-            self.advance()
+            self.catch_up()
             yield
+
+    def catch_up(self) -> None:
+        """Bring the plant and everything to the clock's present time, also what instruments have put off.
+
+        A request needs `advance` only; this is for what changes plant, sensors or instruments from without.
+        """
+        with self.lock:
+            self.advance_locked()
+            for catch_up in self._late:
+                catch_up()
 
     def advance(self) -> None:
         """Bring the plant and everything due to the clock's present time."""

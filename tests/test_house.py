@@ -35,10 +35,12 @@ OPENS_LINES = re.compile(
     r"import\b.*\bRig\b|import (serial|can|pymodbus|pyvisa)\b|from (serial|can|pymodbus|pyvisa)\b"
 )
 WHERE_LINES_ARE_OPENED = {
+    "bench/campaigns/known_rig.py",
     "bench/contracts/on_a_rig.py",
     "bench/face.py",
     "bench/guardian/__main__.py",
     "bench/guardian/process.py",
+    "bench/rehearsal.py",
     "bench/runs.py",
     "bench/station/local.py",
 }

@@ -29,9 +29,6 @@ LIBRARIES = (
     "scipy.optimize",
     "scipy.sparse",
     "sqlite3",
-    "bench.campaign",
-    "bench.controllers",
-    "bench.rehearsal",
     "bench.results.report",
     "bench.runs",
 )

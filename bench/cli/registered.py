@@ -71,11 +71,18 @@ class Studies(RegisteredCommands):
             live: Annotated[
                 bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
             ] = False,
+            workers: Annotated[
+                int | None,
+                typer.Option(
+                    min=1, help="Runs that go on beside each other; as many as there are cores if not given."
+                ),
+            ] = None,
             json_file: JsonOption = None,
         ) -> None:
-            from bench.campaign import reproduce
+            from bench.studies import reproduce
 
-            write_json(json_file, reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console))
+            result = reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console, workers=workers)
+            write_json(json_file, result)
 
         carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"
         return carry_out_study

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from bench.cli.console import JsonOption, console, parse_assignments, print_rows, show_compilation, write_json
 
@@ -89,7 +89,9 @@ def _print(rehearsal: Rehearsal) -> None:
     ]
     console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}", highlight=False)
     print_rows("", rows)
-    table = Table("signal", "lowest", "highest", "unit", "allowed", "margin", box=None, padding=(0, 1))
+    table = Table(
+        Column("signal", no_wrap=True), "lowest", "highest", "unit", "allowed", "margin", box=None, padding=(0, 1)
+    )
     for name, each in rehearsal.extremes.items():
         table.add_row(escape(name), *_cells(each))
     console.print(table)

@@ -12,8 +12,8 @@ from pathlib import Path
 from bench.clock import Stopwatch
 from bench.errors import RecordError
 from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import Mirror, elsewhere
-from bench.journal.rows import FILE_NAME, Entry, entry
+from bench.journal.mirror import Mirror, elsewhere, second_files
+from bench.journal.rows import FILE_NAME, Entry, split
 from bench.journal.store import Store
 
 RESERVE_NAME = "journal.reserve"
@@ -112,6 +112,7 @@ class Keeper:
         try:
             self.store.wait_for_others(_LAST_WAIT)
             self.make_room()
+            self.store.wait_for_others(0.0)
             if self._waiting:
                 return self._why
             self.store.fold_in()
@@ -130,8 +131,9 @@ class Keeper:
         for mirror in (self._mirror, self._elsewhere, *self.spare):
             if mirror is not None:
                 mirror.close()
-                if is_whole and not self._waiting:
-                    _remove(mirror.path)
+        if is_whole and not self._waiting:
+            for path in second_files(self.store.path):
+                _remove(path)
         _remove(self._reserve)
 
     @property
@@ -171,7 +173,9 @@ class Keeper:
             return False
         if self._why:
             self._why = ""
-            self.notices.append(f"the journal can be written again; {len(entries)} rows were waiting")
+            self.notices.append(
+                f"the journal can be written again; {sum(len(each.rows) for each in self._waiting)} rows were waiting"
+            )
         self._waiting = []
         return True
 
@@ -214,12 +218,11 @@ class Keeper:
     def _rescue(self, loss: str) -> None:
         """Write everything anew elsewhere, from the files that are still open, and go on there; raise RecordError."""
         former, store = self.store.path, self.store
-        rows = {(each.table, each.row[0]): each for each in ([] if self._mirror is None else self._mirror.entries())}
-        rows |= {(each.table, each.row[0]): each for each in self._waiting}
+        beside = [] if self._mirror is None else self._mirror.entries()
+        rows = {(each.table, each.row[0]): each for each in (*beside, *split(self._waiting))}
         if not self._is_whole:
             with suppress(sqlite3.Error):
-                found = [entry(table, row if table == "files" else row[:-1]) for table, row in store.rows()]
-                rows = {(each.table, each.row[0]): each for each in found} | rows
+                rows = {(each.table, each.row[0]): each for each in store.entries()} | rows
         message = f"{former} was {loss} while the run went on; "
         try:
             folder = Path(tempfile.mkdtemp(prefix=f"{former.parent.name}-rescued-"))

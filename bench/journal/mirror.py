@@ -3,8 +3,8 @@
 It is written before the journal. Where the journal cannot be written for a while, as another program has it locked or
 the disk is full, a row is durable as soon as this file is; where the journal is damaged, the rows come from here.
 
-An entry is a mark, a head (table, quantity of numbers, length and CRC-32 of the rest), and the row's numbers
-and texts as in `bench.journal.rows.Entry`. What is damaged or cut off is left out when it is read.
+An entry is a mark, a head (table, quantity of rows and of numbers in each, length and CRC-32 of the rest), and the
+rows' numbers and texts as in `bench.journal.rows.Entry`. What is damaged or cut off is left out when it is read.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from bench.journal.rows import TABLES, Entry, unpacked
+from bench.journal.rows import TABLES, TEXTS, Entry, unpacked
 
 NAME = "journal.mirror"
 _MARK = b"\xb5row"
-_HEAD = struct.Struct("<BHII")
+_HEAD = struct.Struct("<BIHII")
 _sync = getattr(os, "fdatasync", os.fsync)
 
 
@@ -49,18 +49,18 @@ class Mirror:
         self._file = os.fdopen(
             os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b", buffering=0
         )
-        self._end = os.fstat(self._file.fileno()).st_size
+        self._end = self._file.seek(0, os.SEEK_END)
 
     def append(self, entries: Iterable[Entry]) -> None:
         """Append rows, all or none; they are durable after `sync` only."""
         data = b"".join(map(_encoded, entries))
         try:
-            self._file.seek(self._end)
             if self._file.write(data) != len(data):
                 raise OSError(f"{self.path} takes no more")
         except OSError:
             # Half of an entry would only be in the way.
             self._file.truncate(self._end)
+            self._file.seek(self._end)
             raise
         self._end += len(data)
 
@@ -71,7 +71,9 @@ class Mirror:
     def entries(self) -> list[Entry]:
         """Return the rows, also of a file that has been removed meanwhile."""
         self._file.seek(0)
-        return list(_decoded(self._file.read()))
+        content = self._file.read()
+        self._file.seek(self._end)
+        return list(_decoded(content))
 
     def close(self) -> None:
         """Close the file."""
@@ -92,9 +94,9 @@ def read_mirror(path: Path) -> list[Entry]:
 
 
 def _encoded(entry: Entry) -> bytes:
-    numbers = sum(not isinstance(value, str | bytes) for value in entry.row)
-    head = _HEAD.pack(TABLES.index(entry.table), numbers, len(entry.payload), zlib.crc32(entry.payload))
-    return b"".join((_MARK, head, entry.payload))
+    table, payload = TABLES.index(entry.table), entry.payload
+    numbers = len(entry.row) - TEXTS[entry.table]
+    return b"".join((_MARK, _HEAD.pack(table, len(entry.rows), numbers, len(payload), zlib.crc32(payload)), payload))
 
 
 def _decoded(data: bytes) -> Iterator[Entry]:
@@ -104,11 +106,14 @@ def _decoded(data: bytes) -> Iterator[Entry]:
         begin = start + _HEAD.size
         if begin > len(data):
             return
-        table, numbers, length, crc = _HEAD.unpack_from(data, start)
+        table, count, numbers, length, crc = _HEAD.unpack_from(data, start)
         payload = data[begin : begin + length]
         if len(payload) < length or zlib.crc32(payload) != crc or table >= len(TABLES):
             continue
-        row = unpacked(TABLES[table], numbers, payload)
-        if row is not None:
-            yield Entry(TABLES[table], row, payload)
-            start = begin + length
+        size = length // count if count else 0
+        parts = [payload[size * i : size * (i + 1)] for i in range(count)]
+        rows = [unpacked(TABLES[table], numbers, part) for part in parts]
+        for row, part in zip(rows, parts, strict=True):
+            if row is not None:
+                yield Entry(TABLES[table], (row,), part)
+        start = begin + length

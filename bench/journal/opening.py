@@ -35,24 +35,31 @@ class OpenedJournal:
     def __init__(self, path: Path) -> None:
         self.remark = ""
         self._copy: tempfile.TemporaryDirectory[str] | None = None
-        # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
-        options = "mode=ro"
         try:
-            if not os.access(path.parent, os.W_OK):
-                companion = path.with_name(path.name + "-wal")
-                if companion.is_file() and companion.stat().st_size:
-                    self._copy = tempfile.TemporaryDirectory(prefix="bench-journal-")
-                    for each in (path, companion):
-                        shutil.copyfile(each, Path(self._copy.name) / each.name)
-                    copy = Path(self._copy.name) / path.name
-                    self.remark = f"{path.parent} cannot be written: the journal is read from a copy, {copy}"
-                    path = copy
-                else:
-                    options += "&immutable=1"
-            self.db = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True, isolation_level=None)
+            if os.access(path.parent, os.W_OK):
+                try:
+                    # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
+                    self.db = _connected(path, "mode=ro")
+                except sqlite3.OperationalError as error:
+                    if "readonly" not in str(error):
+                        raise
+                    # Its process died while it was closed: SQLite has something to undo first.
+                    self.db = self._copied(path, "was not closed")
+            elif any(companion.stat().st_size for companion in _companions(path)):
+                self.db = self._copied(path, "cannot be changed and was not closed")
+            else:
+                self.db = _connected(path, "mode=ro&immutable=1")
         except (sqlite3.DatabaseError, OSError) as error:
             self._remove()
-            raise DataError(f"{path} cannot be read: {error}") from error
+            raise DataError(f"{path} is not a readable journal: {error}") from error
+
+    def _copied(self, path: Path, why: str) -> sqlite3.Connection:
+        self._copy = tempfile.TemporaryDirectory(prefix="bench-journal-")
+        copy = Path(self._copy.name) / path.name
+        for each in (path, *_companions(path)):
+            shutil.copyfile(each, copy.with_name(each.name))
+        self.remark = f"{path} {why}: it is read from a copy, {copy}"
+        return _connected(copy, "mode=rw")
 
     def close(self) -> None:
         """Close the file."""
@@ -62,3 +69,19 @@ class OpenedJournal:
     def _remove(self) -> None:
         if self._copy is not None:
             self._copy.cleanup()
+
+
+def _connected(path: Path, options: str) -> sqlite3.Connection:
+    db = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True, isolation_level=None)
+    try:
+        db.execute("SELECT count(*) FROM sqlite_master").fetchall()
+    except sqlite3.DatabaseError:
+        db.close()
+        raise
+    return db
+
+
+def _companions(path: Path) -> list[Path]:
+    """Return the files of what is not yet in the journal, or has to be undone in it."""
+    companions = (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal"))
+    return [companion for companion in companions if companion.is_file()]

@@ -133,13 +133,14 @@ def _state(
     lacking = {key for key in bad if key not in good} | (set(whole) - set(good))
     missing = {key for key in bad if key not in whole}
     if table in FIRST:
-        first = FIRST[table]
-        numbers = [*whole, *(key for key in bad if isinstance(key, int)), first - 1]
-        last = int(max(numbers)) if count is None else count + first - 1
-        gone = set(range(first, last + 1)) - set(whole)
+        start = FIRST[table]
+        numbers = [*whole, *(key for key in bad if isinstance(key, int)), start - 1]
+        last = int(max(numbers)) if count is None else count + start - 1
+        gone = set(range(start, last + 1)) - set(whole)
         missing |= gone
         lacking |= gone
-    first_bad = str(min(lacking, key=lambda key: (isinstance(key, str), key))) if lacking else ""
+    first = min(lacking, key=lambda key: (isinstance(key, str), key)) if lacking else ""
+    first_bad = first if isinstance(first, str) else str(int(first))
     return TableState(len(good), added, len(missing), first_bad)
 
 
@@ -149,7 +150,10 @@ def _salvage(journal: Path) -> tuple[dict[str, dict[Any, Entry]], dict[str, list
     bad: dict[str, list[Any]] = {table: [] for table in TABLES}
     if not journal.is_file():
         return rows, bad, "it is not there"
-    opened = OpenedJournal(journal)
+    try:
+        opened = OpenedJournal(journal)
+    except DataError as error:
+        return rows, bad, str(error.__cause__ or error)
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
     try:
@@ -207,7 +211,7 @@ def _checked(table: str, columns: tuple[Any, ...]) -> Entry | None:
         kept = entry(table, columns[:-1])
     except (ValueError, TypeError):
         return None
-    return kept if kept.columns() == columns else None
+    return kept if kept.columns() == [columns] else None
 
 
 def _write(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import math
+import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,14 +21,27 @@ SCHEMA = 3
 READABLE = (1, 2, SCHEMA)
 FILE_NAME = "journal.sqlite"
 
-_OWN_COLUMNS = ("step", "started", "finished", "phase", "label", "settled", "setpoints", "tick", "t", "checksum")
+_OWN_COLUMNS = (
+    "step",
+    "started",
+    "finished",
+    "phase",
+    "label",
+    "settled",
+    "setpoints",
+    "seen",
+    "tick",
+    "t",
+    "checksum",
+)
 
 _TABLES = (
     "meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL) WITHOUT ROWID",
     "signals (position INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL, unit TEXT NOT NULL, "
     "description TEXT NOT NULL, precision INTEGER NOT NULL, checksum INTEGER NOT NULL)",
     "steps (step INTEGER PRIMARY KEY, started REAL NOT NULL, finished REAL NOT NULL, phase TEXT NOT NULL, "
-    "label TEXT NOT NULL, settled TEXT NOT NULL, setpoints TEXT NOT NULL{columns}, checksum INTEGER NOT NULL)",
+    "label TEXT NOT NULL, settled TEXT NOT NULL, setpoints TEXT NOT NULL{columns}, seen TEXT NOT NULL, "
+    "checksum INTEGER NOT NULL)",
     "telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, step INTEGER NOT NULL{columns}, "
     "checksum INTEGER NOT NULL)",
     "events (event INTEGER PRIMARY KEY, t REAL NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL, "
@@ -46,6 +60,12 @@ _PATTERNS = {
     "files": "ttt",
 }
 """The kinds of a row's columns, numbers or texts; one number a signal may follow."""
+
+TEXTS = {table: pattern.count("t") for table, pattern in _PATTERNS.items()}
+"""Quantity of texts in a row."""
+
+_FEW_ROWS = 3
+"""Rows for which numpy takes longer than it saves."""
 
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
@@ -69,6 +89,8 @@ class StepRecord:
         What was sent, by device.
     values : tuple of float
         The reading, in the order of the journal's signals.
+    seen : tuple of float
+        Times of the ticks that a controller was given, s; empty where none was at work reading by reading.
     """
 
     step: int
@@ -79,6 +101,7 @@ class StepRecord:
     settled: Settled
     setpoints: Mapping[str, float]
     values: tuple[float, ...]
+    seen: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,8 +115,8 @@ class Event:
     level : str
         `INFO`, `WARN` or `ERROR`.
     kind : str
-        `phase`, `note`, `pause`, `resume`, `observer`, `suspended`, `interlock`, `error`, `safe-state`, `clock`,
-        `end`.
+        `phase`, `note`, `pause`, `resume`, `resumed` (by another process), `observer`, `suspended`, `interlock`,
+        `error`, `safe-state`, `clock`, `end`.
     text : str
         One sentence.
     """
@@ -146,26 +169,36 @@ def canonical(numbers: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 class Entry(NamedTuple):
-    """A row that is to be kept.
+    """Rows that are to be kept: one, or several of the telemetry.
 
     Attributes
     ----------
     table : str
-        Its table.
-    row : tuple
-        Its columns without the checksum.
+        Their table.
+    rows : sequence of tuple
+        Their columns without the checksum.
     payload : bytes
-        Its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without a sign of
-        zero), then its texts in their order (UTF-8, each followed by a zero byte). Its CRC-32 is the row's checksum.
+        Row by row: its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without
+        a sign of zero), then its texts in their order (UTF-8, each followed by a zero byte). Their CRC-32 is the
+        row's checksum.
     """
 
     table: str
-    row: tuple[Any, ...]
+    rows: Sequence[tuple[Any, ...]]
     payload: bytes
 
-    def columns(self) -> tuple[Any, ...]:
-        """Return the row as it stands in its table."""
-        return self.row if self.table == "files" else (*self.row, zlib.crc32(self.payload))
+    @property
+    def row(self) -> tuple[Any, ...]:
+        """The first row."""
+        return self.rows[0]
+
+    def columns(self) -> Sequence[tuple[Any, ...]]:
+        """Return the rows as they stand in their table."""
+        if self.table == "files":
+            return self.rows
+        content = memoryview(self.payload)
+        size = len(content) // len(self.rows)
+        return [(*row, zlib.crc32(content[size * i : size * (i + 1)])) for i, row in enumerate(self.rows)]
 
 
 def entry(table: str, row: Sequence[Any]) -> Entry:
@@ -173,20 +206,38 @@ def entry(table: str, row: Sequence[Any]) -> Entry:
 
     Raises ValueError or TypeError if one of its values is neither a number nor a text, nor the content of a file.
     """
-    numbers = [math.nan if value is None else value for value in row if not isinstance(value, str | bytes)]
-    texts = [
-        base64.b64encode(value) if isinstance(value, bytes) else value.encode()
-        for value in row
-        if isinstance(value, str | bytes)
-    ]
-    return Entry(table, tuple(row), b"".join((canonical(numbers).tobytes(), *(text + b"\0" for text in texts))))
+    numbers, texts = [], []
+    for value in row:
+        if isinstance(value, str):
+            texts.append(value.encode())
+        elif isinstance(value, bytes):
+            texts.append(base64.b64encode(value))
+        else:
+            numbers.append(math.nan if value is None else value)
+    return Entry(table, (tuple(row),), b"".join((_packed(numbers), *(text + b"\0" for text in texts))))
 
 
-def ticks(rows: Sequence[tuple[float, ...]]) -> list[Entry]:
-    """Return rows of numbers, all of the telemetry, as they are kept."""
-    content = canonical(rows).tobytes()
-    size = len(content) // len(rows)
-    return [Entry("telemetry", row, content[size * i : size * (i + 1)]) for i, row in enumerate(rows)]
+def ticks(rows: Sequence[tuple[float, ...]]) -> Entry:
+    """Return rows of the telemetry as they are kept."""
+    payload = b"".join(map(_packed, rows)) if len(rows) <= _FEW_ROWS else canonical(rows).tobytes()
+    return Entry("telemetry", rows, payload)
+
+
+def split(entries: Iterable[Entry]) -> Iterator[Entry]:
+    """Yield an entry a row."""
+    for several in entries:
+        size = len(several.payload) // len(several.rows)
+        for i, row in enumerate(several.rows):
+            yield Entry(several.table, (row,), several.payload[size * i : size * (i + 1)])
+
+
+def _packed(numbers: Sequence[float]) -> bytes:
+    """Return numbers as `canonical` does, faster for one row."""
+    numbers = [number + 0.0 for number in numbers]
+    # With infinities the sum is nan as well.
+    if (total := sum(numbers)) != total:
+        numbers = [number if number == number else math.nan for number in numbers]
+    return struct.pack(f"<{len(numbers)}d", *numbers)
 
 
 def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
@@ -202,7 +253,7 @@ def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
         texts[2] = base64.b64decode(texts[2])
     pattern = _PATTERNS[table]
     values = iter(numbers), iter(texts)
-    if pattern.count("t") != len(texts) or pattern.count("n") > count:
+    if TEXTS[table] != len(texts) or pattern.count("n") > count:
         return None
     row = [next(values[kind == "t"]) for kind in pattern]
     return *row, *values[0]

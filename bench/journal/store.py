@@ -5,10 +5,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from itertools import groupby
 from pathlib import Path
 
-from bench.journal.rows import Entry, table_definitions
+from bench.journal.rows import TABLES, Entry, entry, table_definitions
 
 
 class Store:
@@ -18,19 +17,24 @@ class Store:
     ----------
     path : Path
         The file; it is created if there is none.
+    wait : float
+        Wall-clock time for which it waits for other programs until `wait_for_others` says otherwise, s.
+    flushed : bool
+        Whether each commit waits for the disk.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, wait: float = 0.0, *, flushed: bool = True) -> None:
         self.path = path
-        self._connect()
+        self._synchronous = "FULL" if flushed else "NORMAL"
+        self._connect(wait)
         made = path.stat()
         self._file = made.st_dev, made.st_ino
 
-    def _connect(self) -> None:
+    def _connect(self, wait: float = 0.0) -> None:
         # One thread at a time, see `Keeper`.
-        self._db = sqlite3.connect(self.path, timeout=0.0, isolation_level=None, check_same_thread=False)
+        self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
+        self._db.execute(f"PRAGMA synchronous={self._synchronous}")
 
     def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
         """Make the tables, with their first rows."""
@@ -42,7 +46,7 @@ class Store:
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Commit rows, all or none."""
-        if len(entries) == 1:
+        if len(entries) == 1 and len(entries[0].rows) == 1:
             self._insert(entries)
             return
         self._db.execute("BEGIN IMMEDIATE")
@@ -55,12 +59,16 @@ class Store:
                 self._db.execute("ROLLBACK")
             raise
 
+    def forget(self, keys: Iterable[str]) -> None:
+        """Remove entries of the metadata."""
+        self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
+
     def _insert(self, entries: Iterable[Entry]) -> None:
-        for (table, size), rows in groupby(entries, key=lambda entry: (entry.table, len(entry.row))):
-            marks = ", ".join("?" * (size + (table != "files")))
+        for each in entries:
+            marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
             # A row that comes a second time, from the second file, is the same.
-            statement = f"INSERT OR REPLACE INTO {table} VALUES ({marks})"  # noqa: S608 - own names
-            self._db.executemany(statement, [row.columns() for row in rows])
+            statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
+            self._db.executemany(statement, each.columns())
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -97,11 +105,11 @@ class Store:
                     return f"table {table} has {rows} rows of {count}"
         return ""
 
-    def rows(self) -> list[tuple[str, tuple[object, ...]]]:
-        """Return table and columns of every row, also of a file that has been removed."""
+    def entries(self) -> list[Entry]:
+        """Return every row, also of a file that has been removed."""
         return [
-            (table, row)
-            for table in ("meta", "signals", "steps", "telemetry", "events", "files")
+            entry(table, row if table == "files" else row[:-1])
+            for table in TABLES
             for row in self._db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
         ]
 

@@ -16,10 +16,17 @@ from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
 from bench.journal.store import Store
+
+_READERS = 10.0
+"""Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
+
+_END = ("status", "reason", "finished", "safe_state", "counts")
+"""Entries of the metadata that a run has once it has ended."""
 
 
 class Journal:
@@ -38,6 +45,9 @@ class Journal:
     patience : float, optional
         Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
         it the caller's writes, which is faster where nothing waits, as on the virtual clock.
+    flushed : bool
+        Whether each step and event waits until it is on the disk, so that a loss of power takes nothing either.
+        Otherwise the disk gets the journal at its end, and the death of the process alone takes nothing.
 
     Raises
     ------
@@ -53,6 +63,8 @@ class Journal:
         meta: Mapping[str, Any],
         files: Mapping[str, bytes] = MappingProxyType({}),
         patience: float | None = None,
+        *,
+        flushed: bool = True,
     ) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
@@ -69,8 +81,9 @@ class Journal:
         for former in second_files(path):
             former.unlink(missing_ok=True)
         try:
-            store = Store(path)
+            store = Store(path, _READERS, flushed=flushed)
             store.create(names, entries)
+            store.wait_for_others(0.0)
             keeper = Keeper(store)
             keeper.begin(entries)
         except (sqlite3.Error, OSError) as error:
@@ -78,54 +91,42 @@ class Journal:
         self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
 
     @classmethod
-    def reopen(cls, path: Path, patience: float | None = None) -> Self:
-        """Open the record of an unfinished run to write on: its steps, ticks and events are numbered on.
+    def reopen(
+        cls, path: Path, meta: Mapping[str, Any] = MappingProxyType({}), patience: float | None = None
+    ) -> Self:
+        """Open the record of a run that was not completed to write on: steps, ticks and events are numbered on.
+
+        Its end, if it had one, is taken back.
 
         Parameters
         ----------
         path : Path
             The journal, or the folder of the run that holds it.
+        meta : mapping
+            Further entries of the metadata.
         patience : float, optional
             As of a new one.
 
         Raises
         ------
         DataError
-            If there is none, it is damaged or of an older schema.
+            If there is none, it is damaged or of an older schema, or cannot be written.
         ConfigurationError
-            If the run has ended.
+            If the run was completed.
         """
-        with Record(path) as record:
-            file, signals = record.path, record.signals
-            if record.meta["schema"] != SCHEMA:
-                raise DataError(
-                    f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on"
-                )
-            if "status" in record.meta:
-                raise ConfigurationError(f"{file} is the record of a run that has ended: {record.status}")
-            counts = {
-                "steps": len(record.steps()),
-                "telemetry": len(record.telemetry()),
-                "events": len(record.events()),
-            }
-        beside = {
-            (each.table, each.row[0]): each
-            for second in second_files(file)
-            for each in read_mirror(second)
-            # Numbered without a gap, so what the journal lacks is behind its last row.
-            if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
-        }
-        if any(table == "meta" and key == "status" for table, key in beside):
-            raise ConfigurationError(
-                f"{file} is the record of a run that has ended, of which rows wait in a second file; "
-                f"`bench recover-journal {file}` puts them together"
-            )
+        file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
-        keeper = Keeper(Store(file))
-        missing = [each for (table, _), each in beside.items() if table in FIRST]
-        keeper.store.write(missing)
-        for each in missing:
-            counts[each.table] += 1
+        was_mirrored = (file.parent / MIRROR_NAME).exists()
+        try:
+            # A reader may have it for a moment.
+            keeper = Keeper(Store(file, _READERS))
+            keeper.store.forget(_END)
+            keeper.store.wait_for_others(0.0)
+            if not was_mirrored:
+                keeper.begin(keeper.store.entries())
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
+        keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience)
         return journal
 
@@ -166,7 +167,8 @@ class Journal:
         A tick that comes less than 0.1 s (wall clock) after the last write, as on the virtual clock, is written with
         the next tick, step or event.
         """
-        self._waiting.append((self._number("telemetry"), t, step, *map(float, values)))
+        self._counts["telemetry"] = tick = self._counts["telemetry"] + 1
+        self._waiting.append((tick, t, step, *map(float, values)))
         if self._background is not None:
             self._background.keep_soon(self._take_ticks())
         elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
@@ -184,6 +186,7 @@ class Journal:
             record.settled.value,
             json.dumps({name: float(value) for name, value in record.setpoints.items()}),
             *map(float, record.values),
+            json.dumps(record.seen),
         )
         self._write([entry("steps", row)])
 
@@ -250,7 +253,7 @@ class Journal:
     def _take_ticks(self) -> list[Entry]:
         """Return the ticks that wait, which wait no longer."""
         waiting, self._waiting = self._waiting, []
-        return ticks(waiting) if waiting else []
+        return [ticks(waiting)] if waiting else []
 
     def _write(self, entries: Sequence[Entry]) -> None:
         """Make rows durable, and before them the ticks that wait."""
@@ -273,11 +276,64 @@ class Journal:
             self._background = None
 
 
+def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
+    """Bring into the journal of a run that was not completed what waits for it in a second file.
+
+    Returns
+    -------
+    Path
+        The journal.
+    tuple of Signal
+        Its signals.
+    dict of str to int
+        Number of its rows, by table.
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As `Journal.reopen`.
+    """
+    with Record(path) as record:
+        file, signals = record.path, record.signals
+        if record.meta["schema"] != SCHEMA:
+            raise DataError(f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on")
+        if record.status == "completed":
+            raise ConfigurationError(f"{file} is the record of a run that was completed")
+        counts = {
+            "steps": len(record.steps()),
+            "telemetry": len(record.telemetry()),
+            "events": len(record.events()),
+        }
+        has_ended = "status" in record.meta
+    beside = {
+        (each.table, each.row[0]): each
+        for second in second_files(file)
+        for each in read_mirror(second)
+        # Numbered without a gap, so what the journal lacks is behind its last row.
+        if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
+    }
+    if not has_ended and ("meta", "status") in beside:
+        raise ConfigurationError(
+            f"{file} is the record of a run that has ended, of which rows wait in a second file; "
+            f"`bench recover-journal {file}` puts them together"
+        )
+    missing = [each for (table, _), each in beside.items() if table in FIRST]
+    if missing:
+        try:
+            with closing(Store(file, _READERS)) as store:
+                store.write(missing)
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
+    for each in missing:
+        counts[each.table] += 1
+    return file, signals, counts
+
+
 def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
     """Record the end of a run whose own thread hangs, if its file can be written within a second."""
     with suppress(OSError):
         (path.parent / RESERVE_NAME).unlink(missing_ok=True)
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
         for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
-            row = entry("meta", meta_row(key, value)).columns()
-            db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", row)
+            rows = entry("meta", meta_row(key, value)).columns()
+            db.executemany("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", rows)

@@ -1,4 +1,4 @@
-"""Protocols: the vocabulary of operator scripts, their parameters, their dry run, and their discovery."""
+"""Protocols: the vocabulary of operator scripts, their parameters, their plan, and their discovery."""
 
 from bench.binding import Slot, Slots
 from bench.protocol.discovery import Packaged, find_protocol, is_installed, packaged_protocols, source_of

@@ -125,7 +125,7 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: 
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         raise ConfigurationError(
-            f"protocol {definition.name} failed in its dry run: {type(error).__name__}: {error} "
+            f"protocol {definition.name} failed in its plan: {type(error).__name__}: {error} "
             f"({place.filename}, line {place.lineno})"
         ) from error
 

@@ -16,7 +16,7 @@ Messages name devices and signals of a rig. A protocol for any rig asks for slot
 their binding in the rig file; see `bench.binding`.
 
 A protocol touches no device and no clock, and is deterministic given its parameters and its readings. So
-it can be run dry to learn its length and the extremes of its set-points before anything moves.
+it can be planned and rehearsed, to learn what it does before anything moves.
 """
 
 from __future__ import annotations
@@ -318,6 +318,9 @@ class Reading:
     def __getitem__(self, signal: str) -> float:
         return self.values[signal]
 
+
+PROMPT = "prompt"
+"""Label of the reading that follows a prompt."""
 
 Messages = Generator[Message, Reading, None]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -102,6 +103,29 @@ class IdentifiedFile:
             "warnings": list(self.warnings),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
+
+
+def model_options(model: str) -> tuple[str, ...]:
+    """Return the names of the options that `identify_file` takes for a registered model."""
+    template = find_model(model).template
+    own = inspect.signature(template).parameters if template is not None else {}
+    # The first takes the inputs; the units are those of the columns.
+    names = [name for name in list(own)[1:] if not name.endswith("_unit")]
+    return (*names, "smoothing", "skip", "initial", "cross_validated")
+
+
+def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
+    """Check the values of a model's own options for inputs, shape (N,), without a fit.
+
+    Raises ValueError if the model does not take them.
+    """
+    spec = find_model(model)
+    assert spec.template is not None
+    own = {name: value for name, value in options.items() if name in inspect.signature(spec.template).parameters}
+    try:
+        spec.template(inputs, **own)
+    except TypeError as error:
+        raise ValueError(f"options of {model}: {error}") from None
 
 
 def errors_json(errors: Errors) -> dict[str, float]:

@@ -18,9 +18,8 @@ each face at that face's own temperature. The printed equations differ from it i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
 
@@ -300,14 +299,26 @@ class ThermalNetwork:
         air = _ambients(ambient, i.size)
         result = np.empty((i.size, 4))
         now = np.full(4, air[0]) if start is None else _nodes("start", start)
-        for first, stop in _runs(i, air):
-            transition = _transition(self, float(i[first]), step)
+        stretches = list(_runs(i, air))
+        transitions = self._transitions(tuple(dict.fromkeys(i[[first for first, _ in stretches]].tolist())), step)
+        for first, stop in stretches:
             # At rest without current the rises stay exactly 0.
             state = np.concatenate([now - air[first], [1.0, air[first] - ABSOLUTE_ZERO]])
-            path = _powers(transition, state, stop - first)[:, :4] + air[first]
+            path = _powers(transitions[float(i[first])], state, stop - first)[:, :4] + air[first]
             result[first:stop] = path[:-1]
             now = path[-1]
         return result
+
+    def _transitions(self, currents: Sequence[float], dt: float) -> dict[float, Floats]:
+        """Return the exact step by dt of the rises, a 1 and the air's absolute temperature, (6, 6), by current."""
+        from scipy.linalg import expm
+
+        systems = np.zeros((len(currents), 6, 6))
+        for system, current in zip(systems, currents, strict=True):
+            system[:4, :4] = self._matrix(current)
+            system[:4, 4], system[:4, 5] = self._forcing(current)
+        # All at once: a single call costs several times as much as its matrix.
+        return dict(zip(currents, np.asarray(expm(dt * systems)), strict=True))
 
     def to_json(self) -> dict[str, Any]:
         """Return the network as a JSON object."""
@@ -320,17 +331,6 @@ class ThermalNetwork:
         Raises ValueError if a key is missing or wrong.
         """
         return cls(**{each.name: _checks.json_field(document, each.name, "thermal network") for each in fields(cls)})
-
-
-@lru_cache(maxsize=4096)
-def _transition(network: ThermalNetwork, current: float, dt: float) -> Floats:
-    """Return the exact step by dt of the rises, a 1 and the absolute temperature of the air, shape (6, 6)."""
-    from scipy.linalg import expm
-
-    system = np.zeros((6, 6))
-    system[:4, :4] = network._matrix(current)
-    system[:4, 4], system[:4, 5] = network._forcing(current)
-    return _checks.frozen(np.asarray(expm(dt * system)))
 
 
 def _powers(step: Floats, start: Floats, count: int) -> Floats:

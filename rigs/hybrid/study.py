@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult
+from bench.workers import Pending
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
     BASE,
@@ -220,42 +221,55 @@ class _Runs(NamedTuple):
 def _carry_out(campaign: Campaign) -> StudyResult:
     frequencies = ", ".join(map(str, FREQUENCIES))
     sweep = {"amplitude": str(SWEEP_AMPLITUDE), "frequencies": frequencies, "periods": "3"}
-    runs = _Runs(
-        *(
-            campaign.run(protocol, settings)
-            for protocol, settings in (
-                ("current-sine", {}),
-                ("current-steps", {}),
-                ("thermomechanical", {}),
-                ("piezo-loops", {}),
-                ("piezo-step", {}),
-                ("hybrid-excitation", {}),
-                ("current-sine", sweep),
-            )
+    started = [
+        campaign.start(protocol, settings)
+        for protocol, settings in (
+            ("current-sine", {}),
+            ("current-steps", {}),
+            ("thermomechanical", {}),
+            ("piezo-loops", {}),
+            ("piezo-step", {}),
+            ("hybrid-excitation", {}),
+            ("current-sine", sweep),
         )
-    )
+    ]
+    runs = _Runs(*(run.result() for run in started))
     sources = [run.folder for run in (runs.steps, runs.static, runs.loops, runs.step)]
     found = identify_hybrid(*sources)
     model = campaign.folder / "hybrid.json"
     ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
 
     # Only the hybrid controller needs long holds.
-    tracked = {
-        name: _track(campaign, model, {"controller": name, "hold": "60" if name == "hybrid" else "15"})
+    tracking_runs = {
+        name: _start(campaign, model, {"controller": name, "hold": "60" if name == "hybrid" else "15"})
         for name in CONTROLLERS
     }
     slow = {"speed": "0.5e-6", "low": "-10e-6", "high": "10e-6", "hold": "10"}
-    references = {
-        name: _track(campaign, model, {"reference": name, **({"hold": "15"} if name == "staircase" else slow)})
+    reference_runs = {
+        name: _start(campaign, model, {"reference": name, **({"hold": "15"} if name == "staircase" else slow)})
         for name in REFERENCES
     }
-    room = _track(
+    room_run = _start(
         campaign,
         model,
         {"reference": "hold", "hold": "120"},
         {"emulation.ambient_step": str(ROOM_STEP), "emulation.ambient_step_time": str(ROOM_STEP_TIME)},
     )
-    fine = {f"{offset:+.0%}": _fine_step(campaign, model, offset) for offset in RESONANCES}
+    fine_runs = {
+        f"{offset:+.0%}": campaign.start(
+            "fine-step",
+            {"model": str(model), "witness": "true"},
+            {"emulation.resonance_offset": str(offset)},
+            rig=WITNESSED,
+        )
+        for offset in RESONANCES
+    }
+    figures = list(_draw_models(campaign, found, runs))
+    tracked = {name: _tracked(run) for name, run in tracking_runs.items()}
+    figures += _draw_control(campaign, tracked)
+    references = {name: _tracked(run) for name, run in reference_runs.items()}
+    room = _tracked(room_run)
+    fine = {name: _fine_step(run) for name, run in fine_runs.items()}
 
     values: dict[str, Any] = {
         "geometry": dict(
@@ -280,29 +294,25 @@ def _carry_out(campaign: Campaign) -> StudyResult:
         "fine_steps": fine,
     }
     values["table_3"] = _table_3(values, found, runs.loops)
-    figures = tuple(_draw(campaign, found, runs, tracked))
-    return StudyResult(values, TABLES, figures)
+    return StudyResult(values, TABLES, tuple(figures))
 
 
-def _track(
+def _start(
     campaign: Campaign, model: Path, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
-) -> Tracking:
-    run = campaign.run(
+) -> Pending[RunResult]:
+    return campaign.start(
         "hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=WITNESSED
     )
-    samples = read_loop(run.folder)
+
+
+def _tracked(run: Pending[RunResult]) -> Tracking:
+    samples = read_loop(run.result().folder)
     return Tracking(samples.times, samples["reference"], samples[WITNESS])
 
 
-def _fine_step(campaign: Campaign, model: Path, offset: float) -> dict[str, float]:
-    """Carry out a fine step; return settling time (ms), overshoot (%) and the RMS error afterwards (nm)."""
-    run = campaign.run(
-        "fine-step",
-        {"model": str(model), "witness": "true"},
-        {"emulation.resonance_offset": str(offset)},
-        rig=WITNESSED,
-    )
-    samples = read_loop(run.folder)
+def _fine_step(run: Pending[RunResult]) -> dict[str, float]:
+    """Evaluate a fine step; return settling time (ms), overshoot (%) and the RMS error afterwards (nm)."""
+    samples = read_loop(run.result().folder)
     reference, deflection = samples["reference"], samples[WITNESS]
     height = float(reference[-1] - reference[0])
     start = int(np.flatnonzero(reference != reference[0])[0])
@@ -446,21 +456,27 @@ def _panels(found: HybridIdentification, runs: _Runs) -> Iterator[_Panel]:
     )
 
 
-def _draw(
-    campaign: Campaign, found: HybridIdentification, runs: _Runs, tracked: Mapping[str, Tracking]
-) -> Iterator[Path]:
-    """Draw all figures; yield their files."""
+def _draw_models(campaign: Campaign, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
+    """Have the paper's figures drawn; yield their files."""
     for panel in _panels(found, runs):
-        yield (path := campaign.figure(panel.name))
-        plot_panels(
-            path, {"": panel.curves}, horizontal_label=panel.horizontal, vertical_label=panel.vertical, columns=1
+        yield campaign.draw(
+            panel.name,
+            plot_panels,
+            {"": panel.curves},
+            horizontal_label=panel.horizontal,
+            vertical_label=panel.vertical,
+            columns=1,
         )
+
+
+def _draw_control(campaign: Campaign, tracked: Mapping[str, Tracking]) -> Iterator[Path]:
+    """Have each controller's moves drawn; yield the files."""
     for name, tracking in tracked.items():
         # Without the first seconds, in which the controller finds the start.
         shown = tracking.times > SETTLING
-        yield (path := campaign.figure(f"control-moves-{name}"))
-        plot_tracking(
-            path,
+        yield campaign.draw(
+            f"control-moves-{name}",
+            plot_tracking,
             tracking.reference[shown] * 1e6,
             {name: tracking.deflection[shown] * 1e6},
             horizontal=tracking.times[shown],

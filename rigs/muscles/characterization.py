@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
+from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable
+from bench.workers import Pending
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -94,21 +96,10 @@ def json_key(name: str) -> str:
     return name.replace("-", "_")
 
 
-def characterize(campaign: Campaign) -> Characterization:
-    """Run the four protocols of a muscle, and identify each model; the model files go into the campaign's folder.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        Where to run; its seed chooses the random voltages of the verification.
-
-    Raises
-    ------
-    BenchError
-        If a run did not complete, or a model cannot be identified.
-    """
-    folders = {
-        protocol: campaign.run(protocol, settings).folder
+def start_runs(campaign: Campaign) -> dict[str, Pending[RunResult]]:
+    """Start the four protocols of a muscle; the campaign's seed chooses the random voltages of the verification."""
+    return {
+        protocol: campaign.start(protocol, settings)
         for protocol, settings in {
             "force-voltage": {},
             "length-voltage": {},
@@ -116,6 +107,17 @@ def characterize(campaign: Campaign) -> Characterization:
             "length-verification": {"sequence_seed": str(campaign.seed + 1)},
         }.items()
     }
+
+
+def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> Characterization:
+    """Identify each model from the four runs of a muscle; the model files go into the campaign's folder.
+
+    Raises
+    ------
+    BenchError
+        If a run did not complete, or a model cannot be identified.
+    """
+    folders = {protocol: run.result().folder for protocol, run in runs.items()}
     *sources, verification = folders.values()
     resting = read_resting(folders["force-voltage"])
     series = [*read_series(folders["length-voltage"]), *read_series(folders["length-force"])]

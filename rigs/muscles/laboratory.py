@@ -28,6 +28,7 @@ from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.grid import GRID_TOLERANCE
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -185,6 +186,11 @@ class Frame:
         """Take the load off and fasten the end to the stage, so that both stand at the same number of metres."""
         self._fastened = True
 
+    @property
+    def is_moving(self) -> bool:
+        """Whether the end follows a stage that is on its way."""
+        return self._fastened and self.drum is not None and self.drum.is_moving
+
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds, with the end following the stage."""
         if self._fastened and self.drum is not None:
@@ -192,6 +198,39 @@ class Frame:
             reach = self.muscle.parameters.reach
             self.muscle.clamp(min(max(self.drum.position_after(dt), -reach), reach))
         self.muscle.advance(dt)
+
+
+class ForceCourse:
+    """The force of a muscle over time: a `sim_devices.instruments.flintec_dad141.Course`.
+
+    Parameters
+    ----------
+    frame : Frame
+        The muscle's frame.
+    muscle : SMAWire
+        The muscle, which keeps its force.
+    sensor : FaultySensor
+        What the load cell sees of the force.
+    """
+
+    tolerance = GRID_TOLERANCE
+
+    def __init__(self, frame: Frame, muscle: SMAWire, sensor: FaultySensor) -> None:
+        self._frame = frame
+        self._muscle = muscle
+        self._sensor = sensor
+        self.forces = muscle.forces
+        self.step = muscle.parameters.step
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it goes by what the muscle keeps: a stage on its way moves in pieces, from look to look."""
+        frame = self._frame
+        return not frame.is_broken and not frame.is_moving and self._sensor.is_whole
+
+    def since_point(self) -> float:
+        """Return the time for which the muscle has stood at the last grid point, s."""
+        return self._muscle.since_point()
 
 
 def _use(muscle: MusclePlant) -> tuple[float, float]:
@@ -253,6 +292,10 @@ class MuscleLaboratory(EmulatedLaboratory):
             weight_limits=(-5.0, 50.0),
             zero_tracking=0,
             noise=settings.force_noise,
+            # Of the other muscles it sees the force at each of its own instants.
+            course=ForceCourse(self.frame, self.muscle, self._force_sensor)
+            if isinstance(self.muscle, SMAWire)
+            else None,
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)

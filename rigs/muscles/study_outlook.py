@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.campaign import Campaign, Study, StudyResult
 from bench.results.figures import Curve, plot_panels
-from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths
+from bench.studies import Campaign, Study, StudyResult
+from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths, start_runs
 
 MUSCLES = {
     "mckibben": ("McKibben muscle", "mckibben"),
@@ -30,9 +30,10 @@ def carry_out(campaign: Campaign) -> StudyResult:
     BenchError if a run did not complete; its record is kept.
     """
     values, figures = {}, []
-    for key, (_, rig) in MUSCLES.items():
-        part = campaign.part(key, rig)
-        measured = characterize(part)
+    parts = {key: campaign.part(key, rig) for key, (_, rig) in MUSCLES.items()}
+    runs = {key: start_runs(part) for key, part in parts.items()}
+    for key, part in parts.items():
+        measured = characterize(part, runs[key])
         measured.keep_model(part)
         values[key] = measured.errors_json()
         figures += _draw(part, measured)
@@ -51,16 +52,18 @@ STUDY = Study(
 def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
     """Draw the three hysteresis relationships as they were measured."""
     voltages, forces, _ = measured.resting
-    paths = [campaign.figure("force-voltage")]
-    plot_panels(
-        paths[0],
-        {"ends held": [Curve("", voltages, forces)]},
-        horizontal_label="voltage / V",
-        vertical_label="force / N",
-        columns=1,
-    )
+    paths = [
+        campaign.draw(
+            "force-voltage",
+            plot_panels,
+            {"ends held": [Curve("", voltages, forces)]},
+            horizontal_label="voltage / V",
+            vertical_label="force / N",
+            columns=1,
+        )
+    ]
     for kind in ("length-voltage", "length-force"):
-        paths.append(campaign.figure(kind))
         chosen = [series for series in measured.series if series.kind == kind]
-        plot_lengths(paths[-1], kind, chosen, {"measured": [s.lengths for s in chosen]}, columns=1)
+        lengths = {"measured": [s.lengths for s in chosen]}
+        paths.append(campaign.draw(kind, plot_lengths, kind, chosen, lengths, columns=1))
     return paths

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.identification.two_stage import predict_series
 from bench.results.figures import (
     Curve,
@@ -22,6 +21,7 @@ from bench.results.figures import (
     plot_tracking,
 )
 from bench.results.tracking import TargetResults
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from rigs.muscles.characterization import (
     TITLES,
     Characterization,
@@ -29,6 +29,7 @@ from rigs.muscles.characterization import (
     errors_table,
     json_key,
     plot_lengths,
+    start_runs,
 )
 from rigs.muscles.identification import FORCE, LENGTH
 
@@ -94,18 +95,26 @@ def carry_out(campaign: Campaign) -> StudyResult:
     The values are errors in percent of the range by `fv`, `lv`, `lf` and `verification`, and those of `control` in
     `units`. Raises BenchError if a run did not complete; its record is kept.
     """
-    measured = characterize(campaign)
+    measured = characterize(campaign, start_runs(campaign))
     common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
-    reached = {
+    runs = {
         key: {
-            controller: reached_targets(
-                campaign.run(session.controlled.protocol, {"controller": controller, **session.settings, **common}),
-                session.controlled.signal,
+            controller: campaign.start(
+                session.controlled.protocol, {"controller": controller, **session.settings, **common}
             )
             for controller in CONTROLLERS
         }
         for key, session in CONTROL.items()
     }
+    figures = _draw(campaign, measured)
+    reached = {
+        key: {
+            controller: reached_targets(run.result(), CONTROL[key].controlled.signal)
+            for controller, run in entry.items()
+        }
+        for key, entry in runs.items()
+    }
+    figures += _draw_control(campaign, reached)
     measured.keep_model(campaign)
     return StudyResult(
         {
@@ -124,7 +133,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
             "units": {key: session.controlled.unit for key, session in CONTROL.items()},
         },
         TABLES,
-        (*_draw(campaign, measured), *_draw_control(campaign, reached)),
+        tuple(figures),
     )
 
 
@@ -146,39 +155,45 @@ def _errors(results: TargetResults, scale: float) -> dict[str, float]:
 def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
     voltages, forces, _ = measured.resting
     models = {name: found for name, found in measured.models.items() if name in _SHOWN}
-    paths = [campaign.figure("figure-06-force-voltage")]
     fitted = {TITLES[name]: forces - models[name].residuals["force-voltage"] for name in ("two-stage", "linear")}
-    plot_panels(
-        paths[0],
-        {title: [Curve("", voltages, values)] for title, values in {"measured": forces, **fitted}.items()},
-        horizontal_label="voltage / V",
-        vertical_label="force / N",
-        columns=3,
-    )
+    paths = [
+        campaign.draw(
+            "figure-06-force-voltage",
+            plot_panels,
+            {title: [Curve("", voltages, values)] for title, values in {"measured": forces, **fitted}.items()},
+            horizontal_label="voltage / V",
+            vertical_label="force / N",
+            columns=3,
+        )
+    ]
     for name, kind in (("figure-07-length-voltage", "length-voltage"), ("figure-08-length-force", "length-force")):
-        paths.append(campaign.figure(name))
         chosen = [series for series in measured.series if series.kind == kind]
         modelled = {
             TITLES[which]: [predict_series(found.model, s) for s in chosen] for which, found in models.items()
         }
-        plot_lengths(paths[-1], kind, chosen, {"measured": [s.lengths for s in chosen], **modelled})
-    paths.append(campaign.figure("figure-09-densities"))
-    plot_densities(paths[-1], models["two-stage"].model.densities())
+        lengths = {"measured": [s.lengths for s in chosen], **modelled}
+        paths.append(campaign.draw(name, plot_lengths, kind, chosen, lengths))
+    paths.append(campaign.draw("figure-09-densities", plot_densities, models["two-stage"].model.densities()))
     for panel, kind in (("a", "length-voltage"), ("b", "length-force")):
-        paths.append(campaign.figure(f"figure-10{panel}-errors-{kind}"))
         residuals = {TITLES[which]: found.residuals[kind] * 1e3 for which, found in models.items()}
-        plot_errors(paths[-1], residuals, error_label="error / mm")
-    paths.append(campaign.figure("figure-11-verification"))
-    plot_sequence_and_errors(
-        paths[-1],
-        np.concatenate([s.voltages for s in measured.verification]),
-        {
-            TITLES[which]: np.concatenate([s.lengths - predict_series(found.model, s) for s in measured.verification])
-            * 1e3
-            for which, found in models.items()
-        },
-        input_label="voltage / V",
-        error_label="error / mm",
+        paths.append(
+            campaign.draw(f"figure-10{panel}-errors-{kind}", plot_errors, residuals, error_label="error / mm")
+        )
+    paths.append(
+        campaign.draw(
+            "figure-11-verification",
+            plot_sequence_and_errors,
+            np.concatenate([s.voltages for s in measured.verification]),
+            {
+                TITLES[which]: np.concatenate(
+                    [s.lengths - predict_series(found.model, s) for s in measured.verification]
+                )
+                * 1e3
+                for which, found in models.items()
+            },
+            input_label="voltage / V",
+            error_label="error / mm",
+        )
     )
     return paths
 
@@ -186,13 +201,15 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
 def _draw_control(campaign: Campaign, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:
     paths = []
     for key, results in reached.items():
-        paths.append(campaign.figure(f"control-{key.replace('_', '-')}"))
         _, name, _, unit, scale = CONTROL[key].controlled
-        plot_tracking(
-            paths[-1],
-            results[CONTROLLERS[-1]].targets * scale,
-            {controller: each.outputs * scale for controller, each in results.items()},
-            output_label=f"{name} / {unit}",
-            error_label=f"error / {unit}",
+        paths.append(
+            campaign.draw(
+                f"control-{key.replace('_', '-')}",
+                plot_tracking,
+                results[CONTROLLERS[-1]].targets * scale,
+                {controller: each.outputs * scale for controller, each in results.items()},
+                output_label=f"{name} / {unit}",
+                error_label=f"error / {unit}",
+            )
         )
     return paths

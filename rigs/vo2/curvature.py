@@ -99,13 +99,17 @@ class CantileverCurvature(DerivedSignal):
         if units[self.source] != "m":
             raise ValueError(f"source = {self.source!r}: is in {units[self.source]}; expected a deflection in m")
 
+        source, length, residual_curvature = self.source, self.length, self.residual_curvature
+        rest = _ratio(residual_curvature * length)
+
         def compute(values: Mapping[str, float]) -> float:
-            deflection = values[self.source]
-            curvature = float(deflection_to_curvature(deflection, self.length, self.residual_curvature))
-            if not np.isfinite(curvature) and np.isfinite(deflection):
+            # `deflection_to_curvature` of one number, without arrays.
+            deflection = values[source]
+            curvature = _angle(deflection / length + rest) / length - residual_curvature
+            if not math.isfinite(curvature) and math.isfinite(deflection):
                 raise DeviceError(
                     name,
-                    f"a beam of {self.length * 1e6:g} µm cannot bend by {deflection * 1e6:.1f} µm; "
+                    f"a beam of {length * 1e6:g} µm cannot bend by {deflection * 1e6:.1f} µm; "
                     "check the spot on the detector and the calibration",
                 )
             return curvature

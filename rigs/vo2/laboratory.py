@@ -77,7 +77,7 @@ class VO2Laboratory(EmulatedLaboratory):
         spot = FaultySensor(
             "spot",
             self.world,
-            lambda: self._bending()[1] + self._misalignment,
+            self._spot,
             "m",
             scale=10e-6,
             beyond=1e-3,
@@ -131,6 +131,11 @@ class VO2Laboratory(EmulatedLaboratory):
     def _bending(self) -> tuple[float, float]:
         """Return curvature (1/m) and deflection of the tip (m)."""
         return (self.plant.curvature, self.plant.tip_deflection) if self._stuck is None else self._stuck
+
+    def _spot(self) -> float:
+        """Return the deflection of the tip that the spot shows, m."""
+        deflection = self.plant.tip_deflection if self._stuck is None else self._stuck[1]
+        return deflection + self._misalignment
 
     def _stick(self) -> None:
         self._stuck = self._bending()

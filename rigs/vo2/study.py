@@ -7,14 +7,12 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.errors import DataError
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
@@ -23,6 +21,8 @@ from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.workers import Pending
 
 Floats = npt.NDArray[np.float64]
 
@@ -151,25 +151,22 @@ def carry_out(campaign: Campaign) -> StudyResult:
     folder = campaign.folder
     sign = 1.0 if campaign.seed % 2 == 0 else -1.0
 
-    def session(protocol: str, settings: Mapping[str, str], offset: float) -> RunResult:
-        return campaign.run(protocol, settings, {"emulation.session_offset": str(sign * offset)})
+    def session(protocol: str, settings: Mapping[str, str], offset: float) -> Pending[RunResult]:
+        return campaign.start(protocol, settings, {"emulation.session_offset": str(sign * offset)})
 
     def model_path(name: str) -> str:
         return str(folder / f"{name}.json")
 
-    characterization = session("damped-oscillation", {}, 0.0)
-    validation = session("random-validation", {}, SESSION_OFFSET)
+    characterization, validation = (
+        session("damped-oscillation", {}, 0.0),
+        session("random-validation", {}, SESSION_OFFSET),
+    )
     models: dict[str, IdentifiedFile] = {}
     for key, (_, name, options, *_) in MODELS.items():
         models[key] = identify_file(
-            characterization.folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
+            characterization.result().folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
         )
         models[key].file.save(Path(model_path(name)))
-    with Record(validation.folder) as record:
-        steps = record.steps()
-        inputs, outputs = steps[INPUT], steps[OUTPUT]
-    predictions = {key: predict(model.file, inputs) for key, model in models.items()}
-
     tracking_runs = {
         key: session(
             "tracking",
@@ -191,17 +188,23 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for period in PERIODS
         for key in FOLLOWERS
     }
-    reached = {key: reached_targets(run, OUTPUT) for key, run in tracking_runs.items()}
-    followed = {key: _followed(run) for key, run in following_runs.items()}
+    with Record(validation.result().folder) as record:
+        steps = record.steps()
+        inputs, outputs = steps[INPUT], steps[OUTPUT]
+    predictions = {key: predict(model.file, inputs) for key, model in models.items()}
+    figures = _draw_models(campaign, models, inputs, outputs, predictions)
+    reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
+    followed = {key: _followed(run.result()) for key, run in following_runs.items()}
+    figures += _draw_control(campaign, reached, followed)
 
-    for run in (characterization, validation):
+    for run in (characterization.result(), validation.result()):
         with Record(run.folder) as record:
             finished = float(record.meta["finished"])
         # The proposed model last: the recording shows the density of the newest.
         for model in reversed(models.values()):
             add_model(run.folder, model.file.name, finished, model.file.to_json())
-    for run in (*tracking_runs.values(), *following_runs.values()):
-        add_model(run.folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
+    for controlled in (*tracking_runs.values(), *following_runs.values()):
+        add_model(controlled.result().folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
     return StudyResult(
         {
             "session_offset": sign * SESSION_OFFSET,
@@ -218,10 +221,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
             },
         },
         TABLES,
-        (
-            *_draw_models(campaign, models, inputs, outputs, predictions),
-            *_draw_control(campaign, reached, followed),
-        ),
+        tuple(figures),
     )
 
 
@@ -265,32 +265,36 @@ def _draw_models(
     temperature, curvature, error = "temperature / °C", "curvature / (1/m)", "error / (1/m)"
     proposed = models["nonmonotonic"]
     residuals = {key: model.identification.residuals for key, model in models.items()}
-    paths = [campaign.figure("figure-05a-loops")]
-    plot_loops(
-        paths[0],
-        proposed.inputs,
-        proposed.outputs,
-        proposed.outputs - residuals["nonmonotonic"],
-        input_label=temperature,
-        output_label=curvature,
-    )
+    paths = [
+        campaign.draw(
+            "figure-05a-loops",
+            plot_loops,
+            proposed.inputs,
+            proposed.outputs,
+            proposed.outputs - residuals["nonmonotonic"],
+            input_label=temperature,
+            output_label=curvature,
+        )
+    ]
     for errors_figure, density_figure, key in (
         ("figure-05b-error-proposed", "figure-06-density-proposed", "nonmonotonic"),
         ("figure-07-error-signed", "figure-08-density-signed", "signed"),
         ("figure-09-error-polynomial", None, "polynomial"),
     ):
-        paths.append(campaign.figure(errors_figure))
-        plot_errors(paths[-1], {MODELS[key].title: residuals[key]}, error_label=error)
+        paths.append(
+            campaign.draw(errors_figure, plot_errors, {MODELS[key].title: residuals[key]}, error_label=error)
+        )
         if density_figure is not None:
-            paths.append(campaign.figure(density_figure))
-            plot_densities(paths[-1], models[key].file.operator.densities())
-    paths.append(campaign.figure("figure-10-validation"))
-    plot_sequence_and_errors(
-        paths[-1],
-        inputs,
-        {MODELS[key].title: outputs - predicted for key, predicted in predictions.items()},
-        input_label=temperature,
-        error_label=error,
+            paths.append(campaign.draw(density_figure, plot_densities, models[key].file.operator.densities()))
+    paths.append(
+        campaign.draw(
+            "figure-10-validation",
+            plot_sequence_and_errors,
+            inputs,
+            {MODELS[key].title: outputs - predicted for key, predicted in predictions.items()},
+            input_label=temperature,
+            error_label=error,
+        )
     )
     return paths
 
@@ -298,24 +302,28 @@ def _draw_models(
 def _draw_control(
     campaign: Campaign, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
 ) -> list[Path]:
-    plot = partial(plot_tracking, output_label="curvature / (1/m)", error_label="error / (1/m)")
+    output, error = "curvature / (1/m)", "error / (1/m)"
     paths = []
     for name, keys in (
         ("figure-12-open-loop", ("open_loop_inverse", "polynomial")),
         ("figure-12-closed-loop", ("closed_loop_inverse", "latched")),
     ):
-        paths.append(campaign.figure(name))
         outputs = {CONTROLLERS[key][0]: reached[key].outputs for key in keys}
-        plot(paths[-1], reached[keys[0]].targets, outputs)
+        targets = reached[keys[0]].targets
+        paths.append(campaign.draw(name, plot_tracking, targets, outputs, output_label=output, error_label=error))
     for period in PERIODS:
-        paths.append(campaign.figure(f"following-period-{period}"))
         results = {key: followed[period, key] for key in FOLLOWERS}
         times = results["closed_loop_inverse"].times
-        plot(
-            paths[-1],
-            results["closed_loop_inverse"].reference,
-            {CONTROLLERS[key][0]: np.interp(times, each.times, each.output) for key, each in results.items()},
-            horizontal=times,
-            horizontal_label="time / s",
+        paths.append(
+            campaign.draw(
+                f"following-period-{period}",
+                plot_tracking,
+                results["closed_loop_inverse"].reference,
+                {CONTROLLERS[key][0]: np.interp(times, each.times, each.output) for key, each in results.items()},
+                horizontal=times,
+                horizontal_label="time / s",
+                output_label=output,
+                error_label=error,
+            )
         )
     return paths

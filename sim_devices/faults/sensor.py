@@ -59,6 +59,11 @@ class FaultySensor:
         """Return what the sensor sees at this instant, without its own noise."""
         return self._quantity() if self._is_whole else self._disturbed()
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it sees the quantity as it is."""
+        return self._is_whole
+
     def faults(self) -> dict[str, Fault]:
         """Return what can be wrong with it, by `NAME.FAULT`."""
         name, unit, scale = self._name, self._unit, self._scale

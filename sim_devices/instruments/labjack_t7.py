@@ -435,13 +435,15 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             duration = settings.samples / settings.scan_rate
             if duration > _LONGEST_BURST:
                 raise RegisterError(DEVICE_FAILURE, f"a burst of {duration:g} s is too long")
-            begin = self.world.time
+            world = self.world
+            begin, scan_rate = world.time, settings.scan_rate
             readings = []
             scale = _SCALES[settings.range, self._stream_index or _DEFAULT_STREAM_INDEX]
+            sleep_until, advance, convert = world.clock.sleep_until, world.advance_locked, self._convert
             for sample in range(1, settings.samples + 1):
-                self.world.clock.sleep_until(begin + sample / settings.scan_rate)
-                self.world.advance()
-                readings.append(self._convert(channel, scale))
+                sleep_until(begin + sample / scan_rate)
+                advance()
+                readings.append(convert(channel, scale))
             settings.burst = Burst(math.fsum(readings) / len(readings), max(readings), min(readings))
             return settings.burst
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -185,9 +186,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the watchdog: a valid package has arrived."""
-        with self.world.lock:
-            self.world.advance()
-            now = self.world.time
+        world = self.world
+        with world.lock:
+            world.advance_locked()
+            now = world.time
             if now > self._supervised_at:
                 self._supervise(now)
             self._feed(now)
@@ -226,8 +228,8 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         if not row.writable:
             raise RequestRefusedError(ServerError.READ_ONLY)
         kept = stored(row, value)
-        inside = stored(row, row.low) <= kept <= stored(row, row.high)
-        if not inside or (number == 2060 and 0.0 < value < 0.1):
+        low, high = _stored_bounds(number)
+        if not low <= kept <= high or (number == 2060 and 0.0 < value < 0.1):
             raise RequestRefusedError(ServerError.OUT_OF_RANGE)
         key = _key(number, instance)
         self._values[key] = kept
@@ -510,9 +512,9 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         elif sink > values[5011]:
             self._trip(143, 5011)
         if self._status is DeviceStatus.RUN:
-            self._supervise_output(now)
+            self._supervise_output(now, plate)
 
-    def _supervise_output(self, now: float) -> None:
+    def _supervise_output(self, now: float, plate: float) -> None:
         values = self._values
         current, voltage = self._load.current, self._load.voltage
         if abs(current) > values[2032]:
@@ -527,13 +529,20 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._trip(108, 6320)
         if self._status is not DeviceStatus.RUN or values[2000] != CONTROLLER:
             return
-        if abs(self._load.plate_temperature - self._target()) > values[4040]:
+        if abs(plate - self._target()) > values[4040]:
             self._in_window_since = math.nan
         elif math.isnan(self._in_window_since):
             self._in_window_since = now
         late = values[4042] > 0.0 and now - self._started_at > values[4042]
         if late and self._stability() != 2:
             self._trip(182, 4042)
+
+
+@cache
+def _stored_bounds(number: int) -> tuple[float, float]:
+    """Return the range of a parameter as the device keeps it."""
+    row = PARAMETERS[number]
+    return stored(row, row.low), stored(row, row.high)
 
 
 def _rounded(value: float, resolution: float) -> float:

@@ -23,6 +23,9 @@ from sim_devices.plants import _sma_kernels as kernels
 from sim_devices.plants.grid import Floats, NotNegative, Record, Signed, fluctuation, record
 from sim_devices.plants.muscle import MILLIMETRE, HeatedParameters, Muscle
 
+_FORCES = 128
+"""Grid points of which the force is kept."""
+
 _MEGAPASCAL = 1e6
 
 # The smallest transformation width (K), Clausius-Clapeyron slope (MPa/K) and detwinning stress (MPa) of a
@@ -165,6 +168,11 @@ class SMAWire(Muscle[SMAParameters]):
     ----------
     rng : numpy.random.Generator
         The session's randomness: the temperature of the room; see `GridPlant`.
+
+    Attributes
+    ----------
+    forces : ndarray
+        The force (N) at the last grid points, in a ring; see `kernels.advance_steps`.
     """
 
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
@@ -185,9 +193,11 @@ class SMAWire(Muscle[SMAParameters]):
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
         self._state[kernels.AMBIENT_OFFSET] = offset
         self._heat(parameters.ambient_temperature + offset, clamped=False)
+        self.forces = np.zeros(_FORCES + 1)
+        self.forces[0] = self.force
 
     def _take_steps(self, normals: Floats) -> None:
-        kernels.advance_steps(normals, self._command, self._parts)
+        kernels.advance_steps(normals, self._command, self.forces, self._parts)
 
     @property
     def temperature(self) -> float:

@@ -222,37 +222,42 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
         state[kernels.DRIFT] = 0.0
         state[kernels.DRIVE] = min(float(self._parts.down[0]), start) - parameters.coupling - 1.0
         state[kernels.RATE] = kernels.plate_rate(start, 0.0, state[kernels.SINK], self._coefficients)
+        self._outputs: list[float] = state.tolist()
+        """The state at the last grid point, for those who ask."""
         kernels.settle_film(self.film_temperature, self._parts)
+        self._deflection: float | None = None
 
     def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._command, self._parts)
+        self._outputs = self._state.tolist()
+        self._deflection = None
 
     @property
     def plate_temperature(self) -> float:
         """Temperature of the plate, where the controller's sensor sits, °C."""
-        return float(self._state[kernels.PLATE])
+        return self._outputs[kernels.PLATE]
 
     @property
     def plate_rate(self) -> float:
         """Rate of the plate temperature, K/s."""
-        return float(self._state[kernels.RATE])
+        return self._outputs[kernels.RATE]
 
     @property
     def sink_temperature(self) -> float:
         """Temperature of the heat sink, °C."""
-        return float(self._state[kernels.SINK])
+        return self._outputs[kernels.SINK]
 
     @property
     def film_temperature(self) -> float:
         """Temperature of the VO2 film: plate, wander, drift and the session's offset, °C."""
-        state = self._state
+        state = self._outputs
         film = state[kernels.PLATE] + state[kernels.WANDER] + state[kernels.DRIFT]
-        return float(film + self._parameters.session_offset)
+        return film + self._parameters.session_offset
 
     @property
     def current(self) -> float:
         """Peltier current, A; positive heats the plate."""
-        return float(self._state[kernels.CURRENT])
+        return self._outputs[kernels.CURRENT]
 
     @property
     def voltage(self) -> float:
@@ -280,10 +285,11 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
     @property
     def tip_deflection(self) -> float:
         """Deflection of the tip from where the beam of residual curvature has it, m."""
-        p = self._parameters
-        return arc_deflection(p.residual_curvature + self.curvature, p.beam_length) - arc_deflection(
-            p.residual_curvature, p.beam_length
-        )
+        if self._deflection is None:
+            p = self._parameters
+            bent = arc_deflection(p.residual_curvature + self.curvature, p.beam_length)
+            self._deflection = bent - arc_deflection(p.residual_curvature, p.beam_length)
+        return self._deflection
 
 
 def arc_deflection(curvature: float, length: float) -> float:

@@ -8,6 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from sim_devices.noise import normals
+
 
 @dataclass(eq=False)
 class NormalisedPSD:
@@ -26,12 +28,16 @@ class NormalisedPSD:
     """White noise of the amplifier in V rms, drawn anew for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
-    """Source of the noise."""
+    """Source of the noise; nothing else may draw from it."""
+
+    def __post_init__(self) -> None:
+        self._normals = normals(self.rng)
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        volts = self.deflection() * self.volts_per_metre + self.noise_volts * self.rng.standard_normal()
-        return float(min(max(volts, -self.SATURATION), self.SATURATION))
+        volts = self.deflection() * self.volts_per_metre + self.noise_volts * next(self._normals)
+        limit = self.SATURATION
+        return volts if -limit <= volts <= limit else min(max(volts, -limit), limit)
 
 
 @dataclass(eq=False)
@@ -56,9 +62,12 @@ class TwoCurrentPSD:
     """White noise of either amplifier in V rms, drawn anew for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
-    """Source of the noise."""
+    """Source of the noise; nothing else may draw from it."""
     light: float = field(default=1.0, init=False)
     """Share of the light that reaches the detector, 0 to 1; for faults and drift."""
+
+    def __post_init__(self) -> None:
+        self._normals = normals(self.rng)
 
     def first(self) -> float:
         """Return the voltage in V of current 1 at this instant."""
@@ -71,5 +80,5 @@ class TwoCurrentPSD:
     def _amplified(self, side: float) -> float:
         ratio = self.deflection() * (2 * self.metres_per_metre / self.psd_length)
         share = (1 + side * ratio) / 2 if abs(ratio) <= 1 else 0.0
-        volts = self.light * self.sum_volts * share + self.noise_volts * self.rng.standard_normal()
-        return float(min(max(volts, 0.0), self.SATURATION))
+        volts = self.light * self.sum_volts * share + self.noise_volts * next(self._normals)
+        return min(max(volts, 0.0), self.SATURATION)

@@ -68,12 +68,12 @@ class MeComServer(WireServer):
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
         self._received = b""
+        self._selections: dict[bytes, _Selection] = {}
+        """What the payloads that only read select, of those that came last."""
         self._commands: dict[str, Callable[[str], str]] = {
-            "?VR": self._read,
             "VS": self._write,
             "?VL": self._limits,
             "?VM": self._metadata,
-            "?VX": self._read_several,
             "?VB": self._read_big,
             "VB": self._write_big,
             "?IF": self._identify,
@@ -113,7 +113,9 @@ class MeComServer(WireServer):
         device.attend()
         head = b"!" + body[1:7]
         try:
-            content = self._act(body[7:].decode("ascii", "replace"))
+            payload = body[7:]
+            selection = self._selections.get(payload)
+            content = self._act(payload) if selection is None else self._values(selection)
         except RequestRefusedError as error:
             content = f"+{error.reason:02X}"
         if number == _SILENT:
@@ -122,26 +124,24 @@ class MeComServer(WireServer):
         # An acknowledge carries the CRC of its request.
         return device.transmit(answer + (b"%04X\r" % crc_hqx(answer, 0) if content else crc + b"\r"))
 
-    def _act(self, payload: str) -> str:
+    def _act(self, request: bytes) -> str:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
+        payload = request.decode("ascii", "replace")
         command = payload[:3] if payload.startswith("?") else payload[:2]
+        operand = payload[len(command) :]
+        if command in ("?VR", "?VX"):
+            selection = _single(operand) if command == "?VR" else _several(operand)
+            if len(self._selections) >= _PARSED:
+                self._selections.clear()
+            self._selections[request] = selection
+            return self._values(selection)
         try:
             carry_out = self._commands[command]
         except KeyError:
             raise RequestRefusedError(ServerError.COMMAND_NOT_AVAILABLE) from None
-        return carry_out(payload[len(command) :])
+        return carry_out(operand)
 
-    def _read(self, operand: str) -> str:
-        _check_digits(operand, 6)
-        return self._values(operand)
-
-    def _read_several(self, operand: str) -> str:
-        count = _digits(operand, 0, 2)
-        _check_digits(operand, 2 + 6 * count)
-        return self._values(operand[2:])
-
-    def _values(self, names: str) -> str:
-        selection = _selection(names)
+    def _values(self, selection: _Selection) -> str:
         value = self._device.value
         return selection.encode([value(number, instance) for number, instance in selection.keys])
 
@@ -200,8 +200,13 @@ class MeComServer(WireServer):
 
 def _row(operand: str) -> tuple[Parameter, int]:
     """Return the row of the parameter that an operand begins with, and the instance."""
-    instance = int(operand[4:6], 16)
-    return find_parameter(int(operand[:4], 16), instance), instance
+    return _named_row(operand[:6])
+
+
+@lru_cache(_PARSED)
+def _named_row(name: str) -> tuple[Parameter, int]:
+    instance = int(name[4:], 16)
+    return find_parameter(int(name[:4], 16), instance), instance
 
 
 def _check_digits(operand: str, digits: int) -> None:
@@ -216,7 +221,17 @@ def _digits(operand: str, start: int, digits: int) -> int:
     return int(part, 16)
 
 
-@lru_cache(_PARSED)
+def _single(operand: str) -> _Selection:
+    _check_digits(operand, 6)
+    return _selection(operand)
+
+
+def _several(operand: str) -> _Selection:
+    count = _digits(operand, 0, 2)
+    _check_digits(operand, 2 + 6 * count)
+    return _selection(operand[2:])
+
+
 def _selection(names: str) -> _Selection:
     """Parse parameters and instances, 6 digits each; raise `RequestRefusedError` if one does not exist."""
     keys = tuple((int(names[at : at + 4], 16), int(names[at + 4 : at + 6], 16)) for at in range(0, len(names), 6))

@@ -19,6 +19,8 @@ def main() -> int:
         folder=Path(folder),
         clock=clock,
         recording=False,
+        # What is sent to the process is meant for the run.
+        rehearse=False,
     )
     outcome = carry_out(run, Console(width=200)).outcome
     print("OUTCOME", outcome.status, outcome.steps, outcome.is_safe, outcome.reason, flush=True)

@@ -1068,6 +1068,19 @@ def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, mus
         assert ((abs(plane - (255, 226, 138)).sum(axis=2) < 60).sum() > 100) == is_drawn
 
 
+def test_a_recording_that_stops_is_complete_until_then(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with make_dashboard(path) as dashboard:
+        feed(dashboard, 5)
+        wait_until(lambda: not dashboard._queue.qsize())
+        dashboard.stop_recording()
+        feed_batches(dashboard, lambda: not dashboard._writer.recording._streams)
+        size = path.stat().st_size
+        feed(dashboard, 1000, start=1000)
+    assert path.stat().st_size == size
+    assert len(read(path)) > 0
+
+
 def feed(dashboard: Dashboard, ticks: int, start: int = 0) -> None:
     """Report ticks as fast as an emulated laboratory does."""
     values = tuple(float(i) for i in range(len(SIGNALS)))

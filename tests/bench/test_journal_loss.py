@@ -147,6 +147,23 @@ class TestAnotherProgramWrites:
         assert_whole(copy, 5)
 
 
+def test_a_copy_without_its_second_file_is_written_on_and_rescued(tmp_path, other_disk):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"rig.toml": b"[rig]"})
+    add(journal, 3)
+    journal.close()
+    assert files_of(tmp_path) == [FILE_NAME]
+    journal = Journal.reopen(tmp_path)
+    add(journal, 2)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(RecordError, match="was removed"):
+        add(journal, 1)
+    journal.close()
+    with Record(journal.path) as run:
+        assert run.steps()["step"].tolist()[:5] == list(range(5))
+        assert run.files() == {"rig.toml": b"[rig]"}
+    assert journal.path.is_relative_to(other_disk)
+
+
 class TestNoSpace:
     @pytest.fixture
     def full(self):
@@ -338,6 +355,23 @@ class TestReadOnlyMedium:
             assert len(files_of(other_disk)) == 1
         assert files_of(other_disk) == []
         journal.close()
+
+
+def test_one_whose_process_died_while_it_was_closed_is_read_from_a_copy(tmp_path, other_disk):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"rig.toml": b"[rig]"})
+    count = add(journal, 3)
+    journal.close()
+    with closing(sqlite3.connect(tmp_path / FILE_NAME, isolation_level=None)) as db:
+        # What SQLite would undo stands in a companion while it changes the file.
+        db.execute("PRAGMA cache_size=1")
+        db.execute("BEGIN IMMEDIATE")
+        db.execute("UPDATE steps SET label = hex(zeroblob(20000))")
+        copy = shutil.copytree(tmp_path, other_disk / "died")
+        db.execute("ROLLBACK")
+    with Record(copy) as run:
+        assert "was not closed" in run.remark
+        assert len(run.steps()) == count
+    assert f"{FILE_NAME}-journal" in files_of(copy)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")

@@ -1,4 +1,4 @@
-"""The CPU time of the T7 in process: a request, a loop at 20 kHz, and a glance of the whole rig. Asserts no time."""
+"""The CPU time of the T7 in process: a request, and a loop at 20 kHz. Asserts no time."""
 
 import time
 from statistics import median
@@ -84,11 +84,3 @@ def test_blocks_of_samples(rig, capsys):
     with capsys.disabled():
         costs = (f"{name} {cost:.1f} µs ({1e6 / RATE / cost:.1f} times)" for name, cost in found.items())
         print(f"\nblocks of {BLOCK} at 20 kHz, CPU time a sample:", ", ".join(costs))
-
-
-def test_a_glance_of_the_whole_rig(rig, capsys):
-    parts = {name: microseconds(device.glance, 500) for name, device in rig.devices.items()}
-    whole = microseconds(rig.glance, 500)
-    assert set(rig.glance()) == {signal.name for signal in rig.signals}
-    with capsys.disabled():
-        print(f"\nglance of hybrid: {whole:.0f} µs;", ", ".join(f"{name} {cost:.0f}" for name, cost in parts.items()))

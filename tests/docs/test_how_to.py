@@ -15,7 +15,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = DOCS / "how-to"
-EXECUTED = [*sorted(PAGES.glob("*.md")), DOCS / "reference" / "interlocks.md"]
+EXECUTED = [*sorted(PAGES.glob("*.md")), *(DOCS / "reference" / f"{name}.md" for name in ("campaign", "interlocks"))]
 BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

@@ -15,10 +15,10 @@ The exit code is 1 if anything has failed.
 """
 
 import argparse
+import faulthandler
 import io
 import json
 import math
-import multiprocessing
 import sys
 import tempfile
 import zlib
@@ -26,16 +26,19 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 
 from rich.console import Console
 
+from bench.clock import VIRTUAL_EPOCH
 from bench.errors import BenchError
 from bench.journal import Record
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
+from bench.workers import Workers
 
 HERE = Path(__file__).parent
 RIGS = ("vo2", "sma", "hybrid")
@@ -209,9 +212,11 @@ def _true(record, rig, name, laboratory):
     if name.endswith(LYING) or name in LYING_TOO:
         return "."
     times = [time for time, _ in laboratory.seen]
+    # The journal counts from the start of the run, the laboratory from the start of its clock.
+    start = (datetime.fromisoformat(record.meta["epoch"]) - VIRTUAL_EPOCH).total_seconds()
     for table, clock in ((record.telemetry(), "t"), (record.steps(), "finished")):
         for signal, (source, scale, tolerance) in SEEN[rig].items():
-            for t, value in zip(table[clock], table[signal], strict=True):
+            for t, value in zip(table[clock] + start, table[signal], strict=True):
                 window = laboratory.seen[max(bisect_left(times, t - AGE) - 1, 0) : bisect_right(times, t) + 1]
                 truths = [scale * values[source] + OFFSETS.get(signal, 0.0) for _, values in window]
                 if not min(truths) - tolerance <= value <= max(truths) + tolerance:
@@ -225,17 +230,26 @@ def cells(rigs=RIGS, word="", seeds=SEEDS):
 
 
 def judged(wanted, processes):
-    """Yield each cell as it is done; one that hangs is one of its failures."""
-    with multiprocessing.get_context("spawn").Pool(processes, maxtasksperchild=100) as pool:
-        waiting = [(cell, pool.apply_async(run_cell, cell)) for cell in wanted]
-        for (rig, name, seed), result in waiting:
+    """Yield each cell as it is done, in their order; one that hangs is one of its failures."""
+    # As a script this module has another name.
+    from matrix import run_cell_in_time
+
+    with Workers(processes, Console(), "fault matrix") as workers:
+        waiting = [(cell, workers.submit_as(" ".join(map(str, cell)), run_cell_in_time, *cell)) for cell in wanted]
+        for (rig, name, seed), pending in waiting:
             try:
-                yield result.get(LONGEST)
+                yield pending.result()
             except BenchError as error:
                 yield Cell(rig, name, seed, "refused", "", dict.fromkeys(CHECKS, ".") | {"ends": str(error)})
-            except multiprocessing.TimeoutError:
-                hung = dict.fromkeys(CHECKS, ".") | {"ends": f"not within {LONGEST:.0f} s of wall-clock time"}
-                yield Cell(rig, name, seed, "hung", "", hung)
+
+
+def run_cell_in_time(rig, name, seed):
+    """As `run_cell`; a run that hangs says where, and ends its process."""
+    faulthandler.dump_traceback_later(LONGEST, exit=True)
+    try:
+        return run_cell(rig, name, seed)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def table(done):
@@ -262,7 +276,7 @@ def main():
     parser.add_argument("--rig", choices=RIGS, action="append")
     parser.add_argument("--fault", default="", help="only faults with this in their name")
     parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--processes", type=int, help="one a core if not given")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     done = []

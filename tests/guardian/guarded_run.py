@@ -75,7 +75,7 @@ class GuardedRun:
     ) -> None:
         self._rig = rig
         command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{protocol}", "--rig", rig.name]
-        command += ["--attach", str(rig.endpoints_file)]
+        command += ["--attach", str(rig.endpoints_file), "--no-rehearse"]
         for option, values in (("--override", overrides), ("--set", parameters)):
             for key, value in values.items():
                 command += [option, f"{key}={value}"]

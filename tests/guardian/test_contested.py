@@ -20,9 +20,7 @@ LONGEST = 200.0
 
 
 def bench_run(*options):
-    # What a run does beside its instruments is not contested.
-    options = ("--rig", "vo2", "--no-rehearse", *options)
-    command = [sys.executable, "-P", "-m", "bench", "run", PROTOCOL, *options]
+    command = [sys.executable, "-P", "-m", "bench", "run", PROTOCOL, "--rig", "vo2", "--no-rehearse", *options]
     return subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

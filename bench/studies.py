@@ -9,20 +9,26 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 from rich.console import Console
 from rich.table import Table
 
 from bench.clock import Stopwatch
+from bench.compilation_display import CompilationDisplay
 from bench.errors import BenchError, ConfigurationError, DataError
-from bench.extras import MissingExtraError
+from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record
 from bench.protocol import find_protocol
-from bench.results.figures import check_matplotlib
 from bench.results.report import export_run
 from bench.results.tracking import TargetResults, target_results
 from bench.runs import Run, RunResult, carry_out
+from bench.workers import Pending, Workers, task_console
+
+P = ParamSpec("P")
+
+_TELLING = 20
+"""Longest setting that is part of a run's name, characters."""
 
 
 @dataclass
@@ -39,18 +45,18 @@ class Campaign:
         From which the seeds of the runs come; no two runs of any two seeds below 50 000 share theirs.
     live : bool
         Whether to serve the live view.
-    console : Console
-        Where to print.
-    runs : list of RunResult
-        What was carried out so far, in the parts of this campaign as well.
+    workers : Workers
+        Who carries the runs out, and draws the figures.
+    started : list of Pending
+        The runs that were started so far, in the parts of this campaign as well.
     """
 
     rig: str
     folder: Path
     seed: int
     live: bool
-    console: Console
-    runs: list[RunResult] = field(default_factory=list)
+    workers: Workers
+    started: list[Pending[RunResult]] = field(default_factory=list)
     _seeds: Iterator[int] = field(init=False)
     _whole: Campaign | None = None
 
@@ -60,48 +66,99 @@ class Campaign:
 
     def part(self, name: str, rig: str) -> Campaign:
         """Return a campaign on another rig, in a folder of its own below this one."""
-        return Campaign(rig, self.folder / name, self.seed, self.live, self.console, _whole=self)
+        return Campaign(rig, self.folder / name, self.seed, self.live, self.workers, _whole=self)
 
-    def figure(self, name: str) -> Path:
-        """Return the file of a figure, without its ending in `name`."""
-        return self.folder / "figures" / f"{name}.png"
+    @property
+    def runs(self) -> list[RunResult]:
+        """The runs of this campaign in the order in which they were started; waits for those that go on."""
+        return [run.result() for run in self.started]
 
-    def run(
+    def start(
         self,
         protocol: str,
         settings: Mapping[str, str],
         overrides: Mapping[str, str] | None = None,
         *,
         rig: str | None = None,
-    ) -> RunResult:
-        """Carry out one protocol, on another rig than the campaign's if one is given.
+    ) -> Pending[RunResult]:
+        """Have one protocol carried out beside others, on another rig than the campaign's if one is given.
 
-        Raises BenchError if it did not complete, or the safe state was not confirmed; its record is kept.
+        Its seed depends on how many were started before it. Its `result()` raises BenchError if the run did not
+        complete, or the safe state was not confirmed; its record is kept.
         """
-        definition = find_protocol(protocol)
+        telling = [f"{key}={value}" for key, value in settings.items() if len(value) <= _TELLING]
+        run = self.workers.submit_as(
+            " ".join([protocol, *telling]),
+            _carry_out,
+            protocol,
+            dict(settings),
+            rig or self.rig,
+            dict(overrides or {}),
+            next(self._seeds),
+            self.folder,
+            live=self.live,
+        )
+        self.started.append(run)
+        if self._whole is not None:
+            self._whole.started.append(run)
+        return run
+
+    def run(
+        self, protocol: str, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
+    ) -> RunResult:
+        """Carry out one protocol and wait for its end; see `start`."""
+        return self.start(protocol, settings, overrides).result()
+
+    def draw(self, name: str, plot: Callable[Concatenate[Path, P], None], *given: P.args, **named: P.kwargs) -> Path:
+        """Have a figure drawn beside what goes on; return its file.
+
+        Parameters
+        ----------
+        name : str
+            Name of the file, without its ending.
+        plot : callable
+            A function of a module that draws to the path of its first argument.
+        given, named
+            Its other arguments; can be pickled.
+        """
+        path = self.folder / "figures" / f"{name}.png"
+        self.workers.submit_as(f"figure {name}", plot, path, *given, **named)
+        return path
+
+
+def _carry_out(
+    protocol: str,
+    settings: Mapping[str, str],
+    rig: str,
+    overrides: Mapping[str, str],
+    seed: int,
+    folder: Path,
+    *,
+    live: bool,
+) -> RunResult:
+    """Carry one run of a campaign out."""
+    console = task_console()
+    with CompilationDisplay(console, console):
         result = carry_out(
             Run(
-                protocol=definition,
+                protocol=find_protocol(protocol),
                 settings=settings,
-                rig=rig or self.rig,
-                overrides=overrides or {},
-                seed=next(self._seeds),
+                rig=rig,
+                overrides=overrides,
+                seed=seed,
                 clock="virtual",
-                folder=self.folder,
-                live=self.live,
+                folder=folder,
+                live=live,
                 # Made from the journal afterwards, when the density is known and can be drawn with it.
                 recording=False,
             ),
-            self.console,
+            console,
         )
-        if result.outcome.error is not None:
-            raise result.outcome.error
-        if not result.outcome.is_safe:
-            raise BenchError(f"{protocol}: the safe state was not confirmed: {dict(result.outcome.safe_state)}")
-        self.runs.append(result)
-        if self._whole is not None:
-            self._whole.runs.append(result)
-        return result
+    if result.outcome.error is not None:
+        raise result.outcome.error
+    if not result.outcome.is_safe:
+        raise BenchError(f"{protocol}: the safe state was not confirmed: {dict(result.outcome.safe_state)}")
+    return result
 
 
 @dataclass(frozen=True)
@@ -170,7 +227,15 @@ class Study:
 
 
 def reproduce(
-    name: str, study: Study, *, rig: str | None = None, seed: int, out: Path, live: bool, console: Console
+    name: str,
+    study: Study,
+    *,
+    rig: str | None = None,
+    seed: int,
+    out: Path,
+    live: bool,
+    console: Console,
+    workers: int | None = None,
 ) -> dict[str, Any]:
     """Carry out a study, export the recordings of its runs, and print its tables.
 
@@ -189,27 +254,44 @@ def reproduce(
         Seed of the noise of the emulated laboratory, and of random sequences.
     out : Path
         Where that folder is made.
-    live, console
-        As in `Campaign`.
+    live : bool
+        Whether to serve the live view of each run; they are then carried out one after another.
+    console : Console
+        Where to print.
+    workers : int, optional
+        How many runs, figures and recordings are worked at beside each other; as many as there are cores if not
+        given. The values do not depend on it.
 
     Raises
     ------
     ConfigurationError
-        If a rig is given to a study that runs on several, or matplotlib is not installed.
+        If a rig is given to a study that runs on several, a live view is asked for with several workers, or
+        matplotlib is not installed.
     BenchError
         If a run did not complete; its record is kept.
     """
     if rig is not None and study.rig is None:
         raise ConfigurationError(f"--rig {rig}: the study {name} runs on several rigs of its own")
-    check_matplotlib()
-    stopwatch = Stopwatch()
-    campaign = Campaign(rig or study.rig or "", out / f"reproduce-{name}-seed-{seed}", seed, live, console)
-    found = study.carry_out(campaign)
+    if live and workers not in (None, 1):
+        raise ConfigurationError(f"--workers {workers}: with the live view runs follow one another; leave it out")
+    check_extra("a figure", "matplotlib", "report")
     try:
-        recordings = [export_run(run.folder, "rrd", None)[0] for run in campaign.runs]
+        check_extra("an .rrd file", "rerun", "dashboard")
+        recorded = True
     except MissingExtraError as error:
         console.print(f"no recordings: {error}", highlight=False, markup=False, soft_wrap=True)
-        recordings = []
+        recorded = False
+    stopwatch = Stopwatch()
+    folder = out / f"reproduce-{name}-seed-{seed}"
+    with Workers(1 if live else workers, console, name) as pool:
+        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool)
+        found = study.carry_out(campaign)
+        exports = [
+            pool.submit_as(f"recording of {run.folder.name}", export_run, run.folder, "rrd", None)
+            for run in campaign.runs
+            if recorded
+        ]
+        recordings = [export.result()[0] for export in exports]
     values = {
         "seed": seed,
         **found.values,

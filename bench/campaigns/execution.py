@@ -1,0 +1,161 @@
+"""Carrying out the tasks of a campaign: not those that were done before, and each once what it needs is there."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from bench.campaigns.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, Done, Task
+from bench.errors import BenchError, ConfigurationError
+from bench.locks import Holder, Locks
+from bench.workers import Pending, Workers
+
+FILE_NAME = "campaign.toml"
+"""Copy of the campaign file in the folder of the campaign."""
+
+
+class Executor(Protocol):
+    """Carries tasks out, many at a time."""
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out; all that it needs is in the folder of the campaign."""
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task that was submitted, and return it with what it left; its folder is there by then."""
+
+
+class WorkersExecutor:
+    """Carries tasks out in the worker processes of this machine.
+
+    Parameters
+    ----------
+    workers : Workers
+        That are at work.
+    campaign : Path
+        Folder of the campaign.
+    """
+
+    def __init__(self, workers: Workers, campaign: Path) -> None:
+        self._workers = workers
+        self._campaign = campaign
+        self._pending: dict[Pending[Done], Task] = {}
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out."""
+        self._pending[self._workers.submit_as(task.name, task.carry_out, self._campaign)] = task
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task."""
+        pending = next(iter(self._workers.as_completed(self._pending)))
+        task = self._pending.pop(pending)
+        return task, settled(task, pending.error, None if pending.error else pending.result())
+
+
+def settled(task: Task, error: BaseException | None, done: Done | None) -> Done:
+    """Return what a task left, also where it has raised."""
+    if done is not None:
+        return done
+    if isinstance(error, BenchError):
+        return Done(task.identity, "refused", str(error))
+    return Done(task.identity, "crashed", f"{type(error).__name__}: {error}")
+
+
+def opened_folder(campaign: Path, text: str, locks: Locks) -> None:
+    """Make the folder of a campaign ready, for one process at a time; what others left unfinished is removed.
+
+    Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
+    """
+    try:
+        campaign.mkdir(parents=True, exist_ok=True)
+        locks.take_folder(campaign)
+        shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
+        (campaign / FILE_NAME).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
+
+
+def holder(campaign: Path) -> Holder:
+    """Return who holds the folder of a campaign, for others."""
+    return Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")
+
+
+@dataclass(frozen=True)
+class Before:
+    """What earlier starts have left.
+
+    Attributes
+    ----------
+    done : dict of str to Done
+        By name of the task.
+    places : dict of str to str
+        By name of a task the one that it had then: what differs among the runs was something else.
+    """
+
+    done: dict[str, Done]
+    places: dict[str, str]
+
+    def put_in_place(self, campaign: Path) -> None:
+        """Rename the folders of tasks that have another name now."""
+        for name, former in self.places.items():
+            (campaign / name).parent.mkdir(parents=True, exist_ok=True)
+            (campaign / former).replace(campaign / name)
+
+
+def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
+    """Return what earlier starts have left of tasks in the folder of a campaign."""
+    found = {name: task.done_in(campaign / name) for name, task in tasks.items()}
+    done = {name: each for name, each in found.items() if each is not None}
+    missing = {task.identity[:SHOWN_DIGITS]: task for name, task in tasks.items() if name not in done}
+    places: dict[str, str] = {}
+    for file in campaign.glob(f"*/*/{DONE_NAME}") if missing else ():
+        former = file.parent.relative_to(campaign).as_posix()
+        task = missing.get(former[-SHOWN_DIGITS:])
+        if task is None or former in tasks or task.name in done:
+            continue
+        if (left := task.done_in(file.parent)) is not None:
+            done[task.name], places[task.name] = left, former
+    return Before({name: done[name] for name in tasks if name in done}, places)
+
+
+def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:
+    """Carry out all tasks that were not done before; return what each has left, by name, in the order of `tasks`.
+
+    A task whose needs could not be carried out is refused.
+    """
+    done: dict[str, Done] = dict(before)
+    missing = {name: {need for need in task.needs if need not in done} for name, task in tasks.items()}
+    users: dict[str, list[str]] = {}
+    for name, needs in missing.items():
+        for need in needs:
+            users.setdefault(need, []).append(name)
+    ready = [name for name, needs in missing.items() if name not in done and not needs]
+    going = 0
+    while ready or going:
+        for name in ready:
+            executor.submit(tasks[name])
+        going += len(ready)
+        task, result = executor.next_done()
+        going -= 1
+        ready = []
+        finished = [(task.name, result)]
+        while finished:
+            name, result = finished.pop()
+            done[name] = result
+            for user in users.get(name, ()):
+                missing[user].discard(name)
+                if user in done:
+                    continue
+                if not result.carried_out:
+                    reason = f"needs {name}, which was not carried out: {result.reason}"
+                    finished.append((user, Done(tasks[user].identity, "refused", reason)))
+                elif not missing[user]:
+                    ready.append(user)
+    return {name: done[name] for name in tasks}
+
+
+def all_carried_out(done: Sequence[Done]) -> bool:
+    """Return whether all that was asked for was carried out; a run that has failed was."""
+    return all(each.carried_out for each in done)

@@ -1,0 +1,193 @@
+"""The command that carries out a campaign."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bench.cli.console import JsonOption, console, error_console, show_compilation, write_json
+from bench.errors import AbortError
+
+if TYPE_CHECKING:
+    from bench.campaigns.expansion import Expansion
+    from bench.campaigns.tasks import Done
+
+app = typer.Typer()
+
+
+@app.command()
+@show_compilation()
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Campaign file; docs/reference/campaign.md.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the campaign; recordings/FILE if not given.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Worker processes; one a core if not given."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Scheduler of dask.distributed in the place of worker processes: tls://HOST:PORT, or "
+            "tcp://127.0.0.1:PORT.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, and list what would be carried out.")
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Carry out all runs, identifications and studies of a campaign file on emulated rigs, and tabulate the results.
+
+    Everything is checked before the first run. What an earlier start has done is not done again; a campaign that was
+    ended, or killed, goes on when it is started again. A run that an interlock or a fault ends is a result.
+
+    Exit codes: 0 all that was asked for was carried out; 1 something was not; 2 the file is wrong.
+    """
+    from bench.campaigns.execution import (
+        WorkersExecutor,
+        all_carried_out,
+        carry_out_tasks,
+        done_before,
+        holder,
+        opened_folder,
+    )
+    from bench.campaigns.expansion import expand
+    from bench.campaigns.file import read_campaign
+    from bench.campaigns.tasks import UNFINISHED
+    from bench.clock import Stopwatch
+    from bench.locks import Locks
+    from bench.workers import Workers, available_cores
+
+    stopwatch = Stopwatch()
+    expansion = expand(read_campaign(file))
+    folder = Path("recordings") / file.stem if out is None else out
+    if scheduler is not None:
+        from bench.campaigns.cluster import check_address
+
+        check_address(scheduler)
+    before = done_before(expansion.tasks, folder)
+    _announce(expansion, before.done, 1 if scheduler else workers or available_cores())
+    if dry_run:
+        _list(expansion, before.done)
+        write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
+        return
+    with ExitStack() as stack:
+        stack.enter_context(_saying_how_to_go_on(folder))
+        opened_folder(folder, file.read_text(encoding="utf-8-sig"), stack.enter_context(Locks(holder(folder))))
+        # Another process may have been at work here until it was locked.
+        before = done_before(expansion.tasks, folder)
+        before.put_in_place(folder)
+        if scheduler is not None:
+            from bench.campaigns.cluster import ClusterExecutor
+
+            done = carry_out_tasks(
+                expansion.tasks, before.done, stack.enter_context(ClusterExecutor(scheduler, folder, console))
+            )
+        else:
+            pool = stack.enter_context(Workers(workers, console, file.stem))
+            done = carry_out_tasks(expansion.tasks, before.done, WorkersExecutor(pool, folder))
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+    files = _show(expansion, done, folder)
+    failed = {name: each for name, each in done.items() if not each.carried_out}
+    for name, each in failed.items():
+        error_console.print(f"{each.status}: {name}: {each.reason}", highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"{len(done) - len(failed)} of {len(done)} carried out, {len(before.done)} of them before, "
+        f"in {stopwatch.seconds():.1f} s: {folder}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+    write_json(
+        json_file,
+        {
+            "folder": str(folder),
+            "files": [str(path) for path in files],
+            "tasks": {
+                name: {"status": each.status, "reason": each.reason, "results": dict(each.results)}
+                for name, each in done.items()
+            },
+        },
+    )
+    if not all_carried_out([*done.values()]):
+        sys.exit(1)
+
+
+@contextmanager
+def _saying_how_to_go_on(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except AbortError as error:
+        raise AbortError(f"{error}; what is done is in {folder}, and the same command goes on from there") from None
+
+
+def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None:
+    left = [name for name in expansion.tasks if name not in before]
+    estimate = expansion.estimate(left)
+    counts = dict.fromkeys(("run", "model", "study"), 0)
+    for name in left:
+        counts[expansion.tasks[name].describe()["kind"]] += 1
+    plural = {"run": "runs", "model": "models", "study": "studies"}
+    text = ", ".join(f"{count} {kind if count == 1 else plural[kind]}" for kind, count in counts.items() if count)
+    line = f"{text or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
+    if estimate.laboratory_seconds:
+        on = "1 core" if cores == 1 else f"{cores} cores"
+        hours, wall = estimate.laboratory_seconds / 3600, _duration(estimate.wall_seconds / cores)
+        line += f"; {hours:.1f} h of laboratory time, {wall} on {on}"
+        if estimate.unknown:
+            line += f", and {estimate.unknown} tasks of unknown length"
+    console.print(line, highlight=False)
+
+
+def _duration(seconds: float) -> str:
+    # The pace of the plant alone is known: what a run takes besides counts among short ones.
+    if seconds < 60:
+        return "less than a minute"
+    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
+
+
+def _list(expansion: Expansion, before: dict[str, Done]) -> None:
+    for name in expansion.tasks:
+        planned = expansion.plans.get(name)
+        parts = [name, f"{planned[0]:.0f} s" if planned else "", before[name].status if name in before else ""]
+        console.print(", ".join(filter(None, parts)), highlight=False, markup=False, soft_wrap=True)
+
+
+def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Path]:
+    """Print the tables and write them to files; return these."""
+    from bench.campaigns.results import (
+        ResultsTable,
+        in_one_cell,
+        over_seeds,
+        runs_table,
+        shown_columns,
+        studies_table,
+        study_values,
+        together,
+        write_tables,
+    )
+
+    summaries: dict[str, ResultsTable] = {}
+    tables = {name: runs_table(expansion, done, name) for name in expansion.varying}
+    for name, table in tables.items():
+        shown_columns(table, expansion.varying[name]).print(name, console)
+        if "seed" in expansion.varying[name]:
+            summaries[name] = over_seeds(table, expansion.varying[name])
+            in_one_cell(summaries[name]).print(f"{name}: median / worst over the seeds", console)
+    files = {"results": together(tables.values())} if tables else {}
+    if summaries:
+        files["summary"] = together(summaries.values())
+    studies = studies_table(expansion, done)
+    if len(studies):
+        studies.print("studies, over the seeds", console, most=200)
+        files |= {"studies": studies, "study-values": study_values(expansion, done)}
+    return write_tables(files, folder, console)

@@ -1,0 +1,404 @@
+"""Campaigns: the file, its tasks, what is done again, and the tables."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import threading
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from bench import registry
+from bench.campaigns.cluster import ClusterExecutor, check_address
+from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
+from bench.campaigns.expansion import expand
+from bench.campaigns.file import read_campaign
+from bench.campaigns.tasks import DONE_NAME, UNFINISHED
+from bench.cli import main
+from bench.errors import ConfigurationError
+from bench.journal import Record
+from bench.locks import Holder, Locks
+from bench.runs import carry_out
+from bench.studies import Study, StudyResult
+from bench.workers import Workers
+
+PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
+STAIRS = f'''
+[[runs]]
+name = "climb"
+protocol = "{PROTOCOLS}:stairs"
+rigs = "heater.toml"
+seeds = [3, 5]
+[runs.parameters]
+increment = [5.0, 10.0]
+'''
+CHAIN = """
+[[runs]]
+name = "characterize"
+protocol = "damped-oscillation"
+rigs = ["vo2"]
+seeds = "0..1"
+[runs.parameters]
+increment = 8.0
+half_cycles = 6
+dwell = 2.0
+
+[[models]]
+name = "density"
+runs = "characterize"
+model = "preisach-nonmonotonic"
+levels = 6
+plane = [30.0, 70.0]
+
+[[runs]]
+name = "track"
+protocol = "tracking"
+rigs = ["vo2"]
+seeds = "0..1"
+seed_offset = 1000
+[runs.parameters]
+model = "@density"
+count = 2
+[runs.overrides]
+emulation.session_offset = [0.1, 0.2]
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path, rig_file):
+    """Write a campaign file beside the heater's rig file."""
+    rig_file()
+
+    def write(text, *replacements):
+        for old, new in replacements:
+            assert old in text, old
+            text = text.replace(old, new)
+        path = tmp_path / "night.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def start(*arguments):
+    """Return the exit code of `bench campaign`."""
+    with pytest.raises(SystemExit) as end:
+        main(["campaign", *map(str, arguments)])
+    return end.value.code
+
+
+def content(folder):
+    """Everything that a run measured, and what happened in it."""
+    with Record(folder) as record:
+        tables = record.steps(), record.telemetry()
+        return [
+            {name: column.tobytes() for name, column in table.columns.items()} for table in tables
+        ], record.events()
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class TestFile:
+    @pytest.mark.parametrize(
+        ("old", "new", "said"),
+        [
+            (
+                "seeds",
+                "seed",
+                r"night\.toml: runs\.0\.seed: there is no such key; allowed are: name, protocol, rigs,",
+            ),
+            ("[3, 5]", '"5..3"', r"runs\.0\.seeds = '5\.\.3': expected a list such as .* or a range"),
+            ("[3, 5]", "[3, 3]", r"3 is there twice"),
+            ("[3, 5]", "[]", r"expected at least one"),
+            ("[3, 5]", "[-1]", r"runs\.0\.seeds\.0 = -1: .* greater than or equal to 0"),
+            ("[5.0, 10.0]", "[]", r"runs\.0 \(climb\): parameters\.increment = \[\]: expected at least one value"),
+            (
+                "[5.0, 10.0]",
+                "[5.0, 99.0]",
+                r"night\.toml: runs\.0 \(climb\): parameters \(rig heater, increment = 99\.0\): protocol stairs: "
+                r"parameter increment = 99\.0 is not allowed; allowed: -50 to 50 K",
+            ),
+            (
+                "increment",
+                "incrememt",
+                r"there is no parameter 'incrememt'; there are: count, dwell, start, increment",
+            ),
+            (
+                "[5.0, 10.0]",
+                "[5.0, 30.0]",
+                r"increment = 30\.0\): protocol stairs would set tec to between 30 and 120 .* allows .* 95",
+            ),
+            ("heater.toml", "haeter.toml", r"runs\.0 \(climb\): rigs = 'haeter\.toml': rig file .* cannot be read"),
+            ('"heater.toml"', '"heater"', r"rigs = 'heater': there is no rig 'heater'; there are: .*vo2"),
+            ('"heater.toml"', '["vo2-hardware"]', r"rigs = 'vo2-hardware': .*not all instruments are emulated"),
+            ("heater_protocols.py:stairs", "heater_protocols.py:stars", r"has no protocol 'stars'; it has: stairs"),
+            ('name = "climb"\n', "", r"runs\.0: name is missing; a table with several protocols"),
+            (
+                "[[runs]]",
+                "[[runs]]\nfaults = 'none.toml'",
+                r"faults = 'none\.toml', rig heater: .*none\.toml cannot be",
+            ),
+            ("[[runs]]", "most_runs = 3\n[[runs]]", r"1 × 1 × 2 × 1 × 2 runs make 4 .*; most_runs = 3 are allowed"),
+            ("5.0, 10.0", ", ".join(map(str, range(200))), r"1 × 1 × 2 × 1 × 200 runs make 400"),
+            (
+                "[runs.parameters]",
+                "[runs.overrides]\n'emulation.noise' = [0.1, -1]\n[runs.parameters]",
+                r"rigs = 'heater\.toml' with overrides \{'emulation\.noise': '-1'\}: .*emulation\.noise = -1",
+            ),
+            (
+                "[[runs]]",
+                "[[studies]]\nname = 'v02'\n[[runs]]",
+                r"studies\.0 \(v02\): name = 'v02': there is no study",
+            ),
+            ("[[runs]]", "[runs", r"night\.toml: not valid TOML"),
+            (STAIRS, "", r"night\.toml: asks for nothing; expected tables \[\[runs\]\] or \[\[studies\]\]"),
+            (STAIRS, STAIRS + STAIRS, r"runs\.1 \(climb\): name = 'climb': an earlier table has this name"),
+        ],
+    )
+    def test_what_is_wrong_is_said_before_anything_moves(self, campaign, old, new, said, tmp_path, capsys):
+        path = campaign("most_runs = 300\n" * ("range" in said or "400" in said) + STAIRS, (old, new))
+        assert start(path, "--out", tmp_path / "out") == 2
+        assert not (tmp_path / "out").exists()
+        with pytest.raises(ConfigurationError, match=said):
+            expand(read_campaign(path))
+        assert "Traceback" not in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("old", "new", "said"),
+        [
+            ("@density", "@densty", r"runs\.1 \(track\): parameters\.model = '@densty': .* there are: @density"),
+            ('runs = "characterize"', 'runs = "charac"', r"models\.0 \(density\): runs = 'charac': .* characterize"),
+            ("preisach-nonmonotonic", "preisak", r"model = 'preisak': there is no such model; there are: .*preisach"),
+            ("levels = 6", "levels = 6\nseed = 9", r"models\.0 \(density\): seed = 9: .* it has: 0, 1"),
+            (
+                '"0..1"\nseed_',
+                '"0..2"\nseed_',
+                r"parameters\.model = '@density': characterize has no run on vo2 with seed 2",
+            ),
+            (
+                "levels = 6",
+                "levls = 6",
+                r"models\.0 \(density\)\.levls: there is no such key; allowed are: levels, plane,",
+            ),
+            ("levels = 6", "levels = -6", r"models\.0 \(density\): .*-6.* \(rig vo2\)"),
+            (
+                "levels = 6",
+                "output = 'x'",
+                r"models\.0 \(density\): output = 'x': there is no such signal; .*curvature",
+            ),
+            ("count = 2", "count = 1", r"parameter count = 1 is not allowed; allowed: 2 to 10000"),
+        ],
+    )
+    def test_models_have_to_be_there(self, campaign, old, new, said):
+        with pytest.raises(ConfigurationError, match=said):
+            expand(read_campaign(campaign(CHAIN, (old, new))))
+
+
+class TestTasks:
+    def test_a_folder_is_named_by_what_differs(self, campaign):
+        tasks = expand(read_campaign(campaign(STAIRS))).tasks
+        assert [name.rpartition("-")[0] for name in tasks] == [
+            f"climb/increment={increment}-seed={seed}" for increment in (5.0, 10.0) for seed in (3, 5)
+        ]
+
+    def test_the_identity_is_that_of_all_that_determines_the_results(self, campaign, tmp_path):
+        program = tmp_path / "mine.py"
+        program.write_text(PROTOCOLS.read_text())
+        text = STAIRS.replace(str(PROTOCOLS), "mine.py")
+
+        def identity(*replacements):
+            return next(iter(expand(read_campaign(campaign(text, *replacements))).tasks.values())).identity
+
+        first = identity()
+        # Other runs, other names, and defaults that are written down do not matter.
+        assert identity(("[3, 5]", "[3, 7]")) == first
+        assert identity(("increment", "count = 4\nincrement")) == first
+        found = {
+            first,
+            identity(("[3, 5]", "[4]")),
+            identity(("[5.0, 10.0]", "5.5")),
+            identity(("[3, 5]", "[3]\nseed_offset = 7")),
+            identity(("[3, 5]", "[3]\ninterlock_rate = 2")),
+            identity(("[runs.parameters]", "[runs.overrides]\ntelemetry.period = 1.5\n[runs.parameters]")),
+        }
+        program.write_text(program.read_text() + "# changed\n")
+        assert len(found | {identity()}) == 7
+        rig = tmp_path / "heater.toml"
+        rig.write_text(rig.read_text().replace("high = 90.0", "high = 91.0"))
+        assert len(found | {identity()}) == 7
+
+    def test_a_campaign_is_one_table_and_goes_on_where_it_was(self, campaign, tmp_path, capsys):
+        path, out = campaign(CHAIN), tmp_path / "out"
+        assert start(path, "--out", out, "--workers", 1, "--json", tmp_path / "first.json") == 0
+        assert "6 runs, 2 models to do; " in capsys.readouterr().out
+        first = json.loads((tmp_path / "first.json").read_text())["tasks"]
+        assert {task["status"] for task in first.values()} == {"completed"}
+        assert not (out / UNFINISHED).exists()
+        found = rows(out / "results.csv")
+        assert [row["seed"] for row in found] == ["0", "1", "0", "1", "0", "1"]
+        characterized, tracked = found[:2], found[2:]
+        assert all(float(row["density_rms [1/m]"]) > 0.0 and not row["tracking_rms [1/m]"] for row in characterized)
+        assert all(0.0 < float(row["tracking_rms [1/m]"]) < 300.0 for row in tracked)
+        assert [row["emulation.session_offset"] for row in tracked] == ["0.1", "0.1", "0.2", "0.2"]
+        schema = pq.read_schema(out / "results.parquet")
+        assert schema.field("tracking_seconds_per_target [s]").metadata == {b"unit": b"s"}
+        assert schema.field("seed").type == "int64"
+        summary = rows(out / "summary.csv")
+        assert [row["runs"] for row in summary] == ["2", "2", "2"]
+        of_track = sorted(float(row["tracking_rms [1/m]"]) for row in tracked[:2])
+        assert float(summary[1]["tracking_rms worst [1/m]"]) == of_track[1]
+        assert float(summary[1]["tracking_rms median [1/m]"]) == pytest.approx(sum(of_track) / 2)
+
+        # One run was lost, the seed of others is new, and a folder is named by less; the rest is not done again.
+        (out / tracked[0]["folder"] / DONE_NAME).unlink()
+        (out / UNFINISHED / "died").mkdir(parents=True)
+        path = campaign(CHAIN, ("0..1", "0..2"), ("[0.1, 0.2]", "0.1"))
+        assert start(path, "--out", out, "--workers", 1, "--json", tmp_path / "second.json") == 0
+        said = capsys.readouterr().out
+        assert "3 runs, 1 model to do, 5 done before; " in said
+        assert "9 of 9 carried out, 5 of them before" in said
+        assert not (out / UNFINISHED).exists()
+        second = json.loads((tmp_path / "second.json").read_text())["tasks"]
+        again = [second[row["folder"]]["results"] for row in rows(out / "results.csv")[3:5]]
+        before = [first[row["folder"]]["results"] for row in tracked[:2]]
+        # Done again, so that it took another time; not done again.
+        assert again[0].pop("wall_time") != before[0].pop("wall_time")
+        assert again == before
+
+    def test_a_run_that_an_interlock_ends_is_a_result(self, campaign, tmp_path, capsys):
+        path = campaign(STAIRS, ("[5.0, 10.0]", "[5.0, 20.0]\ndwell = 30"), ("[3, 5]", "3"))
+        assert start(path, "--out", tmp_path / "out", "--workers", 1) == 0
+        completed, failed = rows(tmp_path / "out" / "results.csv")
+        assert (completed["status"], failed["status"]) == ("completed", "failed")
+        assert "probe_temperature" in failed["reason"]
+        assert start(path, "--out", tmp_path / "out", "--workers", 1) == 0
+        assert "nothing to do, 2 done before" in capsys.readouterr().out
+
+    def test_a_defect_is_named_and_its_run_done_again(self, campaign, tmp_path, capsys):
+        program = tmp_path / "mine.py"
+        text = PROTOCOLS.read_text()
+        program.write_text(
+            text.replace(
+                'yield Note(f"step',
+                "assert reading['probe_temperature'] < 35.0 or not reading.step\n        yield Note(f\"step",
+            )
+        )
+        assert program.read_text() != text
+        path = campaign(STAIRS.replace(str(PROTOCOLS), "mine.py"), ("[3, 5]", "3"), ("[5.0, 10.0]", "[0.0, 5.0]"))
+        assert start(path, "--out", tmp_path / "out", "--workers", 1) == 1
+        assert "crashed: climb/increment=5.0-" in capsys.readouterr().err
+        assert start(path, "--out", tmp_path / "out", "--workers", 1) == 1
+        assert "1 run to do, 1 done before" in capsys.readouterr().out
+
+    def test_one_process_at_a_time_works_in_a_folder(self, campaign, tmp_path, capsys):
+        path, out = campaign(STAIRS), tmp_path / "out"
+        with Locks(Holder.of_this_process("emulated", "the other")) as locks:
+            opened_folder(out, "", locks)
+            assert start(path, "--out", out, "--workers", 1) == 2
+        assert "out is in use: " in capsys.readouterr().err
+
+    def test_nothing_is_done_in_a_dry_run(self, campaign, tmp_path, capsys):
+        assert start(campaign(STAIRS), "--out", tmp_path / "out", "--dry-run") == 0
+        said = capsys.readouterr().out
+        assert said.startswith("4 runs to do; 0.0 h of laboratory time, less than a minute on ")
+        assert said.count("climb/increment=") == 4
+        assert not (tmp_path / "out").exists()
+
+
+def the_study(series):
+    """A study of one run."""
+    reached = series.run(f"{PROTOCOLS}:stairs", {"count": "2"})
+    return StudyResult({"seed": series.seed, "nested": {"steps": reached.outcome.steps}, "word": "no"}, (), ())
+
+
+def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys):
+    study = Study(str(tmp_path / "heater.toml"), "", "", the_study)
+    monkeypatch.setattr(registry, "load", lambda *_: study)
+    path = campaign("[[studies]]\nname = 'climbs'\nseeds = [1, 2, 6]\n")
+    assert start(path, "--out", tmp_path / "out", "--workers", 1) == 0
+    by_number = {row["number"]: row for row in rows(tmp_path / "out" / "studies.csv")}
+    assert set(by_number) == {"seed", "nested.steps"}
+    assert [float(by_number["seed"][head]) for head in ("seeds", "median", "worst", "spread")] == [3, 2, 6, 5]
+    assert len(rows(tmp_path / "out" / "study-values.csv")) == 6
+    assert "studies, over the seeds" in capsys.readouterr().out
+
+
+def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_path):
+    path = campaign(STAIRS, ("increment = [5.0, 10.0]", "increment = 0.0\ncount = 800"))
+    expansion = expand(read_campaign(path))
+    out = tmp_path / "out"
+    killed = []
+    with Workers(2) as workers:
+
+        def kill_one():
+            # Once its journal is there a run is going on, for a second at least.
+            while not any(out.glob(f"{UNFINISHED}/*/*/journal.sqlite")):
+                if over.wait(0.01):
+                    return
+            process = next(iter(workers._processes))
+            os.kill(process.pid, signal.SIGKILL)
+            killed.append(process.pid)
+
+        over = threading.Event()
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        done = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, out))
+        over.set()
+        killer.join()
+    assert killed
+    assert [each.status for each in done.values()] == ["completed", "completed"]
+    assert done_before(expansion.tasks, out).done == done
+    for task in expansion.tasks.values():
+        alone = carry_out(task.run(out, tmp_path / "alone"), Console(quiet=True))
+        assert content(alone.folder) == content(out / task.name)
+
+
+@pytest.mark.parametrize("address", ["tls://lab-7:8786", "tcp://127.0.0.1:8786", "tcp://localhost:1", "[::1]:8786"])
+def test_a_scheduler_is_encrypted_or_here(address):
+    check_address(address)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://lab-7:8786", "10.0.0.7:8786", "ws://127.0.0.1:80", "tls://", "", "://127.0.0.1:1"]
+)
+def test_no_other_scheduler_is_trusted(address, campaign, tmp_path, capsys):
+    with pytest.raises(
+        ConfigurationError, match=r"is unpickled, .* expected tls://HOST:PORT, .* or tcp://127\.0\.0\.1"
+    ):
+        check_address(address)
+    if address == "tcp://lab-7:8786":
+        assert start(campaign(STAIRS), "--out", tmp_path / "out", "--scheduler", address) == 2
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
+    distributed = pytest.importorskip("distributed")
+    program = tmp_path / "mine.py"
+    program.write_text(PROTOCOLS.read_text())
+    # What the rig file imports goes with it if it stands beside it; here it is found nowhere else.
+    shutil.copy(Path(__file__).with_name("heater_laboratory.py"), tmp_path / "shipped_laboratory.py")
+    chain = CHAIN.replace("0..1", "0..0").replace("[0.1, 0.2]", "0.1")
+    path = campaign(chain + STAIRS.replace(str(PROTOCOLS), "mine.py"), ("[3, 5]", "3"), ("[5.0, 10.0]", "5.0"))
+    rig_file(("heater_laboratory:", "shipped_laboratory:"))
+    # Its processes begin with the import path of this one, so they come before the folder of the rig is on it.
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        expansion = expand(read_campaign(path))
+        with ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor:
+            there = carry_out_tasks(expansion.tasks, {}, executor)
+    with Workers(1) as workers:
+        here = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, tmp_path / "here"))
+    assert [(each.status, each.reason) for each in there.values()] == [("completed", "")] * 4
+    assert done_before(expansion.tasks, tmp_path / "there").done == there
+    for name, task in expansion.tasks.items():
+        assert there[name].identity == here[name].identity
+        if task.describe()["kind"] == "run":
+            assert content(tmp_path / "there" / name) == content(tmp_path / "here" / name)

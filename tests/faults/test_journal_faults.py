@@ -1,0 +1,63 @@
+"""A small part of the journal's faults and kills; `make journal-faults` and `make journal-kills` run all of it."""
+
+import importlib.util
+import json
+import sqlite3
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from bench.journal import Journal, Record, keeping
+from bench.journal.store import Store
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def faults():
+    spec = importlib.util.spec_from_file_location("journal_faults", HERE / "journal_faults.py")
+    module = importlib.util.module_from_spec(spec)
+    # It finds the fault matrix beside it.
+    path = list(sys.path)
+    spec.loader.exec_module(module)
+    sys.path[:] = path
+    return module
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+@pytest.mark.parametrize(("rig", "fault"), [("vo2", "page"), ("sma", "removed"), ("hybrid", "eio")])
+def test_no_acknowledged_row_is_lost_and_the_rig_is_safe(faults, monkeypatch, rig, fault):
+    # What the fault replaces is put back afterwards.
+    for owner, name in ((Journal, "step"), (Store, "_connect"), (tempfile, "tempdir")):
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+    monkeypatch.setattr(keeping, "_LAST_WAIT", 0.05)
+    cell = faults.run_cell(rig, fault, "virtual")
+    assert cell.verdict == "ok", cell
+    assert cell.ended == "failed (8)"
+
+
+def test_a_run_whose_journal_stays_locked_has_a_code_of_its_own(bench, monkeypatch, tmp_path):
+    def locked(store, entries):
+        raise sqlite3.OperationalError("database is locked")
+
+    monkeypatch.setattr(Store, "write", locked)
+    code, _, err = bench(
+        "run", f"{HERE / 'excursions.py'}:excursion-vo2", "--rig", "vo2", "--clock", "virtual",
+        "--out", tmp_path / "runs",
+    )  # fmt: skip
+    assert code == 8
+    assert "database is locked" in err
+    assert "bench recover-journal" in err
+    monkeypatch.undo()
+    (folder,) = (tmp_path / "runs").iterdir()
+    with Record(folder) as record:
+        assert (record.status, len(record.steps())) == ("unfinished", 0)
+    code, _, err = bench("recover-journal", folder, "--json", tmp_path / "found.json")
+    assert (code, err) == (0, "")
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["tables"]["steps"] == {"good": 0, "added": 16, "missing": 0, "first_bad": "0"}
+    with Record(Path(found["copy"])) as record:
+        assert (record.status, len(record.steps())) == ("failed", 16)
+        assert set(record.meta["safe_state"].values()) == {"safe"}
