@@ -83,6 +83,8 @@ class RunAtHand:
         What the operator and the system ask for.
     ask : callable, optional
         Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
+    zero : float, optional
+        Time of the clock at which the record begins to count, s; now if not given.
 
     Attributes
     ----------
@@ -95,7 +97,7 @@ class RunAtHand:
     trace : dict of str to float
         What a controller thinks, for the record.
     zero : float
-        Time of the clock at which the run started, s.
+        Time of the clock at which the record begins to count, s.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class RunAtHand:
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None,
+        zero: float | None = None,
     ) -> None:
         self.station = station
         self.clock = station.clock
@@ -114,7 +117,7 @@ class RunAtHand:
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
-        self.zero = self.clock.now()
+        self.zero = self.clock.now() if zero is None else zero
         self.ask = ask
         self._journal = journal
         self._observers = tuple(observers)
