@@ -50,6 +50,13 @@ LAYOUTS = {
     "plain": (table(), ("U", "y"), None, "comma-separated"),
     "semicolon": (table(";"), ("U", "y"), None, "semicolon-separated"),
     "tab": (table("\t"), ("U", "y"), None, "tab-separated"),
+    "bar": (table("|"), ("U", "y"), None, "separated by |"),
+    "names, units and remarks": (
+        "time\tU\ty\ns\tV\tµm\n\t\tfiltered\n" + body("\t"), ("U", "y"), UNITS, "units from a row"
+    ),
+    "unit row, and a number in the preamble": (
+        "x-axis,1,2\ntime,U,y\ns,V,µm\n" + body(), ("U", "y"), UNITS, "1 line above the header, units from a row"
+    ),
     "runs of blanks": (table("   "), ("U", "y"), None, "separated by blanks"),
     "aligned blanks": (
         "".join("  " + line.replace(",", "    ") + "  \n" for line in table().splitlines()),
@@ -449,3 +456,91 @@ def test_many_rows_are_read_as_numpy_reads_them(tmp_path):
     np.testing.assert_array_equal(columns.values["u"], array[:, 1])
     np.testing.assert_array_equal(columns.values["y"], array[:, 2])
     assert columns.assumptions == "tab-separated, header from a comment, 1 line of comment"
+
+
+MODEL = ("--model", "polynomial", "--degree", "3")
+
+
+class TestCommands:
+    """Identify from a file of decimal commas, and apply the model to the same values in other layouts."""
+
+    COLUMNS = ("--input", "U", "--output", "y")
+    CONTENT = table(";", ",", WITH_UNITS)
+
+    @pytest.fixture
+    def model(self, bench, tmp_path):
+        path = tmp_path / "model.json"
+        file = write(tmp_path, self.CONTENT)
+        code, out, err = bench("identify", file, *self.COLUMNS, *MODEL, "--out", path)
+        assert (code, err) == (0, "")
+        assert "read data.txt: semicolon-separated, decimal comma\n" in out
+        return path
+
+    def test_the_model_is_that_of_plain_numbers(self, bench, model, tmp_path):
+        plain = write(tmp_path, table(heads=WITH_UNITS), "plain.csv")
+        again = tmp_path / "again.json"
+        bench("identify", plain, *self.COLUMNS, *MODEL, "--out", again)
+        assert again.read_text() == model.read_text().replace("data.txt", "plain.csv")
+
+    @pytest.mark.parametrize("command", ["identify", "predict", "invert", "compare"])
+    def test_options_of_the_layout(self, bench, model, tmp_path, command):
+        content = "written by hand; 3 4\n" + "\n".join("5,6;7,8;9,1" for _ in range(20)) + "\n\ntime;U\n"
+        content += "".join(f"{number(u, ',')};{number(y, ',')}\n" for u, y in zip(U, Y, strict=True))
+        file = write(tmp_path, content.encode("utf-16"), "other.dat")
+        options = (
+            "--delimiter", ";", "--decimal", "comma", "--encoding", "utf-16", "--skip-lines", "1", "--table", "2"
+        )  # fmt: skip
+        arguments = {
+            "identify": ("identify", file, "--input", "1", "--output", "2", *MODEL),
+            "predict": ("predict", model, file, "--input", "1", "--output", "2", "--out", tmp_path / "p.csv"),
+            "invert": ("invert", model, file, "--column", "2", "--out", tmp_path / "i.csv"),
+            "compare": ("compare", model, "--data", file, "--input", "1", "--output", "2"),
+        }[command]
+        code, out, err = bench(*arguments, *options)
+        assert (code, err) == (0, "")
+        assert "read other.dat: UTF-16, table 2, semicolon-separated, decimal comma\n" in out
+        code, _, err = bench(*arguments, *options[:-2])
+        assert code == 3
+        assert "has 2 tables" in err
+        assert "--table" in err
+
+    @pytest.mark.parametrize(
+        ("option", "name", "exit_code"),
+        [("--out", "none/a", 3), ("--json", "none/a", 2), ("--figures", "data.txt/a", 3)],
+    )
+    @pytest.mark.parametrize("command", ["identify", "predict", "invert", "compare"])
+    def test_outputs_are_checked_first(self, bench, model, tmp_path, command, option, name, exit_code):
+        absent = tmp_path / "absent.csv"
+        arguments = {
+            "identify": ("identify", absent, *self.COLUMNS, *MODEL),
+            "predict": ("predict", model, absent, "--input", "U"),
+            "invert": ("invert", model, absent, "--column", "y"),
+            "compare": ("compare", model, "--data", absent),
+        }[command]
+        without = {"predict": ("--figures",), "invert": ("--figures",), "compare": ("--out",)}.get(command, ())
+        if option in without:
+            pytest.skip(f"{command} has no {option}")
+        if command == "predict" and option != "--out":
+            arguments += ("--out", tmp_path / "p.csv")
+        found, out, err = bench(*arguments, option, tmp_path / name)
+        assert (found, out) == (exit_code, "")
+        assert f"error: {option} " in err
+        assert "absent.csv" not in err
+
+    def test_wrong_options_are_one_message(self, bench, tmp_path):
+        file = write(tmp_path, self.CONTENT)
+        code, _, err = bench("identify", file, *self.COLUMNS, *MODEL, "--decimal", "dot")
+        assert (code, err) == (2, "error: --decimal 'dot': expected point or comma\n")
+        code, _, err = bench("compare", file, file, "--decimal", "comma")
+        assert code == 2
+        assert "for models, with --data" in err
+
+    def test_from_python(self, tmp_path):
+        import bench
+
+        file = write(tmp_path, self.CONTENT)
+        found = bench.identify(
+            file, "polynomial", degree=3, input="2", output="3", decimal=",", delimiter="semicolon"
+        )
+        np.testing.assert_array_equal(found.inputs, U)
+        assert found.file.operator.output_unit == "µm"

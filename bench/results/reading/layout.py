@@ -30,7 +30,13 @@ NUMBER = {
 }
 """A number, by its decimal sign."""
 
-_DELIMITERS = {"\t": "tab-separated", ";": "semicolon-separated", ",": "comma-separated", " ": "separated by blanks"}
+_DELIMITERS = {
+    "\t": "tab-separated",
+    ";": "semicolon-separated",
+    "|": "separated by |",
+    ",": "comma-separated",
+    " ": "separated by blanks",
+}
 # The strongest first: what stands in a text is rarely a tab.
 
 
@@ -151,6 +157,7 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
     for delimiter in [options.delimiter] if options.delimiter else list(_DELIMITERS):
         assert delimiter is not None
         rows = list(split_rows(lines, delimiter, first))
+        signs: list[tuple[tuple[int, int, float], Layout]] = []
         for decimal in [options.decimal] if options.decimal else [".", ","]:
             assert decimal is not None
             header = find_header(rows, decimal, delimiter)
@@ -164,15 +171,21 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             comments = sum(is_comment(line, comment_marks(delimiter)) for line in lines[: header.start - first])
             notes = _notes(lines[: header.start - first], comments, header, delimiter, decimal)
             layout = Layout(delimiter, decimal, header.start, header.heads, header.columns, notes, comments)
-            found.append(((header.fit, numbers, numbers / len(filled)), layout))
+            signs.append(((header.fit, numbers, numbers / len(filled)), layout))
+        # The decimal sign is the one with which more are numbers, whether or not a header fits.
+        found += sorted(signs, key=lambda entry: -entry[0][1])[:1]
     if not found:
         return None
     # Of equals the first: the point before the comma, the stronger delimiter before the weaker.
     rank, layout = max(found, key=lambda entry: entry[0])
     if options.delimiter is None and options.decimal is None:
-        rivals = [other.delimiter for same, other in found if same == rank]
+        rivals = [
+            other
+            for same, other in found
+            if same == rank and other.columns != layout.columns and "," in (layout.delimiter, other.delimiter)
+        ]
         cells = [row for row in split_rows(lines, layout.delimiter, first) if row.line > layout.start]
-        if {",", " "} <= {*rivals} or (layout.delimiter == "," and rank[0] < 2 and _may_be_decimal(cells, layout)):
+        if rivals or (layout.delimiter == "," and rank[0] < 2 and _may_be_decimal(cells, layout)):
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
                 "--delimiter comma, or --decimal comma; where it is both, save the file with another delimiter"
@@ -184,7 +197,7 @@ def header_only(lines: Sequence[str], options: ReadingOptions, first: int = 0) -
     """Return the layout of lines without any number: the first row is the header; None if there is no row."""
     rows = {
         delimiter: list(split_rows(lines, delimiter, first))
-        for delimiter in ([options.delimiter] if options.delimiter else (",", ";", "\t"))
+        for delimiter in ([options.delimiter] if options.delimiter else (",", ";", "\t", "|"))
     }
     best = max(rows, key=lambda delimiter: max((len(row.cells) for row in rows[delimiter][:1]), default=0))
     if not rows[best] or not any(character.isalnum() for cell in rows[best][0].cells for character in cell):
@@ -214,7 +227,12 @@ def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",") -> Head
     texts, units = rows[begin - 1].cells, list[str]()
     notes: list[str] = []
     above = rows[begin - 2].cells if begin > 1 and not any(masks[begin - 2]) else []
-    if above and _unit_row(texts) and len(_matched(above, columns, delimiter)) >= len(texts):
+    highest = rows[begin - 3].cells if above and begin > 2 and not any(masks[begin - 3]) else []
+    if highest and _unit_row(above) and len(highest) >= len(above) > 1:
+        # Names, units and remarks, as Origin writes them.
+        texts, units = highest, above
+        notes.append("units from a row")
+    elif above and _unit_row(texts) and len(_matched(above, columns, delimiter)) >= len(texts):
         texts, units = above, texts
         notes.append("units from a row")
     other = "," if decimal == "." else "."

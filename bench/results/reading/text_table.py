@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,13 +68,14 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> Read
 
 def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
     start, table = options.skip_lines, int(options.table or 1)
+    layout = _layout(file, options, start)
     for number in range(1, table):
-        layout = _layout(file, options, start)
-        following = None if layout is None else _find_break(file, layout)
-        if following is None or _layout(file, options, following) is None:
+        end = None if layout is None else _find_break(file, layout)
+        following = None if end is None or layout is None else _next_layout(file, options, layout, end)
+        if following is None:
             raise DataError(f"{file.path}: --table {table}: it has {count_tables(number)}")
-        start = following
-    layout = _layout(file, options, start) or header_only(_sample(file, start), options, start)
+        layout = following
+    layout = layout or header_only(_sample(file, start), options, start)
     if layout is None:
         raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
     places = (
@@ -196,7 +198,7 @@ def _remedy(cell: str, layout: Layout) -> str:
     other = "," if layout.decimal == "." else "."
     if is_number(cell, other):
         return f"; if its decimal sign is a {'comma' if other == ',' else 'point'}, say --decimal {other}"
-    if "," in cell and is_number(cell.replace(",", ""), "."):
+    if any(is_number(cell.replace(sign, ""), layout.decimal) for sign in ",.'’ \xa0\u202f" if sign in cell):
         return "; separators of thousands are not read"
     parts = [delimiter for delimiter in "\t;, " if delimiter in cell]
     if any(is_number(part, layout.decimal) for delimiter in parts for part in cell.split(delimiter)):
@@ -219,6 +221,12 @@ def _sample(file: TextFile, start: int) -> list[str]:
 
 def _layout(file: TextFile, options: ReadingOptions, start: int) -> Layout | None:
     return find_layout(file.path, _sample(file, start), options, start)
+
+
+def _next_layout(file: TextFile, options: ReadingOptions, layout: Layout, start: int) -> Layout | None:
+    """Return the layout of the table behind another, preferably with its delimiter and decimal sign."""
+    like = replace(options, delimiter=layout.delimiter, decimal=layout.decimal)
+    return _layout(file, like, start) or _layout(file, options, start)
 
 
 def _fits(layout: Layout) -> bool:
@@ -270,7 +278,7 @@ def _what_follows(file: TextFile, options: ReadingOptions, layout: Layout, end: 
 
     Raises DataError if they are another table, and none was chosen.
     """
-    following = _layout(file, options, end)
+    following = _next_layout(file, options, layout, end)
     if following is None:
         rest = sum(not line.isspace() and not is_comment(line, layout.marks) for line in file.lines(end))
         return (f"{count_lines(rest, 'below the table')} left out",) if rest else ()
@@ -281,7 +289,7 @@ def _what_follows(file: TextFile, options: ReadingOptions, layout: Layout, end: 
     while following is not None and len(starts) < _MOST_TABLES:
         starts.append(following.start + 1)
         next_end = _find_break(file, following)
-        following = None if next_end is None else _layout(file, options, next_end)
+        following = None if next_end is None else _next_layout(file, options, following, next_end)
     many = "at least " * (following is not None)
     raise DataError(
         f"{file.path}: has {many}{count_tables(len(starts))}, whose data begin in the lines "
