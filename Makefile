@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
 .PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
-.PHONY: studies clean
+.PHONY: studies resume-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -87,6 +87,11 @@ kill-safe: $(SETUP)
 # The time from when each interlock of each rig has to act until every output is off, likewise.
 interlock-times: $(SETUP)
 	$(BIN)/python tests/guardian/interlock_times.py --times 5
+
+# A run killed ten times and 40 runs killed once, by SIGKILL at random moments, resumed and compared with uninterrupted
+# ones.
+resume-trials: $(SETUP)
+	$(BIN)/python tests/bench/resume_trials.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -84,6 +84,23 @@ class Clock(ABC):
         """Let laboratory time pass until `now()` is `instant` (s); an instant in the past returns at once."""
         self.sleep(instant - self.now())
 
+    def go_on(self, epoch: datetime, last: float) -> None:  # noqa: ARG002
+        """Go on with the laboratory time of a run that died, before anything else has read this clock.
+
+        Parameters
+        ----------
+        epoch : datetime
+            Where that time began.
+        last : float
+            How far it is known to have come, s.
+
+        Raises
+        ------
+        ConfigurationError
+            If this clock cannot go on with it.
+        """
+        raise ConfigurationError("this clock cannot go on with the time of another run")
+
     def suspension(self) -> float:
         """Return for how many seconds the machine was suspended since the last call; 0 where it cannot matter."""
         return 0.0
@@ -125,6 +142,12 @@ class WallClock(Clock):
     def now(self) -> float:
         """Return seconds since the clock was made."""
         return self._running() - self._start
+
+    def go_on(self, epoch: datetime, last: float) -> None:
+        """Go on as if this clock had run since the epoch; a wall clock that was set back does not go back here."""
+        passed = (datetime.now(UTC) - epoch).total_seconds()
+        self.epoch = epoch
+        self._start -= max(last, passed) - self.now()
 
     def sleep(self, seconds: float) -> None:
         """Wait, in naps short enough for signals to be handled between them."""
@@ -198,6 +221,11 @@ class VirtualClock(Clock):
         """Return laboratory seconds since the clock was made."""
         return self._now
 
+    def go_on(self, epoch: datetime, last: float) -> None:
+        """Go on where that time ended: without a process there was no laboratory in which it could pass."""
+        self.epoch = epoch
+        self._now = last
+
     def sleep(self, seconds: float) -> None:
         """Jump ahead."""
         if not -math.inf < seconds < math.inf:
@@ -266,6 +294,12 @@ class PacedClock(VirtualClock):
         self.epoch = datetime.now(UTC)
         # Wall-clock instant at which laboratory time would have been zero at this pace.
         self._origin = time.monotonic()
+        self.restart_pace()
+
+    def go_on(self, epoch: datetime, last: float) -> None:
+        """Go on where that time ended."""
+        super().go_on(epoch, last)
+        self._origin = time.monotonic() - last / self.factor
         self.restart_pace()
 
     def restart_pace(self) -> None:

@@ -69,6 +69,10 @@ class DeviceRestartedError(DeviceError):
     """An instrument has restarted since it was connected: its settings are lost, and it has to be connected again."""
 
 
+class WatchdogError(DeviceError):
+    """An instrument is in error as its watchdog has expired: its host was silent, and its output went off."""
+
+
 class LimitError(DeviceError):
     """A set-point lies outside of the limits of the device; it was not sent."""
 
@@ -95,6 +99,12 @@ class RecordError(BenchError):
     """The journal of a run is damaged, or rows are missing in it; `bench recover-journal` says how far it is good."""
 
     exit_code = 8
+
+
+class AgreementError(BenchError):
+    """A resumed run did not find the specimen as its record left it; it was ended in the safe state."""
+
+    exit_code = 9
 
 
 class AbortError(BenchError):

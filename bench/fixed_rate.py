@@ -29,9 +29,12 @@ def carry_out(run: RunAtHand, message: FixedRate) -> Reading:
     ConfigurationError
         If the rig lacks something, or the controller returns another number of set-points.
     LimitError
-        If the controller asks for a set-point beyond its limits; none is sent then.
+        If its limits are beyond those of a device, or the controller asks for a set-point beyond them; none is sent
+        then.
     """
     run.check_signals(*message.inputs, *message.watched)
+    # Before the controller asks for any of them.
+    run.station.check(dict(zip(message.actuators, message.limits, strict=False)))
     period = 1.0 / message.rate
     if period <= run.period:
         run.station.promise(_GRACE + _PERIODS_OF_GRACE * period, f"a loop at {message.rate:g} Hz")

@@ -15,7 +15,7 @@ from bench.clock import VirtualClock
 from bench.description import RigDescription
 from bench.devices import Signal
 from bench.engine import Engine, Outcome, check_before_moving
-from bench.errors import AbortError, ConfigurationError
+from bench.errors import AbortError, ConfigurationError, DataError
 from bench.interlocks import SETPOINT, Interlock
 from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
@@ -317,10 +317,10 @@ def rehearse(
 
 
 def _raise_if_ended(outcome: Outcome, interrupts: Interrupts) -> None:
-    """Raise what ends more than the rehearsal: a request to end, a protocol without an end, a defect."""
+    """Raise what ends more than the rehearsal: a request to end, a protocol without an end, a wrong file."""
     if interrupts.abort_reason is not None or outcome.status == "aborted":
         raise AbortError(f"the rehearsal was {outcome.reason}; nothing has moved")
-    if isinstance(outcome.error, ConfigurationError):
+    if isinstance(outcome.error, ConfigurationError | DataError):
         raise outcome.error
 
 

@@ -104,7 +104,8 @@ def repeat(
             recorded = None
         own = recorded if _has_own_rig(meta, recorded) else None
         _check_rig(run, own, rig, attach, overrides or {})
-        definition = _protocol(run, meta, folder)
+        definition = recorded_protocol(run, meta, folder)
+        _check_source(run, meta, definition)
         original = Original(meta, files, folder, own)
         asked = Run(
             protocol=definition,
@@ -144,23 +145,27 @@ def _check_rig(
         )
 
 
-def _protocol(run: Path, meta: Mapping[str, Any], folder: Path) -> ProtocolDefinition:
+def recorded_protocol(run: Path, meta: Mapping[str, Any], folder: Path) -> ProtocolDefinition:
     """Return the protocol of a record, whose files were unpacked into a folder; raises DataError if there is none."""
     name, source = meta["protocol"], meta["protocol_source"]
     kept = folder / PROTOCOL_NAME
     if not source["installed"] and (source["module"] == "__main__" or not kept.is_file()):
         raise DataError(
-            f"{run} cannot be repeated: protocol {name} was written in the program or notebook that started the run, "
-            "not in a file of its own"
+            f"{run} can be neither repeated nor resumed: protocol {name} was written in the program or notebook that "
+            "started the run, not in a file of its own"
         )
     try:
-        definition = find_protocol(name if source["installed"] else f"{kept}:{name}")
+        return find_protocol(name if source["installed"] else f"{kept}:{name}")
     except ConfigurationError as error:
-        raise DataError(f"{run} cannot be repeated: {error}") from None
-    file = source_of(definition)
+        raise DataError(f"{run} can be neither repeated nor resumed: {error}") from None
+
+
+def _check_source(run: Path, meta: Mapping[str, Any], definition: ProtocolDefinition) -> None:
+    """Raise DataError if the protocol of an installed package was changed since it ran."""
+    source, file = meta["protocol_source"], source_of(definition)
     if source["installed"] and (file is None or hashlib.sha256(file.read_bytes()).hexdigest() != source["sha256"]):
         raise DataError(
-            f"{run} cannot be repeated: protocol {name} ({source['module']}) was changed since it ran, with "
-            f"actuator-bench {meta['packages']['actuator-bench']} of git {meta['git']}; bench run takes the new one"
+            f"{run} cannot be repeated: protocol {meta['protocol']} ({source['module']}) was changed since it ran, "
+            f"with actuator-bench {meta['packages']['actuator-bench']} of git {meta['git']}; bench run takes the new "
+            "one"
         )
-    return definition

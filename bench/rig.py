@@ -48,6 +48,8 @@ class Rig:
         The clock of the run.
     seed : int
         Seed of everything random in an emulated laboratory.
+    when_built : callable, optional
+        Called between the making of an emulated laboratory and the connecting of the first device.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class Rig:
         If a device does not answer; those connected before are closed again.
     """
 
-    def __init__(self, file: RigFile, clock: Clock, seed: int) -> None:
+    def __init__(self, file: RigFile, clock: Clock, seed: int, when_built: Callable[[], None] | None = None) -> None:
         self.file = file
         self.clock = clock
         self.devices: dict[str, Device] = {}
@@ -66,6 +68,8 @@ class Rig:
                 self.laboratory = file.laboratory(file.laboratory_settings, clock, seed)
                 ports = self.laboratory.open()
                 stack.callback(self.laboratory.close)
+            if when_built is not None:
+                when_built()
             for entry in file.devices:
                 settings = entry.wired(ports, file.path)
                 device = entry.driver.connect(entry.name, settings, clock)

@@ -42,7 +42,7 @@ _LONGEST_NAME = 96
 _LONGEST_PART = 32
 _COMPARED = (
     "protocol",
-    "protocol_source",
+    "protocol_source.sha256",
     "parameters",
     "rig",
     "rig_content",
@@ -116,6 +116,7 @@ def metadata(
         },
         "epoch": epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in description.devices.items()},
+        "limits": {name: (limits.low, limits.high) for name, limits in description.limits.items()},
         "calibration": {
             **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
             **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},

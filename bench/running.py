@@ -202,8 +202,9 @@ class RunAtHand:
         setpoints: Mapping[str, float],
         values: Mapping[str, float],
         settled: Settled,
+        seen: Sequence[float] = (),
     ) -> Reading:
-        """Write a step down, then notify the observers."""
+        """Write a step down, then notify the observers; a controller was given the ticks of the times `seen`, s."""
         record = StepRecord(
             step=self.steps,
             started=started - self.zero,
@@ -213,6 +214,7 @@ class RunAtHand:
             settled=settled,
             setpoints=setpoints,
             values=self._row(values),
+            seen=tuple(seen),
         )
         self._journal.step(record)
         self.steps += 1

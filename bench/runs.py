@@ -28,7 +28,9 @@ from bench.faults import read_schedule, schedule_faults
 from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
+from bench.locks import Holder, Locks
 from bench.model_file import models_among
+from bench.past import Interrupted
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rehearsal import Rehearsal, rehearse
@@ -130,7 +132,9 @@ class RunResult:
         return self.outcome.laboratory_seconds / self.wall_seconds
 
 
-def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) -> RunResult:
+def carry_out(
+    run: Run, console: Console, interrupts: Interrupts | None = None, again: Interrupted | None = None
+) -> RunResult:
     """Carry a run out, keep its record, and leave the rig in the safe state.
 
     Parameters
@@ -141,6 +145,8 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         Where progress is shown.
     interrupts : Interrupts, optional
         At work already, and for longer than the run; without them the run has its own.
+    again : Interrupted, optional
+        The run that died and is taken up; see `bench.resume`.
 
     Raises
     ------
@@ -164,11 +170,11 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         # A guardian makes the devices safe as soon as this process is gone.
         interrupts.leave_by(_leave)
         rehearsal = None
-        if run.rehearse and run.clock != "virtual":
+        if run.rehearse and again is None and run.clock != "virtual":
             rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
         if rehearsal is not None:
             rehearsal.raise_if_wrong()
-        station, laboratory = _connected(run, rig_file, clock, attachment)
+        station, laboratory = _connected(run, rig_file, clock, attachment, again)
         guardian = station if isinstance(station, RemoteStation) else None
         # The lines only: the engine brings the devices into their safe state, and says how that went.
         stack.callback(station.close)
@@ -192,20 +198,32 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
         meta = _asked(run, attachment, rig_file)
         meta |= metadata(run.protocol, stated, description, slots, planned, clock.date())
-        if original:
+        resumption = None
+        if again is not None:
+            resumption = again.fed(run.protocol, parameters, slots, description, clock, by_hand=guardian is None)
+        elif original:
             meta["repeats"] = original.meta["run"]
             for difference in differences(original.meta, meta):
                 console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
-        folder = make_folder(run.folder, run_name(run.protocol, meta))
+        folder = again.folder if again is not None else make_folder(run.folder, run_name(run.protocol, meta))
+        if again is None:
+            locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
+            locks.take_folder(folder)
         if guardian is not None:
             guardian.keep_record(folder)
-        (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta["run"] = folder.name
         meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
         patience = rig_file.telemetry.period if clock.sleep_waits else None
-        given = files | {RIG_FILE_NAME: rig_file.text.encode()}
-        journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience)
+        if again is not None and resumption is not None:
+            changes = [str(each) for each in differences(again.latest, meta)]
+            journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now(), patience)
+        else:
+            (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
+            given = files | {RIG_FILE_NAME: rig_file.text.encode()}
+            # A run on the virtual clock moves nothing, and is done again in the time that its flushes would take.
+            flushed = clock.sleep_waits
+            journal = Journal(folder / FILE_NAME, signals, meta, given, patience=patience, flushed=flushed)
         stack.callback(journal.close)
         interrupts.leave_by(partial(_leave, station=station, journal=journal.path))
         observers: list[Any] = []
@@ -224,8 +242,9 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
         engine = Engine(station, journal, observers, interrupts, ask)
-        engine.warn(warnings)
-        outcome = engine.run(run.protocol, parameters)
+        if again is None:
+            engine.warn(warnings)
+        outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
@@ -235,10 +254,12 @@ def carry_out(run: Run, console: Console, interrupts: Interrupts | None = None) 
 def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:
     """Return what the record says of how the run was asked for."""
     return {
+        "rig_given": str(Path(run.rig).resolve()) if run.rig.endswith(".toml") else run.rig,
         "overrides": dict(run.overrides),
         "seed": run.seed,
         "interlock_rate": _interlock_rate(run, rig),
         "clock": run.clock if attachment is None else f"attached x{attachment.clock.factor:g}",
+        "laboratory_epoch": None if attachment is None else attachment.clock.epoch.isoformat(),
     }
 
 
@@ -325,11 +346,17 @@ def _interlock_rate(run: Run, file: RigFile) -> float | None:
     return run.interlock_rate if run.attach is None and file.in_process else file.safety.rate
 
 
-def _connected(run: Run, file: RigFile, clock: Clock, attachment: Attachment | None) -> tuple[Station, object]:
+def _connected(
+    run: Run, file: RigFile, clock: Clock, attachment: Attachment | None, again: Interrupted | None = None
+) -> tuple[Station, object]:
     """Connect the rig of a run; return its station, and the emulated laboratory if there is one."""
+    continue_time = None if again is None else partial(again.continue_time, clock)
     if run.attach is None and file.in_process:
-        rig = Rig(file, clock, run.seed)
+        # A laboratory that begins at 0 has the room that the run has by now.
+        rig = Rig(file, clock, run.seed, continue_time)
         return LocalStation(rig, run.interlock_rate), rig.laboratory
+    if continue_time is not None:
+        continue_time()
     doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
     guarded = GuardedRig(file, run.rig, run.overrides, run.attach, run.seed, doing)
     return RemoteStation(guarded, clock), attachment

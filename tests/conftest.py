@@ -116,7 +116,10 @@ def reproduce(bench, tmp_path):
 
     def run(study, seed):
         result = tmp_path / "result.json"
-        code, out, err = bench("reproduce", study, "--seed", seed, "--out", tmp_path, "--json", result)
+        # One worker: the tests themselves go on beside each other.
+        code, out, err = bench(
+            "reproduce", study, "--seed", seed, "--workers", 1, "--out", tmp_path, "--json", result
+        )
         assert code == 0
         assert err == ""
         campaign = json.loads(result.read_text())

@@ -23,8 +23,10 @@ from bench.cli import (
     records,
     rehearse,
     repeat,
+    resume,
     run_list,
     runs,
+    twin,
     upkeep,
 )
 from bench.cli.console import error_console, fail
@@ -34,7 +36,8 @@ from bench.errors import BenchError
 _EPILOG = (
     "Exit codes: 0 done; 1 failed; 2 wrong command, rig file or parameter (nothing has moved); 3 unusable data or "
     "model file; 4 device fault; 5 interlock; 6 not steady in time; 7 safe state not confirmed; 8 record damaged or "
-    "incomplete; 130 ended by the operator. Try: bench list, and bench run PROTOCOL --rig RIG --clock virtual"
+    "incomplete; 9 a resumed specimen is not as it was; 130 ended by the operator. Try: bench list, and bench run "
+    "PROTOCOL --rig RIG --clock virtual"
 )
 
 app = typer.Typer(
@@ -53,12 +56,14 @@ for group in (
     rehearse.app,
     repeat.app,
     campaign.app,
+    resume.app,
     run_list.app,
     upkeep.app,
     models.app,
     comparisons.app,
     records.app,
     journals.app,
+    twin.app,
 ):
     app.add_typer(group)
 reproduce_ = typer.Typer(

@@ -106,9 +106,9 @@ class Writer:
         """Yield the points of the XY plots: each reading and, under control, each tick."""
         for entry in entries:
             if isinstance(entry, StepRecord):
-                yield Point(entry.finished, entry.step, entry.values, True)
+                yield entry.finished, entry.step, entry.values, True
             elif isinstance(entry, Tick) and self._control is not None and self._control.is_at_work(entry.values):
-                yield Point(*entry, False)
+                yield *entry, False
 
     def _blueprint(self) -> rrb.Blueprint:
         series = [plot.view() for plot in self._signals]

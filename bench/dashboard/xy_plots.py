@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -31,13 +30,8 @@ _FALLING: Colour = (78, 160, 255)
 _Line = list[tuple[float, float]]
 
 
-class Point(NamedTuple):
-    """A point of the plots: a reading after settling, or a tick under control."""
-
-    t: float
-    step: int
-    values: Sequence[float]
-    is_reading: bool
+Point = tuple[float, int, Sequence[float], bool]
+"""Time (s), step, values, and whether it is a reading after settling, not a tick under control."""
 
 
 class XYPlots:
@@ -75,33 +69,36 @@ class XYPlots:
 
     def write(self, recording: Recording, points: Iterable[Point]) -> None:
         """Draw plots and memory curve to further points."""
+        points = list(points)
         first = self._tracks[0]
-        drawn: list[list[tuple[Point, _Line]]] = [[] for _ in self._tracks]
-        memories = []
-        for point in points:
-            x = point.values[first.x]
-            if math.isfinite(x):
-                self._memory = self._memory.step(x) if self._memory else MemoryCurve.from_negative_saturation(x)
-            for track, shown in zip(self._tracks, drawn, strict=True):
-                line = track.line_to(point)
-                if line is None:
-                    continue
-                shown.append((point, line))
-                if track is first and self._memory is not None:
-                    memories.append(self._memory.corners(*self._plane))
-        for track, shown in zip(self._tracks, drawn, strict=True):
+        memories = self._memories_at(points)
+        for track in self._tracks:
+            shown = track.lines(points)
             if not shown:
                 continue
-            when = times([point.t for point, _ in shown], [point.step for point, _ in shown])
+            when = times([points[k][0] for k, _ in shown], [points[k][1] for k, _ in shown])
             strips = [line for _, line in shown]
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
             recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=strips, colors=colours))
             ends = [line[-1] for line in strips]
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
             if track is first:
-                recording.send("plane/data/memory", when, rr.LineStrips2D.columns(strips=memories))
-                inputs = [memory[-1] for memory in memories]
+                corners = [memory.corners(*self._plane) for k, _ in shown if (memory := memories[k]) is not None]
+                recording.send("plane/data/memory", when, rr.LineStrips2D.columns(strips=corners))
+                inputs = [each[-1] for each in corners]
                 recording.send("plane/data/input", when, rr.Points2D.columns(positions=inputs))
+
+    def _memories_at(self, points: Sequence[Point]) -> list[MemoryCurve | None]:
+        """Return the memory after each point, which the first plot's input has moved."""
+        memory, column = self._memory, self._tracks[0].x
+        memories = []
+        for _, _, values, _ in points:
+            x = values[column]
+            if math.isfinite(x):
+                memory = memory.step(x) if memory else MemoryCurve.from_negative_saturation(x)
+            memories.append(memory)
+        self._memory = memory
+        return memories
 
     def views(self) -> list[rrb.Spatial2DView]:
         """Return a view of each plot."""
@@ -119,27 +116,30 @@ class _Track:
 
     def __init__(self, path: str, plot: XYPlot, x: int, y: int, extent: tuple[float, float]) -> None:
         self.path, self.plot, self.x, self.y = path, plot, x, y
-        self._extents = extent, plot.output_range
+        self._visible = [_VISIBLE * (high - low) for low, high in (extent, plot.output_range)]
         self._line: _Line = []
         self._drawn = -math.inf
 
-    def line_to(self, point: Point) -> _Line | None:
-        """Return the line to a point from the one that was drawn last; None if it is not drawn yet."""
-        here = x, y = point.values[self.x], point.values[self.y]
-        if not (math.isfinite(x) and math.isfinite(y)):
-            return None
-        self._line = self._line or [here]
-        if not (point.is_reading or self._is_visible(here)):
-            return None
-        self._line.append(here)
-        if not point.is_reading and point.t - self._drawn < _REDRAW_SECONDS:
-            return None
-        line, self._line, self._drawn = self._line, [here], point.t
-        return line
-
-    def _is_visible(self, point: tuple[float, float]) -> bool:
-        """Return whether a point differs visibly from the one that was drawn last."""
-        return any(
-            abs(new - old) > _VISIBLE * (high - low)
-            for new, old, (low, high) in zip(point, self._line[0], self._extents, strict=True)
-        )
+    def lines(self, points: Sequence[Point]) -> list[tuple[int, _Line]]:
+        """Return the points that are drawn, by their numbers, and the line to each from the one before."""
+        # Tens of thousands of points: without a call for each.
+        column_x, column_y = self.x, self.y
+        visible_x, visible_y = self._visible
+        line, drawn = self._line, self._drawn
+        shown = []
+        for k, (t, _, values, is_reading) in enumerate(points):
+            x, y = values[column_x], values[column_y]
+            if not (math.isfinite(x) and math.isfinite(y)):
+                continue
+            if not line:
+                line = [(x, y)]
+            if not is_reading:
+                last_x, last_y = line[0]
+                if not (abs(x - last_x) > visible_x or abs(y - last_y) > visible_y):
+                    continue
+            line.append((x, y))
+            if is_reading or t - drawn >= _REDRAW_SECONDS:
+                shown.append((k, line))
+                line, drawn = [(x, y)], t
+        self._line, self._drawn = line, drawn
+        return shown

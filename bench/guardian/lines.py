@@ -68,6 +68,8 @@ class LineThreads:
         self._longest = longest
         self._notify = notify
         self._ending = threading.Event()
+        self._lines = lines
+        self._lost: set[str] = set()
         self._numbers = itertools.count()
         queues: dict[str, queue.PriorityQueue[_Call]] = {line: queue.PriorityQueue() for line in lines.values()}
         self._queues = {name: queues[line] for name, line in lines.items()}
@@ -97,6 +99,10 @@ class LineThreads:
     def _carry(self, call: _Call) -> Result:
         if call.priority != SAFE and self._ending.is_set():
             raise DeviceConnectionError(call.device, "was not asked, as the run has ended")
+        line = self._lines[call.device]
+        if call.priority != SAFE and line in self._lost:
+            # That ends the run: each device of a lost line would take as long again to say so.
+            raise DeviceConnectionError(call.device, "was not asked, as its line is lost")
         try:
             return Result(call.device, call.call(), None, was_away=False)
         except DeviceConnectionError as lost:
@@ -104,7 +110,11 @@ class LineThreads:
             if call.priority == SAFE or self._ending.is_set():
                 raise
             device = self._devices[call.device]
-            seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
+            try:
+                seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
+            except DeviceConnectionError:
+                self._lost.add(line)
+                raise
             self._notify(call.device, seconds, str(lost))
             # A set-point that waited for its line may not be sent after the end.
             if self._ending.is_set():

@@ -104,7 +104,7 @@ class Guardian:
         self._wake, self._woken = socket.socketpair()
         for each in (self._wake, self._woken):
             each.setblocking(False)
-        self._lines = LineThreads(rig.devices, lines_of(rig), rig.clock, self._longest_away, self._line_was_away)
+        self._lines = LineThreads(rig.devices, lines_of(rig.file), rig.clock, self._longest_away, self._line_was_away)
         self._looking: set[str] = set()
         self._latest: dict[str, dict[str, float]] = {}
         self._concerned = {name: self._signals_of(name) for name in self._looked_at}
@@ -409,7 +409,7 @@ class Guardian:
         self._news += news_of(findings)
 
     def _longest_away(self, name: str) -> float:
-        longest = longest_away(self._rig, name)
+        longest = longest_away(self._rig.file, self._rig.devices, name)
         return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
@@ -521,14 +521,17 @@ class Guardian:
                 self._core.trip(_as_bench_error(error))
 
     def _take_part(self, job: _Job, result: Result) -> None:
+        if job.error is not None:
+            return
+        if result.error is not None:
+            # At once: what the others say does not matter any more, and one of them may take long.
+            job.error = result.error
+            job.failed(job.error)
+            return
         job.waiting.discard(result.device)
         job.values[result.device] = result.value
-        job.error = job.error or result.error
         job.was_late = job.was_late or result.was_away
         if job.waiting:
-            return
-        if job.error is not None:
-            job.failed(job.error)
             return
         try:
             job.done(job.values)

@@ -100,7 +100,8 @@ class Record:
         rows = self._rows("steps")
         self._check("steps", rows)
         end = 7 + len(self.signals)
-        for step, started, finished, phase, label, settled, setpoints, *values in (row[:end] for row in rows):
+        for row in rows:
+            step, started, finished, phase, label, settled, setpoints, *values = row[:end]
             try:
                 record = StepRecord(
                     step,
@@ -111,6 +112,7 @@ class Record:
                     Settled.UNRECORDED if settled == 1 else Settled(settled),
                     json.loads(setpoints),
                     tuple(math.nan if value is None else float(value) for value in values),
+                    tuple(map(float, json.loads(row[end]))) if self._is_checked else (),
                 )
             except (ValueError, TypeError) as error:
                 raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
@@ -170,7 +172,8 @@ class Record:
             "events": ("event", "t", "level", "kind", "text"),
         }[table]
         signals = () if table == "events" else tuple(signal.name for signal in self.signals)
-        names = (*leading, *signals, *(("checksum",) if self._is_checked else ()))
+        seen = ("seen",) if table == "steps" and self._is_checked else ()
+        names = (*leading, *signals, *seen, *(("checksum",) if self._is_checked else ()))
         columns = ", ".join(map(quoted, names))
         return self._query(f"SELECT {columns} FROM {table} ORDER BY 1")  # noqa: S608 - own names
 

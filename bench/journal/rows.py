@@ -21,14 +21,27 @@ SCHEMA = 3
 READABLE = (1, 2, SCHEMA)
 FILE_NAME = "journal.sqlite"
 
-_OWN_COLUMNS = ("step", "started", "finished", "phase", "label", "settled", "setpoints", "tick", "t", "checksum")
+_OWN_COLUMNS = (
+    "step",
+    "started",
+    "finished",
+    "phase",
+    "label",
+    "settled",
+    "setpoints",
+    "seen",
+    "tick",
+    "t",
+    "checksum",
+)
 
 _TABLES = (
     "meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL) WITHOUT ROWID",
     "signals (position INTEGER PRIMARY KEY, name TEXT UNIQUE NOT NULL, unit TEXT NOT NULL, "
     "description TEXT NOT NULL, precision INTEGER NOT NULL, checksum INTEGER NOT NULL)",
     "steps (step INTEGER PRIMARY KEY, started REAL NOT NULL, finished REAL NOT NULL, phase TEXT NOT NULL, "
-    "label TEXT NOT NULL, settled TEXT NOT NULL, setpoints TEXT NOT NULL{columns}, checksum INTEGER NOT NULL)",
+    "label TEXT NOT NULL, settled TEXT NOT NULL, setpoints TEXT NOT NULL{columns}, seen TEXT NOT NULL, "
+    "checksum INTEGER NOT NULL)",
     "telemetry (tick INTEGER PRIMARY KEY, t REAL NOT NULL, step INTEGER NOT NULL{columns}, "
     "checksum INTEGER NOT NULL)",
     "events (event INTEGER PRIMARY KEY, t REAL NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL, "
@@ -76,6 +89,8 @@ class StepRecord:
         What was sent, by device.
     values : tuple of float
         The reading, in the order of the journal's signals.
+    seen : tuple of float
+        Times of the ticks that a controller was given, s; empty where none was at work reading by reading.
     """
 
     step: int
@@ -86,6 +101,7 @@ class StepRecord:
     settled: Settled
     setpoints: Mapping[str, float]
     values: tuple[float, ...]
+    seen: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,8 +115,8 @@ class Event:
     level : str
         `INFO`, `WARN` or `ERROR`.
     kind : str
-        `phase`, `note`, `pause`, `resume`, `observer`, `suspended`, `interlock`, `error`, `safe-state`, `clock`,
-        `end`.
+        `phase`, `note`, `pause`, `resume`, `resumed` (by another process), `observer`, `suspended`, `interlock`,
+        `error`, `safe-state`, `clock`, `end`.
     text : str
         One sentence.
     """

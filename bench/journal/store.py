@@ -17,19 +17,24 @@ class Store:
     ----------
     path : Path
         The file; it is created if there is none.
+    wait : float
+        Wall-clock time for which it waits for other programs until `wait_for_others` says otherwise, s.
+    flushed : bool
+        Whether each commit waits for the disk.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, wait: float = 0.0, *, flushed: bool = True) -> None:
         self.path = path
-        self._connect()
+        self._synchronous = "FULL" if flushed else "NORMAL"
+        self._connect(wait)
         made = path.stat()
         self._file = made.st_dev, made.st_ino
 
-    def _connect(self) -> None:
+    def _connect(self, wait: float = 0.0) -> None:
         # One thread at a time, see `Keeper`.
-        self._db = sqlite3.connect(self.path, timeout=0.0, isolation_level=None, check_same_thread=False)
+        self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
+        self._db.execute(f"PRAGMA synchronous={self._synchronous}")
 
     def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
         """Make the tables, with their first rows."""
@@ -53,6 +58,10 @@ class Store:
             with suppress(sqlite3.Error):
                 self._db.execute("ROLLBACK")
             raise
+
+    def forget(self, keys: Iterable[str]) -> None:
+        """Remove entries of the metadata."""
+        self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
 
     def _insert(self, entries: Iterable[Entry]) -> None:
         for each in entries:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import ConfigurationError
+from bench.journal.rows import StepRecord
 from bench.units import header_with_unit
 
 _ROWS_SHOWN = 5
@@ -30,6 +31,11 @@ class Table:
 
     columns: Mapping[str, npt.NDArray[np.float64]]
     units: Mapping[str, str] = field(default_factory=dict)
+
+    def ticks_of(self, step: StepRecord) -> Table:
+        """Return the ticks of a step, of a telemetry; without those of an attempt that its run's death ended."""
+        rows = (self["step"] == step.step) & (self["t"] >= step.started) & (self["t"] <= step.finished)
+        return Table({name: column[rows] for name, column in self.columns.items()}, self.units)
 
     def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
         return self.columns[name]

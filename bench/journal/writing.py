@@ -22,6 +22,12 @@ from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
 from bench.journal.store import Store
 
+_READERS = 10.0
+"""Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
+
+_END = ("status", "reason", "finished", "safe_state", "counts")
+"""Entries of the metadata that a run has once it has ended."""
+
 
 class Journal:
     """Writes the record of one run.
@@ -39,6 +45,9 @@ class Journal:
     patience : float, optional
         Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
         it the caller's writes, which is faster where nothing waits, as on the virtual clock.
+    flushed : bool
+        Whether each step and event waits until it is on the disk, so that a loss of power takes nothing either.
+        Otherwise the disk gets the journal at its end, and the death of the process alone takes nothing.
 
     Raises
     ------
@@ -54,6 +63,8 @@ class Journal:
         meta: Mapping[str, Any],
         files: Mapping[str, bytes] = MappingProxyType({}),
         patience: float | None = None,
+        *,
+        flushed: bool = True,
     ) -> None:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
@@ -70,8 +81,9 @@ class Journal:
         for former in second_files(path):
             former.unlink(missing_ok=True)
         try:
-            store = Store(path)
+            store = Store(path, _READERS, flushed=flushed)
             store.create(names, entries)
+            store.wait_for_others(0.0)
             keeper = Keeper(store)
             keeper.begin(entries)
         except (sqlite3.Error, OSError) as error:
@@ -79,13 +91,19 @@ class Journal:
         self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
 
     @classmethod
-    def reopen(cls, path: Path, patience: float | None = None) -> Self:
-        """Open the record of an unfinished run to write on: its steps, ticks and events are numbered on.
+    def reopen(
+        cls, path: Path, meta: Mapping[str, Any] = MappingProxyType({}), patience: float | None = None
+    ) -> Self:
+        """Open the record of a run that was not completed to write on: steps, ticks and events are numbered on.
+
+        Its end, if it had one, is taken back.
 
         Parameters
         ----------
         path : Path
             The journal, or the folder of the run that holds it.
+        meta : mapping
+            Further entries of the metadata.
         patience : float, optional
             As of a new one.
 
@@ -94,45 +112,21 @@ class Journal:
         DataError
             If there is none, it is damaged or of an older schema, or cannot be written.
         ConfigurationError
-            If the run has ended.
+            If the run was completed.
         """
-        with Record(path) as record:
-            file, signals = record.path, record.signals
-            if record.meta["schema"] != SCHEMA:
-                raise DataError(
-                    f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on"
-                )
-            if "status" in record.meta:
-                raise ConfigurationError(f"{file} is the record of a run that has ended: {record.status}")
-            counts = {
-                "steps": len(record.steps()),
-                "telemetry": len(record.telemetry()),
-                "events": len(record.events()),
-            }
-        beside = {
-            (each.table, each.row[0]): each
-            for second in second_files(file)
-            for each in read_mirror(second)
-            # Numbered without a gap, so what the journal lacks is behind its last row.
-            if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
-        }
-        if any(table == "meta" and key == "status" for table, key in beside):
-            raise ConfigurationError(
-                f"{file} is the record of a run that has ended, of which rows wait in a second file; "
-                f"`bench recover-journal {file}` puts them together"
-            )
+        file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
         was_mirrored = (file.parent / MIRROR_NAME).exists()
-        missing = [each for (table, _), each in beside.items() if table in FIRST]
         try:
-            keeper = Keeper(Store(file))
-            keeper.store.write(missing)
+            # A reader may have it for a moment.
+            keeper = Keeper(Store(file, _READERS))
+            keeper.store.forget(_END)
+            keeper.store.wait_for_others(0.0)
             if not was_mirrored:
                 keeper.begin(keeper.store.entries())
         except (sqlite3.Error, OSError) as error:
             raise DataError(f"{file} cannot be written on: {error}") from None
-        for each in missing:
-            counts[each.table] += 1
+        keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience)
         return journal
 
@@ -192,6 +186,7 @@ class Journal:
             record.settled.value,
             json.dumps({name: float(value) for name, value in record.setpoints.items()}),
             *map(float, record.values),
+            json.dumps(record.seen),
         )
         self._write([entry("steps", row)])
 
@@ -279,6 +274,59 @@ class Journal:
                 raise RecordError(f"{self.path}: its disk does not answer")
             self._failure = self._background.failure
             self._background = None
+
+
+def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
+    """Bring into the journal of a run that was not completed what waits for it in a second file.
+
+    Returns
+    -------
+    Path
+        The journal.
+    tuple of Signal
+        Its signals.
+    dict of str to int
+        Number of its rows, by table.
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As `Journal.reopen`.
+    """
+    with Record(path) as record:
+        file, signals = record.path, record.signals
+        if record.meta["schema"] != SCHEMA:
+            raise DataError(f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on")
+        if record.status == "completed":
+            raise ConfigurationError(f"{file} is the record of a run that was completed")
+        counts = {
+            "steps": len(record.steps()),
+            "telemetry": len(record.telemetry()),
+            "events": len(record.events()),
+        }
+        has_ended = "status" in record.meta
+    beside = {
+        (each.table, each.row[0]): each
+        for second in second_files(file)
+        for each in read_mirror(second)
+        # Numbered without a gap, so what the journal lacks is behind its last row.
+        if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
+    }
+    if not has_ended and ("meta", "status") in beside:
+        raise ConfigurationError(
+            f"{file} is the record of a run that has ended, of which rows wait in a second file; "
+            f"`bench recover-journal {file}` puts them together"
+        )
+    missing = [each for (table, _), each in beside.items() if table in FIRST]
+    if missing:
+        try:
+            with closing(Store(file, _READERS)) as store:
+                store.write(missing)
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {error}") from None
+    for each in missing:
+        counts[each.table] += 1
+    return file, signals, counts
 
 
 def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:

@@ -319,6 +319,9 @@ class Reading:
         return self.values[signal]
 
 
+PROMPT = "prompt"
+"""Label of the reading that follows a prompt."""
+
 Messages = Generator[Message, Reading, None]
 
 TRACES = (

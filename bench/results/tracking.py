@@ -87,15 +87,15 @@ def target_results(record: Record, output: str) -> TargetResults | None:
 
 def following_result(record: Record, output: str) -> FollowingResult | None:
     """Return a moving reference and its output, or None if there was none; arguments as `target_results`."""
-    steps = [step.step for step in record.step_records() if step.label == FOLLOW]
     ticks = record.telemetry()
     if "reference" not in ticks.columns:
         return None
-    rows = np.isin(ticks["step"], steps) & np.isfinite(ticks["reference"])
-    if not rows.any():
+    parts = [ticks.ticks_of(step) for step in record.step_records() if step.label == FOLLOW]
+    columns = [np.concatenate([part[name] for part in parts]) for name in ("t", "reference", output)] if parts else []
+    if not parts or not (rows := np.isfinite(columns[1])).any():
         return None
-    times = ticks["t"][rows]
-    return FollowingResult(times - times[0], ticks["reference"][rows], ticks[output][rows])
+    times, reference, outputs = (column[rows] for column in columns)
+    return FollowingResult(times - times[0], reference, outputs)
 
 
 def results_json(record: Record, output: str) -> Mapping[str, Any]:

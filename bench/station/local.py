@@ -205,7 +205,7 @@ class LocalStation(Station):
             return call()
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
-        longest = longest_away(self._rig, name)
+        longest = longest_away(self._rig.file, self._rig.devices, name)
         seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
         self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))

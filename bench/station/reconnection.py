@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from bench.clock import Clock
 from bench.devices import Device
 from bench.errors import DeviceConnectionError
 from bench.locks import line_names, port_of
-from bench.rig import Rig
+from bench.rig_file import RigFile
 
 TRIES = 3
 """How often all devices are read at most, when a line is lost and comes back while they are read."""
@@ -20,22 +20,22 @@ _SHARE_OF_WATCHDOG = 0.6
 """Share of its watchdog's time for which an instrument may be out of reach."""
 
 
-def lines_of(rig: Rig) -> dict[str, str]:
+def lines_of(file: RigFile) -> dict[str, str]:
     """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
-    ports = {entry.name: port_of(entry.settings) for entry in rig.file.devices}
+    ports = {entry.name: port_of(entry.settings) for entry in file.devices}
     # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
     return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
 
 
-def longest_away(rig: Rig, name: str) -> float:
+def longest_away(file: RigFile, devices: Mapping[str, Device], name: str) -> float:
     """Return for how long the line of a device may be away, s.
 
     It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
     it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
     """
-    lines = lines_of(rig)
-    watchdogs = (rig.devices[other].watchdog for other, line in lines.items() if line == lines[name])
-    return min([rig.file.safety.reconnect, *(_SHARE_OF_WATCHDOG * each for each in watchdogs if each)])
+    lines = lines_of(file)
+    watchdogs = (devices[other].watchdog for other, line in lines.items() if line == lines[name])
+    return min([file.safety.reconnect, *(_SHARE_OF_WATCHDOG * each for each in watchdogs if each)])
 
 
 def reconnect(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from bench.devices import Device
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, WatchdogError
 from bench.rig_file import DeviceEntry
 from bench.upkeep.opening import Workplace
 
@@ -67,3 +67,28 @@ def _condition(place: Workplace, entry: DeviceEntry, connect: Any) -> Condition:
     finally:
         device.close()
     return found("ready", device.identity)
+
+
+def clear_expired_watchdogs(place: Workplace) -> dict[str, str]:
+    """Clear the errors that watchdogs left when their host was gone, and no others.
+
+    Returns
+    -------
+    dict of str to str
+        What each device reported whose error was cleared, by its name.
+
+    Raises
+    ------
+    DeviceError
+        If a device is in another error, or cannot be reached.
+    """
+    cleared: dict[str, str] = {}
+    for entry in place.entries:
+        try:
+            entry.driver.connect(entry.name, entry.settings, place.clock).close()
+        except WatchdogError as error:
+            found = recover(place, entry)
+            if found.state != "ready":
+                raise DeviceError(entry.name, f"is {found.state}: {found.meaning}") from None
+            cleared[entry.name] = str(error).removeprefix(f"{entry.name}: ").partition(";")[0]
+    return cleared

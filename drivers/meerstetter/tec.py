@@ -22,7 +22,13 @@ from pydantic import Field, field_validator
 
 from bench.clock import Clock
 from bench.devices import Finding, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.errors import (
+    ConfigurationError,
+    DeviceConnectionError,
+    DeviceError,
+    DeviceRestartedError,
+    WatchdogError,
+)
 from bench.roles import TECAmplifier, TECMode
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
@@ -85,6 +91,7 @@ _INPUT = Parameter(2000, "output stage input selection")
 _ENABLE = Parameter(2010, "output stage enable")
 _CURRENT_LIMIT = Parameter(2030, "current limitation", real=True)
 _VOLTAGE_LIMIT = Parameter(2031, "voltage limitation", real=True)
+_WATCHDOG_EXPIRED = 183  # error number
 _WATCHDOG = Parameter(2060, "communication watchdog", real=True, of_channel=False)
 _TARGET = Parameter(3000, "target object temperature", real=True)
 _POLARITY = Parameter(3034, "positive current heats")
@@ -536,7 +543,8 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         number = int(self._read(_ERROR_NUMBER))
         instance, parameter = int(self._read(_ERROR_INSTANCE)), int(self._read(_ERROR_PARAMETER))
         text, advice = DEVICE_ERRORS.get(number, UNKNOWN_ERROR)
-        return DeviceError(
+        kind = WatchdogError if number == _WATCHDOG_EXPIRED else DeviceError
+        return kind(
             self.name,
             f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
             f"then clear it by `bench recover RIG {self.name}`, or switch the device off and on",

@@ -10,6 +10,7 @@ nonlinear estimation", Proceedings of the IEEE 92, 2004.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ class Bending:
                 f"polynomial: expected one that rises or falls all over its range, {self.low:g} to {self.high:g} K"
             )
         order = slice(None) if falls[0] > 0.0 else slice(None, None, -1)
-        self._sorted = self._deflections[order].copy(), self._rises[order].copy()
+        self._sorted: tuple[list[float], list[float]] = self._deflections[order].tolist(), self._rises[order].tolist()
         # Powers of the rise mapped to [-1, 1].
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         series = np.append(polynomial.bias - polynomial.evaluate([0.0])[0], polynomial.series)
@@ -62,7 +63,13 @@ class Bending:
 
     def rise(self, deflection: float) -> float:
         """Return the rise of the tip (K) for a deflection (m), at most that at the end of the range."""
-        return float(np.interp(deflection, *self._sorted))
+        # As np.interp does, which takes ten times as long for a single value.
+        deflections, rises = self._sorted
+        k = bisect_right(deflections, deflection) - 1
+        if k < 0 or k + 1 == len(rises):
+            return rises[max(k, 0)]
+        slope = (rises[k + 1] - rises[k]) / (deflections[k + 1] - deflections[k])
+        return slope * (deflection - deflections[k]) + rises[k]
 
 
 class ReducedNetwork:

@@ -113,19 +113,21 @@ def read_loops(run: Path) -> dict[str, Samples]:
             raise DataError(f"{run}: the run is {record.status}; a model needs a completed one")
         if LATENESS.name not in [signal.name for signal in record.signals]:
             raise DataError(f"{run}: has no fast loop")
-        labels = {step.step: step.label for step in record.step_records()}
+        steps = list(record.step_records())
         ticks, names = record.telemetry(), signal_names(record)
-    taken = np.isfinite(ticks[LATENESS.name])
     loops = {}
-    for step in np.unique(ticks["step"][taken]).astype(int).tolist():
-        rows = taken & (ticks["step"] == step)
-        table = Table({name: values[rows] for name, values in ticks.columns.items()})
+    for step in steps:
+        whole = ticks.ticks_of(step)
+        rows = np.isfinite(whole[LATENESS.name])
+        if not rows.any():
+            continue
+        table = Table({name: values[rows] for name, values in whole.columns.items()})
         times = table["t"] - table[LATENESS.name]
-        if labels[step] in loops:
-            raise DataError(f"{run}: has two loops {labels[step]!r}; expected one of each label")
-        if len(table) < 2 or np.ptp(steps := np.diff(times)) > 1e-3 * steps.mean():
-            raise DataError(f"{run}: the loop {labels[step]!r} left samples out; a model needs all of them")
-        loops[labels[step]] = Samples(table, float(steps.mean()), names)
+        if step.label in loops:
+            raise DataError(f"{run}: has two loops {step.label!r}; expected one of each label")
+        if len(table) < 2 or np.ptp(periods := np.diff(times)) > 1e-3 * periods.mean():
+            raise DataError(f"{run}: the loop {step.label!r} left samples out; a model needs all of them")
+        loops[step.label] = Samples(table, float(periods.mean()), names)
     if not loops:
         raise DataError(f"{run}: has no fast loop")
     return loops

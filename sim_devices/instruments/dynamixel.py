@@ -190,14 +190,9 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
         return self._trajectory is not None and self.world.time < self._trajectory.end
 
     def position_after(self, seconds: float) -> float:
-        """Return where the profile brings the shaft within some seconds, rad, for a plant on its way there.
-
-        The load is left out of account: a plant that is one takes `position`.
-        """
+        """Return where the profile alone brings the shaft within some seconds, rad, for a plant that is no load."""
         with self.world.lock:
-            if self._trajectory is None:
-                return self._angle
-            return self._trajectory.at(self.world.time + seconds)[0]
+            return self._angle if self._trajectory is None else self._trajectory.at(self.world.time + seconds)[0]
 
     @property
     def holds(self) -> bool:
@@ -504,9 +499,7 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
 
     @property
     def _moving(self) -> bool:
-        if self._trajectory is not None and self.world.time < self._trajectory.end:
-            return True
-        return abs(self._velocity) > self._values[24] * VELOCITY_UNIT
+        return self.is_moving or abs(self._velocity) > self._values[24] * VELOCITY_UNIT
 
     @property
     def _shut_down(self) -> bool:
@@ -654,8 +647,7 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
     def _follow(self) -> None:
         """Bring the shaft to where it is now."""
         now = self.world.time
-        elapsed = now - self._followed_at
-        self._followed_at = now
+        elapsed, self._followed_at = now - self._followed_at, now
         if elapsed > 0.0:
             settled = self._ambient_temperature + FULL_LOAD_HEATING * self._output * self._output
             self._temperature = settled + (self._temperature - settled) * math.exp(-elapsed / HEATING_TIME)

@@ -38,6 +38,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -93,6 +94,10 @@ _TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
 _TRACKING_RATE = 0.4  # d in a second
 _TRACKING_LOOK = 0.1  # s
 _FIRST_ACCESS_CODE = 17
+# The state of the converter, in the order of the kernels; the zero is not theirs to change.
+_CONTINUOUS = ("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since")
+_DIGITS = ("_reference", "_digits", "_gross", "_peak")
+_STATE_OF = attrgetter(*_CONTINUOUS, *_DIGITS, "_zero")
 
 
 def time_constant(setting: int) -> float:
@@ -293,7 +298,8 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
-        return _next_look(self._converted, now, self._conversion)
+        due: float = _next_look(self._converted, now, self._conversion)
+        return due
 
     def _may_wait(self, course: Course, now: float) -> bool:
         """Return whether the conversions for a reading at the present can wait, and note that they do."""
@@ -324,22 +330,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _convert_along(self, course: Course) -> None:
         until = self.world.time
-        state = np.array(
-            (
-                self._converted,
-                self._input,
-                self._first,
-                self._second,
-                self._noise_first,
-                self._noise_second,
-                self._still_since,
-                self._reference,
-                self._digits,
-                self._gross,
-                self._peak,
-                self._zero,
-            )
-        )
+        state = np.array(_STATE_OF(self), dtype=np.float64)
         point = until - course.since_point()
         done = 0
         while True:
@@ -361,17 +352,11 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 break
             self._draw_more()
         del self._asked[:done]
-        (
-            self._converted,
-            self._input,
-            self._first,
-            self._second,
-            self._noise_first,
-            self._noise_second,
-            self._still_since,
-            *digits,
-        ) = state.tolist()
-        self._reference, self._digits, self._gross, self._peak = (int(each) for each in digits[:4])
+        values = state.tolist()
+        for name, value in zip(_CONTINUOUS, values, strict=False):
+            setattr(self, name, value)
+        for name, digits in zip(_DIGITS, values[len(_CONTINUOUS) :], strict=False):
+            setattr(self, name, int(digits))
 
     def _draw_more(self) -> None:
         self._block = np.concatenate((self._block[self._used :], self._rng.standard_normal(_NORMALS)))

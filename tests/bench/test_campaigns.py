@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from bench import registry
-from bench.campaign import Study, StudyResult
 from bench.campaigns.cluster import ClusterExecutor, check_address
 from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
 from bench.campaigns.expansion import expand
@@ -24,6 +23,7 @@ from bench.errors import ConfigurationError
 from bench.journal import Record
 from bench.locks import Holder, Locks
 from bench.runs import carry_out
+from bench.studies import Study, StudyResult
 from bench.workers import Workers
 
 PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
@@ -307,7 +307,7 @@ class TestTasks:
     def test_nothing_is_done_in_a_dry_run(self, campaign, tmp_path, capsys):
         assert start(campaign(STAIRS), "--out", tmp_path / "out", "--dry-run") == 0
         said = capsys.readouterr().out
-        assert said.startswith("4 runs to do; 0.0 h of laboratory time, about 0 s on ")
+        assert said.startswith("4 runs to do; 0.0 h of laboratory time, less than a minute on ")
         assert said.count("climb/increment=") == 4
         assert not (tmp_path / "out").exists()
 
@@ -387,16 +387,15 @@ def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     chain = CHAIN.replace("0..1", "0..0").replace("[0.1, 0.2]", "0.1")
     path = campaign(chain + STAIRS.replace(str(PROTOCOLS), "mine.py"), ("[3, 5]", "3"), ("[5.0, 10.0]", "5.0"))
     rig_file(("heater_laboratory:", "shipped_laboratory:"))
-    expansion = expand(read_campaign(path))
+    # Its processes begin with the import path of this one, so they come before the folder of the rig is on it.
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        expansion = expand(read_campaign(path))
+        with ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor:
+            there = carry_out_tasks(expansion.tasks, {}, executor)
     with Workers(1) as workers:
         here = carry_out_tasks(expansion.tasks, {}, WorkersExecutor(workers, tmp_path / "here"))
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        ClusterExecutor(cluster.scheduler_address, tmp_path / "there", Console(quiet=True)) as executor,
-    ):
-        there = carry_out_tasks(expansion.tasks, {}, executor)
     assert [(each.status, each.reason) for each in there.values()] == [("completed", "")] * 4
     assert done_before(expansion.tasks, tmp_path / "there").done == there
     for name, task in expansion.tasks.items():

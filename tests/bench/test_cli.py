@@ -89,7 +89,7 @@ class TestHelp:
         [
             ("identify-muscle", ["FORCE_RUN", "LENGTH_RUN", "two-stage-prandtl-ishlinskii", "--verify", "--json"]),
             ("reproduce", ["vo2", "sma", "muscles"]),
-            ("reproduce sma", ["Zhang and Yip", "--seed", "--out", "--live", "--json"]),
+            ("reproduce sma", ["Zhang and Yip", "--seed", "--out", "--live", "--workers", "--json"]),
             ("reproduce muscles", ["McKibben", "--seed", "--out", "--live", "--json"]),
         ],
     )

@@ -307,3 +307,29 @@ class TestMakeClock:
 
 def test_wall_time_carries_its_zone():
     assert wall_time().utcoffset() == timedelta(0)
+
+
+class TestGoingOn:
+    EPOCH = datetime(2026, 3, 1, 10, tzinfo=UTC)
+
+    def test_a_laboratory_of_this_process_goes_on_where_it_ended(self):
+        for clock in (VirtualClock(), PacedClock(1e6)):
+            clock.go_on(self.EPOCH, 500.0)
+            assert clock.now() == 500.0
+            clock.sleep(2.0)
+            assert clock.now() == 502.0
+            assert clock.date() == self.EPOCH + timedelta(seconds=502.0)
+
+    def test_on_the_wall_clock_the_time_has_passed(self):
+        clock = WallClock()
+        clock.go_on(datetime.now(UTC) - timedelta(hours=2), 10.0)
+        assert 7200.0 <= clock.now() < 7260.0
+
+    def test_a_wall_clock_that_was_set_back_does_not_go_back(self):
+        clock = WallClock()
+        clock.go_on(datetime.now(UTC) + timedelta(hours=2), 10.0)
+        assert 10.0 <= clock.now() < 70.0
+
+    def test_the_clock_of_a_served_laboratory_goes_on_by_itself(self):
+        with pytest.raises(ConfigurationError, match="cannot go on with the time of another run"):
+            ScaledClock(2.0).go_on(self.EPOCH, 0.0)

@@ -60,6 +60,15 @@ def intact(tmp_path_factory):
 
 
 class TestRoundTrip:
+    def test_what_is_not_flushed_is_committed_all_the_same(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"}, flushed=False)
+        for step in range(3):
+            journal.step(record(step, 20.0, 1.0))
+            # By another connection, as after the death of the process.
+            with Record(tmp_path) as run:
+                assert len(run.steps()) == step + 1
+        journal.close()
+
     def test_everything_comes_back(self, tmp_path):
         meta = {"rig": "vo2", "parameters": {"low": 21.0, "note": "10 µm"}, "command": ["bench", "run"], "seed": 3}
         write(tmp_path / FILE_NAME, meta=meta)
@@ -520,7 +529,7 @@ class TestReopening:
 
     def test_a_run_that_has_ended_is_not_written_on(self, tmp_path):
         write(tmp_path / FILE_NAME)
-        with pytest.raises(ConfigurationError, match="has ended: completed"):
+        with pytest.raises(ConfigurationError, match="a run that was completed"):
             Journal.reopen(tmp_path)
 
     def test_a_damaged_one_is_not_written_on(self, tmp_path):

@@ -62,7 +62,7 @@ def write_table(path, header, rows):
 
 
 def assert_refused(bench, out, code, words, protocol, *options):
-    found, _, err = bench("run", protocol, *VO2, *options, "--out", out)
+    found, _, err = bench("run", protocol, "--rig", "vo2", "--clock", "x1000", *options, "--out", out)
     assert found == code
     assert "Traceback" not in err
     for word in words:

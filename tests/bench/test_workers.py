@@ -3,6 +3,7 @@
 import io
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from rich.console import Console
 from bench.errors import AbortError, BenchError, DeviceError
 from bench.journal import Record
 from bench.workers import Workers, available_cores
+from bench.workers.display import TasksDisplay
 
 sys.path.append(str(Path(__file__).parent))
 import worker_tasks
@@ -129,6 +131,23 @@ def test_one_worker_is_this_process():
 def test_the_end_raises_what_nobody_has_asked_for(number):
     with pytest.raises(DeviceError), Workers(number) as workers:
         workers.submit(worker_tasks.fail, "tec")
+
+
+def test_a_terminal_shows_each_task_that_runs_and_how_many_are_finished():
+    text = io.StringIO()
+    display = TasksDisplay(Console(file=text, width=120, force_terminal=True), "study")
+    for _ in range(3):
+        display.add()
+    display.start()
+    display.begin(0, "tracking controller=latched")
+    display.begin(1, "creep")
+    display.advance(0, 3, 60, "curvature 12.5 1/m")
+    display.end(1, finished=True)
+    display.stop()
+    last = text.getvalue().rpartition("study")[2]
+    assert "1/3" in last
+    assert re.search(r"tracking controller=latched.*curvature 12.5 1/m.*3/60", last)
+    assert "creep" not in last
 
 
 def test_there_are_as_many_as_cores():

@@ -26,11 +26,13 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 
 from rich.console import Console
 
+from bench.clock import VIRTUAL_EPOCH
 from bench.errors import BenchError
 from bench.journal import Record
 from bench.protocol import find_protocol
@@ -210,9 +212,11 @@ def _true(record, rig, name, laboratory):
     if name.endswith(LYING) or name in LYING_TOO:
         return "."
     times = [time for time, _ in laboratory.seen]
+    # The journal counts from the start of the run, the laboratory from the start of its clock.
+    start = (datetime.fromisoformat(record.meta["epoch"]) - VIRTUAL_EPOCH).total_seconds()
     for table, clock in ((record.telemetry(), "t"), (record.steps(), "finished")):
         for signal, (source, scale, tolerance) in SEEN[rig].items():
-            for t, value in zip(table[clock], table[signal], strict=True):
+            for t, value in zip(table[clock] + start, table[signal], strict=True):
                 window = laboratory.seen[max(bisect_left(times, t - AGE) - 1, 0) : bisect_right(times, t) + 1]
                 truths = [scale * values[source] + OFFSETS.get(signal, 0.0) for _, values in window]
                 if not min(truths) - tolerance <= value <= max(truths) + tolerance:

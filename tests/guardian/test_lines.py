@@ -155,6 +155,21 @@ def test_a_line_that_stays_away_is_given_up():
     assert bench.news == []
 
 
+def test_the_devices_of_a_lost_line_are_not_waited_for_one_after_another():
+    devices = {"a": Instrument("a", attempts=1000), "b": Instrument("b", attempts=1000), "c": Instrument("c")}
+    bench = Bench({"a": "line", "b": "line", "c": "other"}, longest=1.0, devices=devices)
+    for name in ("a", "b", "c"):
+        bench.submit(BENCH, name, devices[name].measure)
+    said = {result.device: result for result in (bench.result() for _ in devices)}
+    assert str(said["b"].error) == "b: was not asked, as its line is lost"
+    assert (devices["a"].tried, devices["b"].tried) == (6, 0)
+    assert said["c"].value == {"c": 1.0}
+    # The safe state opens a line of its own.
+    devices["b"].attempts = 0
+    bench.submit(SAFE, "b", devices["b"].measure)
+    assert bench.result().value == {"b": 1.0}
+
+
 def test_another_instrument_or_a_restart_is_not_tried_again():
     restarted = DeviceRestartedError("a", "has restarted")
     bench = Bench({"a": "line"}, devices={"a": Instrument("a", attempts=1, problem=restarted)})

@@ -108,10 +108,9 @@ def everything_that_it_says_is_there(campaign):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.seeds) for seed in range(1, 6))])
-def test_campaign(tmp_path, seed):
+def test_campaign(reproduce, seed):
     """One campaign a seed: it takes most of a minute, so that everything is looked at in one test."""
-    bench("reproduce", "vo2", "--seed", seed, "--out", tmp_path, "--json", tmp_path / "result.json")
-    campaign = json.loads((tmp_path / "result.json").read_text())
+    _, campaign = reproduce("vo2", seed)
     it_is_more_than_eleven_hours_in_the_laboratory(campaign)
     identification_is_as_good_as_the_paper_s_and_in_its_order(campaign)
     validation_holds_in_a_session_with_an_offset(campaign)

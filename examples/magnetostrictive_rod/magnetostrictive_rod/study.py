@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.results.models import errors_json, identify_file
+from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.workers import Pending
 
 MODELS: Mapping[str, Mapping[str, Any]] = {"quadratic-play": {}, "preisach-signed": {"plane": (-2.4, 2.4)}}
 """Models and their options. The plane ends before the drive's range does, so that the reset saturates it."""
@@ -31,7 +33,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
     """Run the experiments and evaluate them; raises `BenchError` if a run did not complete."""
     measured = campaign.run("damped-oscillation", {"half_cycles": "24"})
     identification: dict[str, Any] = {}
-    tracking: dict[str, dict[str, Any]] = {}
+    runs: dict[str, dict[str, Pending[RunResult]]] = {}
     for name, options in MODELS.items():
         model = identify_file(
             measured.folder, input_column="coil_current", output_column="strain", model=name, **options
@@ -39,10 +41,15 @@ def carry_out(campaign: Campaign) -> StudyResult:
         path = campaign.folder / f"{name}.json"
         model.file.save(path)
         identification[name] = errors_json(model.identification.errors)
-        tracking[name] = {}
-        for controller in CONTROLLERS:
-            run = campaign.run("tracking", {"model": str(path), "controller": controller, "count": "20"})
-            tracking[name][controller] = reached_targets(run, "strain").summary()
+        # They go on beside each other.
+        runs[name] = {
+            controller: campaign.start("tracking", {"model": str(path), "controller": controller, "count": "20"})
+            for controller in CONTROLLERS
+        }
+    tracking = {
+        name: {controller: reached_targets(run.result(), "strain").summary() for controller, run in started.items()}
+        for name, started in runs.items()
+    }
     return StudyResult({"identification": identification, "tracking": tracking}, (TABLE,), ())
 
 

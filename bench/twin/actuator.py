@@ -1,0 +1,197 @@
+"""The dynamics of the actuator, identified from what the drive did after each change of its set-point.
+
+Candidates are an actuator that follows at once, of first and of second order, each with a delay and with or without a
+fastest change. The Bayesian information criterion chooses (Schwarz, "Estimating the dimension of a model", Annals of
+Statistics 6, 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from bench.hysteresis._checks import Floats
+from bench.twin import _kernels
+from bench.twin.recording import Recording
+from bench.twin.specimen import ActuatorDynamics
+
+GRID = 0.02
+"""Step of time with which drives are simulated, s; shorter for one of a shorter time constant."""
+LONGEST_PART = 2000.0
+"""Part of a run that is used for dynamics, s."""
+_INSTANT = 0.03
+"""Standard uncertainty of the instant at which a reading saw the drive, s."""
+_MEDIAN_OF_DIFFERENCES = 0.954
+"""Median of the magnitude of the difference of two normal numbers, in standard deviations."""
+_EARLY = 0.1
+"""Time by which a change of the set-point may come before its record says so, s."""
+
+
+@dataclass(frozen=True)
+class IdentifiedActuator:
+    """The dynamics of an actuator with the evidence for it.
+
+    Attributes
+    ----------
+    dynamics : ActuatorDynamics
+        What was identified.
+    uncertainties : mapping of str to float
+        Standard uncertainty of its numbers, in their units.
+    rms : float
+        Of what it leaves over, input units.
+    """
+
+    dynamics: ActuatorDynamics
+    uncertainties: dict[str, float]
+    rms: float
+
+
+def at_rows(recording: Recording, values: Floats, first: float, step: float, delay: float) -> Floats:
+    """Return what a quantity had at each row of a recording that its values on a grid of time reach to.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        After each step of the grid.
+    first : float
+        At the beginning.
+    step : float
+        Of the grid, s.
+    delay : float
+        Time by which the rows see it late, s.
+    """
+    grid = step * np.arange(values.size + 1)
+    times = recording.times[recording.times <= step * (values.size - 1)]
+    return np.asarray(np.interp(times - delay, grid, np.concatenate([[first], values])))
+
+
+def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float, end: float) -> Floats:
+    """Return the position (before gain and offset) that the drive had at each row up to `end` s."""
+    initial = (float(recording.driven[0]) - dynamics.offset) / dynamics.gain
+    setpoints = recording.on_grid(step, initial, end)
+    out = np.empty((2, setpoints.size))
+    _kernels.follow(
+        np.array([initial, 0.0, initial, 0.0, 0.0]), setpoints, np.zeros((2, setpoints.size)), out, step,
+        dynamics.frequency, dynamics.damping, dynamics.rate, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
+    )  # fmt: skip
+    return at_rows(recording, out[0], initial, step, dynamics.delay)
+
+
+def identify_actuator(recordings: Sequence[Recording]) -> IdentifiedActuator:
+    """Identify the dynamics of the drive of some runs."""
+    from scipy.optimize import least_squares
+
+    ends = [min(LONGEST_PART, float(each.times[-1])) for each in recordings]
+    slow = _time_scale(recordings)
+
+    def simulated(dynamics: ActuatorDynamics) -> Floats:
+        step = grid_step(dynamics)
+        return np.concatenate(
+            [simulate_drive(r, dynamics, step, end) for r, end in zip(recordings, ends, strict=True)]
+        )
+
+    measured = np.concatenate([r.driven[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
+    weights = np.concatenate([_weights(r)[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
+
+    def fitted(dynamics: ActuatorDynamics) -> tuple[Floats, float, float]:
+        """Return what is left over, weighted, with gain and offset."""
+        positions = simulated(dynamics)
+        columns = weights[:, None] * np.column_stack([positions, np.ones(positions.size)])
+        (gain, offset), *_ = np.linalg.lstsq(columns, weights * measured, rcond=None)
+        return weights * measured - columns @ (gain, offset), float(gain), float(offset)
+
+    def dynamics_of(names: Sequence[str], values: Floats) -> ActuatorDynamics:
+        numbers = {
+            name: value * slow if name == "delay" else math.exp(value)
+            for name, value in zip(names, values.tolist(), strict=True)
+        }
+        return ActuatorDynamics(**numbers)
+
+    def left_over(names: Sequence[str], values: Floats) -> Floats:
+        return fitted(dynamics_of(names, values))[0]
+
+    found: list[tuple[float, ActuatorDynamics, dict[str, float]]] = []
+    for start in _candidates(slow, recordings):
+        names, values = [*start], np.array([v / slow if n == "delay" else math.log(v) for n, v in start.items()])
+        spread = np.empty(0)
+        if names:
+            low = [
+                -_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)
+            ]
+            high = [
+                values[0] + 10.0 if name == "delay" else value + 3.0
+                for name, value in zip(names, values, strict=True)
+            ]
+            solved = least_squares(
+                partial(left_over, names),
+                values,
+                bounds=(low, high),
+                diff_step=[1e-3],
+                max_nfev=40,
+            )
+            values = solved.x
+            jacobian = np.asarray(solved.jac)
+            spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
+        dynamics = dynamics_of(names, values)
+        left, gain, offset = fitted(dynamics)
+        score = left.size * math.log(float(left @ left) / left.size) + len(names) * math.log(left.size)
+        sigma = float(np.sqrt(left @ left / left.size))
+        scales = {name: slow if name == "delay" else float(getattr(dynamics, name)) for name in names}
+        known = {name: sigma * s * scales[name] for name, s in zip(names, spread.tolist(), strict=True)}
+        found.append((score, replace(dynamics, gain=gain, offset=offset), known))
+    score, dynamics, uncertainties = min(found, key=lambda each: each[0])
+    left = fitted(dynamics)[0] / weights
+    # What is sent is a little late on the record, and no actuator moves before it is.
+    causal = replace(dynamics, delay=max(dynamics.delay, 0.0))
+    return IdentifiedActuator(causal, uncertainties, float(np.sqrt(np.mean(left**2))))
+
+
+def grid_step(dynamics: ActuatorDynamics) -> float:
+    """Return the step of the grid of time for an actuator, s."""
+    return GRID if dynamics.frequency == 0.0 else float(np.clip(0.25 / dynamics.frequency, 0.005, GRID))
+
+
+def _candidates(slow: float, recordings: Sequence[Recording]) -> list[dict[str, float]]:
+    """Return the numbers of each candidate with their first guesses."""
+    rate = {"rate": _fastest(recordings)}
+    lags = [{"frequency": frequency / slow, "delay": 0.0} for frequency in (1.0, 3.0)]
+    pairs = [{**lag, "damping": damping} for lag in lags for damping in (0.5, 1.0)]
+    plain: list[dict[str, float]] = [{}, {"delay": 0.0}, *lags, *pairs]
+    return [*plain, *(each | rate for each in (*lags, *pairs))]
+
+
+def _weights(recording: Recording) -> Floats:
+    """Return the weight of each row: less while the drive moves, as the instants of readings are uncertain."""
+    moves = np.abs(np.diff(recording.driven))
+    rates = moves / np.maximum(np.diff(recording.times), 1e-3)
+    fastest = np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
+    noise = max(float(np.median(moves)) / _MEDIAN_OF_DIFFERENCES, 1e-6 * float(np.ptp(recording.driven)))
+    return np.asarray(1.0 / np.sqrt(noise**2 + (_INSTANT * fastest) ** 2))
+
+
+def _time_scale(recordings: Sequence[Recording]) -> float:
+    """Return a first guess of the time constant, s: how long the drive is away from its set-point after a change."""
+    areas, sizes = 0.0, 0.0
+    for r in recordings:
+        last = r.last_change
+        target = np.where(last < 0, r.driven, r.setpoints[np.maximum(last, 0)])
+        steps = np.abs(np.diff(np.append(r.driven[0], r.setpoints)))
+        spacing = np.diff(r.times, prepend=0.0)
+        areas += float((np.abs(target - r.driven) * np.minimum(spacing, 2.0)).sum())
+        sizes += float(steps.sum())
+    return float(np.clip(areas / max(sizes, 1e-300), 0.02, 100.0))
+
+
+def _fastest(recordings: Sequence[Recording]) -> float:
+    """Return the fastest change that was seen over a time that is long beside the uncertainty of instants."""
+    found = []
+    for r in recordings:
+        spacing = np.diff(r.times)
+        long = spacing > 5.0 * _INSTANT
+        found.append(np.abs(np.diff(r.driven))[long] / spacing[long])
+    rates = np.concatenate(found)
+    return float(rates.max()) if rates.size and rates.max() > 0.0 else 1.0

@@ -1,0 +1,309 @@
+"""Noise of the readings, and what drive and response do while the set-point stands.
+
+Everything is found within holds: there the set-point, and with it the model, stand still. Noise is the difference of
+neighbouring rows where the response depends least on the drive. Wander of the drive as the specimen sees it, and
+drift of the response, are those with which a simulation shows the mean squares of differences that were measured, by
+the time between two rows and by the slope of the response.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.hysteresis import Operator
+from bench.hysteresis._checks import Floats
+from bench.twin.actuator import at_rows
+from bench.twin.recording import Recording
+from bench.twin.specimen import Dynamics, Specimen, Wander
+
+_LAGS = (0.3, 1.0, 3.0, 8.0, 20.0, 60.0)
+"""Edges of the classes of the time between two rows, s."""
+_SLOPES = 3
+"""Classes of the slope of the response."""
+_LONGEST = 4000.0
+"""Part of a run that is simulated, s."""
+_FEWEST = 12
+"""Fewest differences of a class that counts."""
+_SETTLED = 4.0
+"""Time constants of actuator and lag after which the set-point counts as reached."""
+_NEAR = 2e-3
+"""Share of the range of the drive over which the slope is taken."""
+_LEAST_OF_HOLD = 3
+_FAR = 6.0
+"""Readings of a hold whose middle counts; distance of an outlier in standard deviations."""
+_RARE = 0.05
+_QUANTILES = 9
+"""Greatest share of outliers, and how many of their quantiles are kept."""
+_SEED = 0
+"""Of the simulations, the same for each trial."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise of a signal, in its unit.
+
+    Attributes
+    ----------
+    reading, quick : float
+        Standard deviation of a reading, and of a quick one.
+    resolution : float
+        Last digit; 0 for none.
+    outlier_share : float
+        Share of readings that are further off than noise and last digit explain.
+    outliers : tuple of float
+        By how much these are off: quantiles.
+    """
+
+    reading: float = 0.0
+    quick: float = 0.0
+    resolution: float = 0.0
+    outlier_share: float = 0.0
+    outliers: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of rows of one hold and kind: their rows, class (time, slope), and kind."""
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    time: NDArray[np.int64]
+    slope: NDArray[np.int64]
+    is_reading: NDArray[np.bool_]
+
+
+def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
+    """Return the noise of a signal that stands still within holds, such as what is read of the drive."""
+    found: dict[bool, list[Floats]] = {True: [], False: []}
+    middles, deviations = [], []
+    for r in recordings:
+        values = r.columns[signal]
+        late = (r.since_change > _settled_after(r, dynamics)) & np.isfinite(values)
+        for kind, differences in found.items():
+            rows = np.flatnonzero((r.is_reading == kind) & late)
+            same = np.diff(r.last_change[rows]) == 0
+            differences.append(np.diff(values[rows])[same])
+        rows = np.flatnonzero(late)
+        for hold in np.split(values[rows], np.flatnonzero(np.diff(r.last_change[rows])) + 1):
+            if hold.size >= _LEAST_OF_HOLD:
+                middles.append(float(np.median(hold)))
+                deviations.append(hold - middles[-1])
+    noise = _noise([_deviation(np.concatenate(found[kind])) for kind in (True, False)], np.array(middles))
+    off = np.concatenate(deviations) if deviations else np.empty(0)
+    far = off[np.abs(off) > max(_FAR * max(noise.reading, noise.quick), 0.75 * noise.resolution)]
+    # What wanders through a hold is no outlier.
+    if not outliers or not 3 <= far.size <= _RARE * off.size:
+        return noise
+    levels = np.quantile(far, np.linspace(0.0, 1.0, _QUANTILES))
+    return replace(noise, outlier_share=far.size / off.size, outliers=tuple(levels.tolist()))
+
+
+def identify_disturbances(
+    recordings: Sequence[Recording], operators: Sequence[Operator[Any]], dynamics: Dynamics, signal: str
+) -> tuple[Noise, Wander, Wander]:
+    """Return the noise of the response, the wander of the drive, and the drift of the response."""
+    from scipy.optimize import minimize
+
+    parts = [Part(r, tuple(operators), dynamics) for r in recordings]
+    _classify(parts)
+    noise = _response_noise(parts, recordings, signal)
+    variances = np.array([noise.quick**2, noise.reading**2])
+    measured = [_squares(part.pairs, part.errors) for part in parts]
+    counts = np.sum([each[1] for each in measured], axis=0)
+    sums = np.sum([each[0] for each in measured], axis=0)
+    used = counts >= _FEWEST
+    if not used.any():
+        return noise, Wander(), Wander()
+    target = np.log(np.maximum(sums[used] / counts[used], 1e-300))
+    white = 2.0 * np.broadcast_to(variances[None, None, :], counts.shape)[used]
+    weights = np.sqrt(np.minimum(counts[used], 200.0))
+    span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
+    height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
+
+    def trial(numbers: Floats) -> tuple[Wander, Wander]:
+        wander, wander_time, drift, drift_time = np.exp(np.clip(numbers, -30.0, 12.0)).tolist()
+        return Wander(wander * span, wander_time), Wander(drift * height, drift_time)
+
+    def cost(numbers: Floats) -> float:
+        wander, drift = trial(numbers)
+        disturbed = replace(dynamics, wander=wander, drift=drift)
+        totals = np.zeros_like(sums)
+        for number, part in enumerate(parts):
+            totals += _squares(part.pairs, part.simulate(disturbed, _SEED + number))[0]
+        found = np.log(np.maximum(totals[used] / counts[used] + white, 1e-300))
+        penalty = float(np.sum(np.maximum(numbers[[1, 3]] - math.log(3000.0), 0.0) ** 2)) + float(
+            np.sum(np.maximum(math.log(0.2) - numbers[[1, 3]], 0.0) ** 2)
+        )
+        return float(np.sum((weights * (found - target)) ** 2)) + 100.0 * penalty
+
+    start = np.log([3e-4, 5.0, 1e-4, 100.0])
+    simplex = np.vstack([start, start + np.diag([1.0, 1.0, 1.0, 1.0])])
+    solved = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": 90, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.1},
+    )
+    wander, drift = trial(solved.x)
+    return noise, wander, drift
+
+
+class Part:
+    """A run, simulated without disturbances, and the pairs of its rows within holds."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        operators: tuple[Operator[Any], ...],
+        dynamics: Dynamics,
+        longest: float = _LONGEST,
+    ) -> None:
+        self._recording, self._operators, self._dynamics = recording, operators, dynamics
+        self._end = min(longest, float(recording.times[-1]))
+        first = float(recording.driven[0])
+        initial = (first - dynamics.actuator.offset) / dynamics.actuator.gain
+        self._first = first
+        self._setpoints = recording.on_grid(dynamics.step, initial, self._end)
+        quiet = replace(dynamics, wander=Wander(), drift=Wander())
+        self.still = self._run(quiet, None)
+        count = self.still.size
+        self.errors = recording.responded[:count] - self.still
+        self.slopes = self._local_slopes(count)
+        self.pairs: _Pairs
+
+    def simulate(self, dynamics: Dynamics, seed: int) -> Floats:
+        """Return what disturbances add to the response at each row."""
+        return self._run(dynamics, np.random.default_rng(seed)) - self.still
+
+    def _run(self, dynamics: Dynamics, rng: np.random.Generator | None) -> Floats:
+        specimen = Specimen(self._operators, dynamics, self._first, rng)
+        before = specimen.response
+        _, response = specimen.advance(self._setpoints)
+        return at_rows(self._recording, response, before, dynamics.step, dynamics.actuator.delay)
+
+    def _local_slopes(self, count: int) -> Floats:
+        """Return by how much the model's response depends on the drive at each row, by its greater slope."""
+        r, model = self._recording, self._operators[0]
+        near = _NEAR * float(np.ptp(r.driven))
+        slopes = np.zeros(count)
+        state, last = model.initial_state(), -2
+        changes = r.last_change
+        for row in range(count):
+            if changes[row] != last:
+                last = changes[row]
+                place = float(r.driven[row]) if last < 0 else float(r.setpoints[last])
+                state = model.advance(state, [place])
+                here = model.value(state)
+                slope = (
+                    max(abs(float(model.evaluate([place + each], state)[0]) - here) for each in (near, -near)) / near
+                )
+            slopes[row] = slope
+        return slopes
+
+    def pair(self, edges: Floats) -> _Pairs:
+        """Return the pairs of settled rows of the same hold and kind, by the time between them and by slope."""
+        r, count = self._recording, self.still.size
+        firsts, seconds, kinds = [], [], []
+        settled = r.since_change[:count] > _settled_after(r, self._dynamics)
+        for kind in (False, True):
+            rows = np.flatnonzero((r.is_reading[:count] == kind) & settled)
+            holds = r.last_change[rows]
+            for gap in (1, 2, 3, 6, 12, 25, 50, 100):
+                same = np.flatnonzero(holds[gap:] == holds[:-gap]) if rows.size > gap else np.empty(0, dtype=np.int64)
+                firsts.append(rows[same])
+                seconds.append(rows[same + gap])
+                kinds.append(np.full(same.size, kind))
+        first, second = np.concatenate(firsts), np.concatenate(seconds)
+        time = np.searchsorted(_LAGS, r.times[second] - r.times[first])
+        slope = np.searchsorted(edges, self.slopes[first])
+        return _Pairs(first, second, time, slope, np.concatenate(kinds))
+
+
+def _classify(parts: Sequence[Part]) -> None:
+    """Divide the pairs of all parts into classes of the slope that hold as many rows each."""
+    every = np.concatenate([part.slopes for part in parts])
+    edges = np.quantile(every, np.arange(1, _SLOPES) / _SLOPES)
+    for part in parts:
+        part.pairs = part.pair(edges)
+
+
+def _squares(pairs: _Pairs, values: Floats) -> tuple[Floats, Floats]:
+    """Return sum and number of the squared differences of pairs, by time, slope and kind."""
+    shape = (len(_LAGS) + 1, _SLOPES, 2)
+    place = np.ravel_multi_index((pairs.time, pairs.slope, pairs.is_reading.astype(np.int64)), shape)
+    squares = (values[pairs.second] - values[pairs.first]) ** 2
+    size = math.prod(shape)
+    return (
+        np.asarray(np.bincount(place, squares, size), dtype=np.float64).reshape(shape),
+        np.bincount(place, minlength=size).astype(float).reshape(shape),
+    )
+
+
+def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
+    """Return the noise of the response: of neighbouring rows in the class of slopes where they differ least."""
+    found: list[float | None] = []
+    for kind in (True, False):
+        pairs = [(part, part.pairs, part.pairs.is_reading == kind) for part in parts]
+        nearest = min((int(each.time[of].min()) for _, each, of in pairs if of.any()), default=0)
+        deviations = []
+        for slope in range(_SLOPES):
+            differences = [
+                part.errors[each.second[chosen]] - part.errors[each.first[chosen]]
+                for part, each, of in pairs
+                if (chosen := of & (each.slope == slope) & (each.time == nearest)).any()
+            ]
+            deviations.append(_deviation(np.concatenate(differences)) if differences else None)
+        found.append(min((each for each in deviations if each is not None), default=None))
+    every = np.concatenate([r.columns[signal] for r in recordings])
+    return _noise(found, every)
+
+
+def _noise(found: Sequence[float | None], values: Floats) -> Noise:
+    """Return the noise of readings and quick readings; where one is not known, it is that of the other."""
+    reading, quick = found
+    known = reading if reading is not None else quick if quick is not None else 0.0
+    return Noise(
+        known if reading is None else reading,
+        known if quick is None else quick,
+        _resolution(values[np.isfinite(values)]),
+    )
+
+
+def _settled_after(recording: Recording, dynamics: Dynamics) -> float:
+    """Return the time after a change of the set-point from which the rest counts as still, s."""
+    actuator, response = dynamics.actuator, dynamics.response
+    constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency
+    longest = float(np.abs(np.diff(recording.setpoints, prepend=recording.driven[0])).max()) / actuator.rate
+    return max(0.5, _SETTLED * (constant + response.lag) + actuator.delay + min(longest, 0.3 * _hold(recording)))
+
+
+def _hold(recording: Recording) -> float:
+    """Return the usual time between two changes of the set-point, s."""
+    return float(np.median(np.diff(recording.changes)))
+
+
+def _deviation(differences: Floats) -> float | None:
+    """Return the standard deviation of the numbers of which these are differences; None of too few."""
+    if differences.size < _FEWEST:
+        return None
+    return float(np.median(np.abs(differences)) / 0.954) or float(np.sqrt(np.mean(differences**2) / 2.0))
+
+
+def _resolution(values: Floats) -> float:
+    """Return the last digit of readings that are multiples of one; 0 if they are not."""
+    distinct = np.unique(values)
+    if distinct.size < 3 or distinct.size > 0.9 * values.size:
+        return 0.0
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]
+    digit = float(gaps.min())
+    multiples = gaps / digit
+    return (
+        digit if float(np.abs(multiples - np.round(multiples)).max()) < 0.02 * float(multiples.max()) ** 0.5 else 0.0
+    )

@@ -1,0 +1,224 @@
+"""What the specimen of a twin does: set-points in, drive and response out, on a grid of time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bench.hysteresis import Operator
+from bench.hysteresis._checks import Floats
+from bench.twin import _kernels
+
+
+@dataclass(frozen=True)
+class ActuatorDynamics:
+    """How the drive follows its set-point.
+
+    The position x follows the set-point by x'' = frequency² (set-point - x) - 2 damping frequency x', or by
+    x' = frequency (set-point - x) if the damping is 0, or at once if the frequency is 0; |x'| is at most `rate`. What
+    the drive does is offset + gain x.
+
+    Attributes
+    ----------
+    delay : float
+        From the set-point to its first effect, s.
+    frequency : float
+        Natural frequency, or the inverse of the time constant, rad/s.
+    damping : float
+        Damping ratio.
+    rate : float
+        Fastest change, input units per s; infinite if none was found.
+    gain, offset : float
+        Drive against set-point at rest; 1 and 0 for an ideal one.
+    """
+
+    delay: float = 0.0
+    frequency: float = 0.0
+    damping: float = 0.0
+    rate: float = math.inf
+    gain: float = 1.0
+    offset: float = 0.0
+
+    @property
+    def order(self) -> int:
+        """Order of the differential equation: 0, 1 or 2."""
+        return 0 if self.frequency == 0.0 else 1 if self.damping == 0.0 else 2
+
+    @property
+    def overshoot(self) -> float:
+        """Overshoot of a small step, as a share of it."""
+        if self.order < 2 or self.damping >= 1.0:
+            return 0.0
+        return math.exp(-math.pi * self.damping / math.sqrt(1.0 - self.damping**2))
+
+
+@dataclass(frozen=True)
+class ResponseDynamics:
+    """How the response follows the drive, beside the hysteresis.
+
+    Attributes
+    ----------
+    lag : float
+        Time constant between drive and hysteresis, s; 0 for none. It acts on |x|^power: 2 is that of heat by a
+        current or voltage.
+    power : {1, 2}
+        See `lag`.
+    gain : float
+        Part of what the hysteresis gives that comes at once.
+    shares, times : tuple of float
+        Parts of it that come late, and their time constants, s.
+    """
+
+    lag: float = 0.0
+    power: float = 1.0
+    gain: float = 1.0
+    shares: tuple[float, ...] = ()
+    times: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Wander:
+    """A quantity that wanders with an exponential autocorrelation (Ornstein-Uhlenbeck).
+
+    Attributes
+    ----------
+    deviation : float
+        Standard deviation, in the unit of the quantity; 0 for none.
+    time : float
+        Correlation time, s.
+    """
+
+    deviation: float = 0.0
+    time: float = 1.0
+
+
+@dataclass(frozen=True)
+class Unevenness:
+    """What the model does not know of the specimen: a shift of the drive that changes as the drive moves.
+
+    It is different in each session, as the error of a model is on a new history; it stands while the drive stands.
+
+    Attributes
+    ----------
+    deviation : float
+        Standard deviation, input units; 0 for none.
+    length : float
+        Travel of the drive after which it is forgotten, input units.
+    """
+
+    deviation: float = 0.0
+    length: float = 1.0
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """All that a specimen has beside its operators.
+
+    Attributes
+    ----------
+    step : float
+        Step of the time grid, s.
+    actuator : ActuatorDynamics
+        From the set-point to the drive.
+    response : ResponseDynamics
+        From the drive to the response.
+    wander : Wander
+        Of the drive as the specimen sees it, beside what is read of it, input units.
+    drift : Wander
+        Of the response, output units.
+    unevenness : Unevenness
+        Of the drive as the specimen sees it.
+    """
+
+    step: float
+    actuator: ActuatorDynamics = field(default_factory=ActuatorDynamics)
+    response: ResponseDynamics = field(default_factory=ResponseDynamics)
+    wander: Wander = field(default_factory=Wander)
+    drift: Wander = field(default_factory=Wander)
+    unevenness: Unevenness = field(default_factory=Unevenness)
+
+
+class Specimen:
+    """A specimen and its actuator, at rest at the beginning.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        Their outputs are added: the model, and what of its error repeats.
+    dynamics : Dynamics
+        The rest of it.
+    start : float
+        Drive at the beginning, input units.
+    rng : numpy.random.Generator or None
+        Its wander and drift; without one there is neither.
+    """
+
+    def __init__(
+        self,
+        operators: tuple[Operator[Any], ...],
+        dynamics: Dynamics,
+        start: float,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self._operators = operators
+        self._dynamics = dynamics
+        self._rng = rng
+        actuator, response = dynamics.actuator, dynamics.response
+        position = (start - actuator.offset) / actuator.gain
+        wander = rng.standard_normal() * dynamics.wander.deviation if rng is not None else 0.0
+        self._drift = rng.standard_normal() * dynamics.drift.deviation if rng is not None else 0.0
+        lagged = math.copysign(abs(position) ** response.power, position)
+        place = rng.standard_normal() * dynamics.unevenness.deviation if rng is not None else 0.0
+        gain = actuator.gain
+        self._state = np.array([position, 0.0, lagged, wander / gain, place / gain])
+        seen = start + wander + place
+        self._memories = [operator.step(operator.initial_state(), seen)[0] for operator in operators]
+        output = sum(operator.value(memory) for operator, memory in zip(operators, self._memories, strict=True))
+        self._slow = np.full(len(response.times), output)
+        self._shares, self._times = np.array(response.shares), np.array(response.times)
+        self.drive = start
+        self.response = output * (response.gain + sum(response.shares)) + self._drift
+
+    def advance(self, setpoints: Floats) -> tuple[Floats, Floats]:
+        """Take as many steps of the grid as there are set-points, each in force during its step.
+
+        Returns drive and response after each step, shape (N,).
+        """
+        dynamics, count = self._dynamics, setpoints.size
+        actuator, response = dynamics.actuator, dynamics.response
+        normals = np.zeros((3, count)) if self._rng is None else self._rng.standard_normal((count, 3)).T.copy()
+        scale = 0.0 if self._rng is None else 1.0 / abs(actuator.gain)
+        unevenness = dynamics.unevenness
+        moved = np.empty((2, count))
+        _kernels.follow(
+            self._state, setpoints, normals[:2], moved, dynamics.step, actuator.frequency, actuator.damping,
+            actuator.rate, response.lag, response.power, scale * dynamics.wander.deviation, dynamics.wander.time,
+            scale * unevenness.deviation, unevenness.length / abs(actuator.gain),
+        )  # fmt: skip
+        moved *= actuator.gain
+        moved += actuator.offset
+        seen = moved[1]
+        outputs = np.zeros((2, count))
+        for number, operator in enumerate(self._operators):
+            outputs[0] += operator.evaluate(seen, self._memories[number])
+            self._memories[number] = operator.advance(self._memories[number], seen)
+        outputs[1] = response.gain * outputs[0]
+        if self._times.size:
+            _kernels.creep(self._slow, outputs, dynamics.step, self._shares, self._times)
+        if dynamics.drift.deviation and self._rng is not None:
+            outputs[1] += self._drifts(normals[2])
+        self.drive, self.response = float(moved[0, -1]), float(outputs[1, -1])
+        return moved[0], outputs[1]
+
+    def _drifts(self, normals: Floats) -> Floats:
+        from scipy.signal import lfilter
+
+        drift = self._dynamics.drift
+        decay = math.exp(-self._dynamics.step / drift.time)
+        kicks = drift.deviation * math.sqrt(1.0 - decay**2) * normals
+        values, _ = lfilter([1.0], [1.0, -decay], kicks, zi=[decay * self._drift])
+        self._drift = float(values[-1])
+        return np.asarray(values)

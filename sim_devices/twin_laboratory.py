@@ -1,0 +1,192 @@
+"""The emulated laboratory of a twin: its devices around the specimen that was identified."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from types import MappingProxyType
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field, InstanceOf
+
+from bench.clock import Clock
+from bench.devices import DriverSettings
+from bench.errors import ConfigurationError
+from bench.rig_file import LaboratorySettings
+from bench.twin.device import TwinSettings
+from bench.twin.specimen import Specimen
+from bench.twin.tables import NoiseTable, TwinTable
+from sim_devices.instruments.twin import EmulatedTwin, TwinServer
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue
+from sim_devices.world import World
+
+_SCHEME = "emulated://"
+_TOLERANCE = 0.05
+"""Share by which what is set by hand may differ from what it was in the runs of the twin."""
+_BLOCK = 4096
+_ON_TIME = 5e-7
+"""Time before which a step of the grid counts as complete, s."""
+
+
+class TwinLaboratorySettings(TwinTable):
+    """What `[emulation]` says of a twin."""
+
+    devices: dict[str, InstanceOf[DriverSettings]] = Field(
+        default_factory=dict, description="the devices of the rig file, which the bench fills in"
+    )
+
+
+class SpecimenPlant:
+    """A specimen on its grid of time, however calls divide the time; see `bench.twin.specimen`.
+
+    A set-point acts from the instant at which it comes, as the mean over the step of the grid in which it does.
+
+    Parameters
+    ----------
+    specimen : Specimen
+        The specimen at rest.
+    step : float
+        Of the grid, s.
+    delay : float
+        After which a set-point acts, s.
+    initial : float
+        Set-point at the beginning.
+    """
+
+    def __init__(self, specimen: Specimen, step: float, delay: float, initial: float) -> None:
+        self.specimen = specimen
+        self._step, self._delay = step, delay
+        self._time = 0.0
+        self._taken = 0
+        self._level = initial
+        self._coming: list[tuple[float, float]] = []
+
+    def set(self, value: float) -> None:
+        """Take a set-point."""
+        self._coming.append((self._time + self._delay, value))
+
+    def advance(self, dt: float) -> None:
+        """Let `dt` seconds pass."""
+        self._time += dt
+        whole = math.floor((self._time + _ON_TIME) / self._step)
+        while self._taken < whole:
+            count = min(whole - self._taken, _BLOCK)
+            self.specimen.advance(self._setpoints(count))
+            self._taken += count
+
+    def _setpoints(self, count: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """Return the mean set-point of each of the next steps."""
+        begin = self._taken * self._step
+        end = begin + count * self._step
+        setpoints = np.full(count, self._level)
+        while self._coming and self._coming[0][0] < end:
+            instant, value = self._coming.pop(0)
+            place = max((instant - begin) / self._step, 0.0)
+            first = int(place)
+            setpoints[first] += (1.0 - (place - first)) * (value - self._level)
+            setpoints[first + 1 :] = value
+            self._level = value
+        return setpoints
+
+
+class TwinLaboratory(EmulatedLaboratory):
+    """A laboratory with the devices of a rig, whose specimen behaves as was identified; see the module."""
+
+    Settings: ClassVar[type[LaboratorySettings]] = TwinLaboratorySettings
+
+    def __init__(self, settings: TwinLaboratorySettings, clock: Clock, seed: int) -> None:
+        specimen_stream, session_stream, reading_stream = np.random.default_rng(seed).spawn(3)
+        drive, response = settings.drive, settings.response
+        self._settings = settings
+        self._session = settings.session_offset * float(session_stream.standard_normal())
+        self._specimen = Specimen(settings.operators, settings.dynamics, drive.rest, specimen_stream)
+        at_rest = (drive.rest - drive.offset) / drive.gain
+        self.plant = SpecimenPlant(self._specimen, settings.step, drive.delay, at_rest)
+        self._at_rest = at_rest
+        world = World(self.plant, clock)
+        self._outputs = dict.fromkeys(settings.devices, math.nan)
+        pairs = np.array(response.conversion).reshape(-1, 2)
+        self._conversion = (pairs[:, 0], pairs[:, 1]) if pairs.size else None
+        twins = {name: each for name, each in settings.devices.items() if isinstance(each, TwinSettings)}
+        instruments = {}
+        for (name, table), rng in zip(twins.items(), reading_stream.spawn(len(twins)), strict=True):
+            meters = {}
+            for signal in table.signals:
+                noise = settings.signals.get(signal.name, NoiseTable())
+                meters[signal.name] = (self._source(signal.name, noise), noise)
+            instruments[table.port.removeprefix(_SCHEME)] = EmulatedTwin(
+                name, world, table, meters, rng, partial(self._act, name)
+            )
+        super().__init__(
+            "twin",
+            {port: TwinServer(instrument) for port, instrument in instruments.items()},
+            clock,
+            world=world,
+            instruments=MappingProxyType(instruments),
+            seed=seed,
+        )
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return drive and response of the specimen as they are, and what the devices set."""
+        units = {
+            signal.name: signal.unit
+            for each in self._settings.devices.values()
+            if isinstance(each, TwinSettings)
+            for signal in each.signals
+        }
+        drive, response = self._settings.drive.signal, self._settings.response.signal
+        outputs = {
+            f"{name}_output": TrueValue(float(not math.isnan(value)), is_output=True)
+            for name, value in self._outputs.items()
+        }
+        return {
+            drive: TrueValue(self._specimen.drive, units.get(drive, "")),
+            response: TrueValue(self._response(), units.get(response, "")),
+            **outputs,
+        }
+
+    def operate(self, task: str, value: float) -> None:
+        """Do by hand what a prompt asks for, if it was so in the runs of the twin.
+
+        Raises ConfigurationError for another task or value: of those nothing is known.
+        """
+        tasks = self._settings.tasks
+        if task not in tasks:
+            known = ", ".join(tasks) or "none"
+            raise ConfigurationError(f"the twin knows nothing of {task!r}; in its runs was done by hand: {known}")
+        level = self._settings.signals[tasks[task]].level
+        if abs(value - level) > _TOLERANCE * max(abs(value), abs(level)):
+            raise ConfigurationError(
+                f"the twin cannot tell what the specimen does at {task} = {value:g}, as its runs were made at "
+                f"{level:.4g}; make a twin from runs at that value"
+            )
+
+    def _act(self, device: str, value: float) -> None:
+        """Take what a device sets from now on; nan for one that is off."""
+        self._outputs[device] = value
+        if device == self._settings.drive.device:
+            self.plant.set(self._at_rest if math.isnan(value) else value)
+
+    def _source(self, signal: str, noise: NoiseTable) -> Callable[[], float]:
+        """Return what gives the true value of a signal."""
+        if signal == self._settings.response.signal:
+            return self._response
+        if signal == self._settings.drive.signal:
+            return lambda: self._specimen.drive
+        return partial(self._standing, noise)
+
+    def _standing(self, noise: NoiseTable) -> float:
+        value = self._outputs.get(noise.follows, math.nan)
+        return noise.level if math.isnan(value) else value
+
+    def _response(self) -> float:
+        value = self._specimen.response + self._session
+        if self._conversion is None:
+            return value
+        outputs, values = self._conversion
+        # Beyond the ends as between the last two.
+        place = int(np.clip(np.searchsorted(outputs, value), 1, outputs.size - 1))
+        slope = (values[place] - values[place - 1]) / (outputs[place] - outputs[place - 1])
+        return float(values[place - 1] + slope * (value - outputs[place - 1]))

@@ -1,0 +1,61 @@
+"""Studies: their runs one after another and beside each other."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bench.errors import BenchError, ConfigurationError
+from bench.journal import Record
+from bench.studies import reproduce
+
+sys.path.append(str(Path(__file__).parent))
+import small_study
+
+
+@pytest.fixture
+def carried_out(tmp_path):
+    """Carry a study out with a number of workers; return its result and what was printed."""
+
+    def run(study, workers, **settings):
+        text = io.StringIO()
+        console = Console(file=text, width=100)
+        settings = {"seed": 0, "live": False, **settings}
+        out = tmp_path / str(workers)
+        return reproduce("small", study, out=out, console=console, workers=workers, **settings), text.getvalue()
+
+    return run
+
+
+def test_a_study_gives_the_same_to_the_last_bit_with_one_worker_and_with_three(carried_out, tmp_path):
+    results = {}
+    for workers in (1, 3):
+        result, text = carried_out(small_study.STUDY, workers)
+        assert "runs" in text
+        assert all(Path(path).stat().st_size > 1000 for path in result["figures"] + result["recordings"])
+        assert len(result["recordings"]) == 4
+        seeds = {}
+        for folder in (tmp_path / str(workers)).glob("*/vo2-creep-*"):
+            with Record(folder) as record:
+                assert record.status == "completed"
+                seeds[record.meta["seed"]] = record.steps()["curvature"].tolist()
+        results[workers] = seeds, result["curvatures"], result["laboratory_seconds"]
+    assert set(results[1][0]) == {0, 1, 100_000, 100_001}
+    assert results[1] == results[3]
+
+
+def test_a_run_that_fails_ends_the_study_with_its_error(carried_out, tmp_path):
+    with pytest.raises(BenchError, match="1000"):
+        carried_out(small_study.WRONG, 2)
+    for folder in tmp_path.glob("2/*/vo2-*"):
+        with Record(folder) as record:
+            assert record.status == "aborted"
+            assert set(record.meta["safe_state"].values()) == {"safe"}
+
+
+def test_the_live_view_is_for_one_run_after_another(carried_out, tmp_path):
+    with pytest.raises(ConfigurationError, match="--workers 2"):
+        carried_out(small_study.STUDY, 2, live=True)
+    assert not (tmp_path / "2").exists()

@@ -1,0 +1,188 @@
+"""A twin of a specimen: what is identified from runs, and what the twin then does."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bench
+from bench.cli import main
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import PrandtlIshlinskii
+from bench.journal import Record
+from bench.rig_file import load_rig
+from bench.twin import _kernels
+from bench.twin.actuator import identify_actuator
+from bench.twin.recording import Recording
+from bench.twin.specimen import ActuatorDynamics, Dynamics, Specimen, Unevenness, Wander
+from bench.twin.write import write_twin
+from sim_devices.twin_laboratory import SpecimenPlant
+
+pytestmark = pytest.mark.slow
+
+CREEP = {"hot": 70.0, "cool": 50.0, "duration": 60.0}
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """Short runs on the emulated cantilever, which is built differently from any twin."""
+    folder = tmp_path_factory.mktemp("measured")
+    creep = bench.run("creep", "vo2", out=folder, seed=1, **CREEP)
+    loops = bench.run("damped-oscillation", "vo2", out=folder, seed=1, increment=2.0, half_cycles=12)
+    return creep.folder, loops.folder
+
+
+@pytest.fixture(scope="module")
+def twin(measured, tmp_path_factory):
+    """Its twin, made by the command, and what the command wrote for programs."""
+    folder = tmp_path_factory.mktemp("twin")
+    out, found = folder / "twin.toml", folder / "twin.json"
+    with pytest.raises(SystemExit) as stopped:
+        main(["twin", *map(str, measured), "--rig", "vo2", "--out", str(out), "--json", str(found)])
+    assert not stopped.value.code
+    return out, json.loads(found.read_text())
+
+
+def test_the_dynamics_of_the_plate_are_found(twin):
+    """The emulated plate has 2.2 rad/s, a damping of 0.9 and 15 K/s, on a grid of 0.05 s."""
+    actuator = twin[1]["actuator"]
+    assert actuator["order"] == 2
+    assert actuator["frequency"] == pytest.approx(2.2, rel=0.1)
+    assert actuator["damping"] == pytest.approx(0.9, rel=0.1)
+    assert actuator["rate"] == pytest.approx(15.0, rel=0.1)
+
+
+def test_the_twin_is_the_rig_with_emulated_devices(twin):
+    rig, real = load_rig(str(twin[0])), load_rig("vo2")
+    assert rig.in_process
+    assert (rig.roles, rig.interlocks, rig.telemetry, rig.derived) == (
+        real.roles, real.interlocks, real.telemetry, real.derived
+    )  # fmt: skip
+    with bench.open_rig(str(twin[0])) as emulated, bench.open_rig("vo2") as original:
+        assert emulated.signals == original.signals
+        assert emulated.description.limits == original.description.limits
+
+
+def test_a_run_on_the_twin_is_as_long_and_goes_as_on_the_specimen(twin, measured, tmp_path):
+    found = bench.run("creep", twin[0], out=tmp_path, seed=5, **CREEP)
+    with Record(measured[0]) as record:
+        real = record.steps()
+    emulated = found.readings
+    assert len(emulated) == len(real)
+    assert emulated["finished"][-1] == pytest.approx(real["finished"][-1], rel=0.02)
+    moving = np.abs(np.diff(real["tec_temperature"], prepend=0.0)) > 1.0
+    late = ~moving
+    assert np.abs(emulated["tec_temperature"] - real["tec_temperature"])[late].max() < 1.0
+    span = np.ptp(real["curvature"])
+    assert np.sqrt(np.mean((emulated["curvature"] - real["curvature"])[late] ** 2)) < 0.05 * span
+
+
+def test_equal_seeds_give_equal_sessions(twin, tmp_path):
+    first, again, other = (
+        bench.run("creep", twin[0], out=tmp_path, seed=seed, hot=60.0, duration=8.0).readings["curvature"]
+        for seed in (3, 3, 4)
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    ("rig", "out", "message"),
+    [
+        ("sma", "new.toml", "is a run of rig vo2, with the devices tec, psd; rig sma has supply"),
+        ("vo2", "old.toml", "exists already"),
+        ("vo2", "new.json", "ends in .toml"),
+        ("vo2", "none/new.toml", "cannot be written"),
+    ],
+)
+def test_a_wrong_command_is_one_message(measured, tmp_path, rig, out, message):
+    (tmp_path / "old.toml").write_text("")
+    with pytest.raises((ConfigurationError, DataError), match=message) as error:
+        write_twin(measured[1:], rig, tmp_path / out)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_rig_without_slots_has_no_twin(measured, tmp_path):
+    (tmp_path / "bare.toml").write_text('extends = "vo2"\nwithout = ["roles"]\n')
+    with pytest.raises(DataError, match="needs the slots drive, with a device, and response"):
+        write_twin(measured, str(tmp_path / "bare.toml"), tmp_path / "twin.toml")
+
+
+def test_a_run_that_says_too_little_is_refused(tmp_path):
+    (tmp_path / "look.py").write_text(
+        '"""Looks."""\n'
+        "from bench.devices import Actuator\n"
+        "from bench.protocol import Dwell, Messages, ProtocolParameters, Slots, Step, protocol\n\n\n"
+        "class Parameters(ProtocolParameters):\n"
+        '    """None."""\n\n\n'
+        '@protocol(needs={"drive": Actuator})\n'
+        "def look(parameters: Parameters, slots: Slots) -> Messages:\n"
+        '    """Look."""\n'
+        "    for _ in range(30):\n"
+        "        yield Step({}, Dwell(1.0))\n"
+    )
+    run = bench.run(str(tmp_path / "look.py"), "vo2", out=tmp_path).folder
+    with pytest.raises(DataError, match="does not change, so that there is no transient"):
+        write_twin([run], "vo2", tmp_path / "twin.toml")
+    with pytest.raises(DataError, match="is not a run"):
+        write_twin([tmp_path], "vo2", tmp_path / "twin.toml")
+
+
+def recording_of(dynamics, noise=0.0):
+    """A recording of an actuator that makes ten steps, read each 0.5 s."""
+    rng = np.random.default_rng(1)
+    changes, setpoints = 10.0 * np.arange(1, 11), rng.uniform(-5.0, 5.0, 10)
+    times = np.arange(0.0, 110.0, 0.5)
+    grid = 0.001
+    out = np.empty((2, int(110.0 / grid)))
+    levels = np.concatenate([[0.0], setpoints])
+    held = levels[np.searchsorted(changes + dynamics.delay, grid * np.arange(out.shape[1]), side="right")]
+    _kernels.follow(
+        np.zeros(5), held, np.zeros((2, held.size)), out, grid, dynamics.frequency, dynamics.damping, dynamics.rate,
+        0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
+    )  # fmt: skip
+    drive = np.interp(times, grid * np.arange(1, held.size + 1), out[0], left=0.0) + noise * rng.standard_normal(
+        times.size
+    )
+    return Recording(
+        path=Path("run"), meta={}, signals=(), steps=(), times=times, is_reading=np.ones(times.size, dtype=bool),
+        columns={"drive": drive, "response": drive}, changes=changes, setpoints=setpoints, drive="drive",
+        response="response", ticks=(np.empty(0), np.empty(0)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "dynamics",
+    [
+        ActuatorDynamics(delay=0.3, frequency=1.5),
+        ActuatorDynamics(frequency=2.0, damping=0.4),
+        ActuatorDynamics(frequency=3.0, damping=0.7, rate=1.5),
+    ],
+)
+def test_the_order_of_an_actuator_is_found_with_its_numbers(dynamics):
+    found = identify_actuator([recording_of(dynamics, 1e-3)]).dynamics
+    assert found.order == dynamics.order
+    assert found.delay == pytest.approx(dynamics.delay, abs=0.05)
+    assert found.frequency == pytest.approx(dynamics.frequency, rel=0.05)
+    assert found.damping == pytest.approx(dynamics.damping, rel=0.05)
+    assert math.isinf(dynamics.rate) or found.rate == pytest.approx(dynamics.rate, rel=0.05)
+
+
+def test_how_calls_divide_the_time_does_not_matter():
+    play = PrandtlIshlinskii(np.array([0.0, 0.5]), np.array([1.0, 1.0]), input_range=(-2.0, 2.0))
+    dynamics = Dynamics(
+        0.02, ActuatorDynamics(frequency=2.0, damping=0.7), wander=Wander(0.01, 1.0), unevenness=Unevenness(0.1, 1.0)
+    )
+
+    def ends(pieces):
+        specimen = Specimen((play,), dynamics, 0.0, np.random.default_rng(1))
+        plant = SpecimenPlant(specimen, 0.02, 0.0, 0.0)
+        for target in (1.0, -1.0):
+            plant.set(target)
+            for _ in range(pieces):
+                plant.advance(4.0 / pieces)
+        return specimen.drive, specimen.response
+
+    assert ends(1) == pytest.approx(ends(7), rel=1e-12)

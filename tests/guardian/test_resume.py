@@ -1,0 +1,63 @@
+import os
+import signal
+
+import pytest
+from benches import is_on, seconds_until
+from guarded_run import find_guardian
+from killing import kill_after
+
+from bench.cli import main
+from bench.errors import DeviceError
+from bench.journal import Record
+from bench.upkeep.opening import opened
+from bench.upkeep.recovery import clear_expired_watchdogs
+from sim_devices.serving.process import serve
+
+
+@pytest.fixture
+def served():
+    with serve("vo2", clock="x4") as rig:
+        yield rig
+
+
+def kill_both(bench):
+    os.kill(find_guardian(bench.pid), signal.SIGKILL)
+    bench.kill()
+
+
+def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
+    settings = ("increment=31.5", "half_cycles=1", "dwell=2")
+    command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
+    command += ["--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
+    folder = kill_after(2, tmp_path, *command, kill=kill_both)
+    with Record(folder) as record:
+        total = record.meta["plan"]["steps"]
+        before = len(record.steps())
+    assert before < total
+    # Nobody is left who could switch it off: its own watchdog does, and it stays in error.
+    seconds_until(lambda: not is_on(served))
+    with pytest.raises(SystemExit) as refused:
+        main(["resume", str(folder)])
+    assert refused.value.code == 2
+    assert "name its endpoints by --attach" in " ".join(capsys.readouterr().err.split())
+    again = ["resume", str(folder), "--attach", str(served.endpoints_file), "--accept-disagreement"]
+    with pytest.raises(SystemExit) as ended:
+        main(again)
+    said = " ".join(capsys.readouterr().out.split())
+    assert not ended.value.code
+    assert "tec: cleared: error 183 (communication watchdog" in said
+    assert not is_on(served)
+    with Record(folder) as record:
+        assert record.status == "completed"
+        assert [step.step for step in record.step_records()] == list(range(total))
+        # The time of the laboratory went on while nobody was there.
+        assert record.meta["resumes"][0]["t"] > record.steps()["finished"][before - 1]
+
+
+def test_clears_no_other_error(served):
+    served.control.fault("tec-over-current")
+    with (
+        opened("vo2", {}, served.endpoints_file, "a test") as place,
+        pytest.raises(DeviceError, match=r"tec: error 1\d\d \((?!communication watchdog)"),
+    ):
+        clear_expired_watchdogs(place)
