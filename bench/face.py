@@ -13,6 +13,7 @@ Leaving the block brings every device into its safe state before its line is clo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,6 +26,7 @@ from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
 from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
 from bench.results.models import predict as predict_file
+from bench.results.reading.options import ReadingOptions
 from bench.results.report import report_run
 from bench.results.run_folder import RunFolder
 from bench.rig import Rig, clock_for
@@ -151,19 +153,21 @@ def identify(
     output: str | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
-    """Identify a model from a run or a CSV file.
+    """Identify a model from a run or a file of measurements.
 
     Parameters
     ----------
     source : RunFolder, str or Path
-        A run, or a CSV file with a header.
+        A run, or a table of measurements: text, .gz, .mat, .xlsx or .parquet.
     model : str
         Name of a registered model.
     input, output : str, optional
-        Columns; of a run, the reading of its slot `drive` and the signal of its slot `response` if not given.
+        Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
+        `response` if not given.
     **options
         As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial` and the options
-        of the model.
+        of the model; and those of `ReadingOptions` where the layout of a file is not found from it: `delimiter`,
+        `decimal`, `encoding`, `skip_lines`, `table`.
 
     Raises
     ------
@@ -191,7 +195,10 @@ def identify(
         input, output = input or recorded.signal_of("drive"), output or recorded.signal_of("response")  # noqa: A001
     if input is None or output is None:
         raise BenchError(f"{folder}: name the columns: input=..., output=...")
-    return identify_file(folder, input_column=input, output_column=output, model=model, **options)
+    reading = ReadingOptions(
+        **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
+    )
+    return identify_file(folder, input_column=input, output_column=output, model=model, reading=reading, **options)
 
 
 def predict(model: Model, inputs: npt.ArrayLike, *, continue_memory: bool = False) -> npt.NDArray[np.float64]:

@@ -9,9 +9,10 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from bench.cli.console import JsonOption, console, show_compilation, write_json
-from bench.cli.models import check_figures
+from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
+from bench.cli.data_options import layout_options, print_assumptions, show_patience
 from bench.errors import ConfigurationError
+from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:
     from bench.results.run_comparison import RunComparison
@@ -20,12 +21,17 @@ app = typer.Typer()
 
 
 @app.command("compare")
+@layout_options
 @show_compilation()
 def compare_(
     compared: Annotated[list[Path], typer.Argument(metavar="A B", help="Model files with --data; or two runs.")],
     data: Annotated[
         Path | None,
-        typer.Option("--data", metavar="FILE", help="For models: CSV file with a header, or the folder of a run."),
+        typer.Option(
+            "--data",
+            metavar="FILE",
+            help="For models: table of measurements (text, .gz, .mat, .xlsx, .parquet), or the folder of a run.",
+        ),
     ] = None,
     input_column: Annotated[
         str | None, typer.Option("--input", metavar="COLUMN", help="Input column; the first model's if not given.")
@@ -41,6 +47,8 @@ def compare_(
     ] = 0,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
 ) -> None:
     """Compare models on measurements that they may not have seen; or, without `--data`, two runs with each other.
 
@@ -51,14 +59,19 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or figures:
-            raise ConfigurationError("--input, --output, --skip and --figures are for models, with --data FILE")
+        if input_column or output_column or skip or figures or reading != ReadingOptions():
+            raise ConfigurationError(
+                "--input, --output, --skip, --figures and how a file is read are for models, with --data FILE"
+            )
+        check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
         return
     from bench.results.models import compare_models
 
-    check_figures(figures)
-    result = compare_models(compared, data, input_column, output_column, skip=skip)
+    check_outputs(figures=figures, json_file=json_file)
+    with show_patience(f"reading {data.name}"):
+        result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
+    print_assumptions(data, result.assumptions)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):

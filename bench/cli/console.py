@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bench.errors import BenchError, ConfigurationError
+from bench.errors import BenchError, ConfigurationError, DataError
 
 console = Console()
 error_console = Console(stderr=True)
@@ -95,6 +96,29 @@ def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
         except ValueError:
             raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
     return numbers
+
+
+def check_outputs(*, out: Path | None = None, figures: Path | None = None, json_file: Path | None = None) -> None:
+    """Check, before any computing, that the files and figures that are asked for can be written.
+
+    Raises ConfigurationError for `--json`, DataError for the others: names the option and the folder.
+    """
+    for path, option, kind in ((out, "--out", DataError), (json_file, "--json", ConfigurationError)):
+        if path is None:
+            continue
+        if path.is_dir():
+            raise kind(f"{option} {path} cannot be written: it is a folder")
+        if not path.parent.is_dir():
+            raise kind(f"{option} {path} cannot be written: there is no folder {path.parent}")
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise kind(f"{option} {path} cannot be written: permission denied")
+    if figures is not None:
+        from bench.results.figures import check_matplotlib
+
+        check_matplotlib()
+        existing = next(folder for folder in (figures, *figures.absolute().parents) if folder.exists())
+        if not existing.is_dir() or not os.access(existing, os.W_OK):
+            raise DataError(f"--figures {figures}: the folder cannot be made in {existing}")
 
 
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold

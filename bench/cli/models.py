@@ -9,13 +9,29 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from bench.cli.console import JsonOption, console, parse_numbers, print_rows, show_compilation, warn, write_json
+from bench.cli.console import (
+    JsonOption,
+    check_outputs,
+    console,
+    parse_numbers,
+    print_rows,
+    show_compilation,
+    warn,
+    write_json,
+)
+from bench.cli.data_options import layout_options, print_assumptions, show_patience
 from bench.errors import ConfigurationError
+from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
 
 
-DataArgument = Annotated[Path, typer.Argument(metavar="FILE", help="CSV file with a header, or the folder of a run.")]
+DataArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE", help="Table of measurements (text, .gz, .mat, .xlsx, .parquet), or the folder of a run."
+    ),
+]
 ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
 ContinueMemory = Annotated[
     bool,
@@ -25,15 +41,8 @@ ContinueMemory = Annotated[
 ]
 
 
-def check_figures(folder: Path | None) -> None:
-    """Check before any computing that figures can be drawn, if they are asked for."""
-    if folder is not None:
-        from bench.results.figures import check_matplotlib
-
-        check_matplotlib()
-
-
 @app.command("identify")
+@layout_options
 @show_compilation()
 def identify_(
     file: DataArgument,
@@ -81,31 +90,37 @@ def identify_(
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
-    Columns are named as in the header; a unit in brackets at the end, as in `force [N]`, may be left out and
-    goes into the model. Of a run, the readings are taken: `bench identify RUN --input voltage
-    --output displacement --model preisach --out model.json`.
+    Columns are named as in the header; a unit at the end, as in `force [N]`, may be left out and goes into the
+    model. A number, such as `--input 1`, chooses a column by its place. The layout of a file is found from it and
+    printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings are
+    taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`.
     """
     from bench.results.models import certificate_lines, identify_file
 
-    check_figures(figures)
-    found = identify_file(
-        file,
-        input_column=input_column,
-        output_column=output_column,
-        model=model,
-        levels=levels,
-        degree=degree,
-        plane=plane,
-        reversible=reversible,
-        smoothing=smoothing,
-        skip=skip,
-        initial=initial,
-        **parse_numbers("--option", options or ()),
-        cross_validated=cross_validate,
-    )
+    check_outputs(out=out, figures=figures, json_file=json_file)
+    with show_patience(f"reading and fitting {file.name}"):
+        found = identify_file(
+            file,
+            input_column=input_column,
+            output_column=output_column,
+            model=model,
+            levels=levels,
+            degree=degree,
+            plane=plane,
+            reversible=reversible,
+            smoothing=smoothing,
+            skip=skip,
+            initial=initial,
+            **parse_numbers("--option", options or ()),
+            cross_validated=cross_validate,
+            reading=reading,
+        )
+    print_assumptions(file, found.assumptions)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
@@ -124,6 +139,7 @@ def identify_(
 
 
 @app.command("predict")
+@layout_options
 @show_compilation()
 def predict_(
     model_path: ModelArgument,
@@ -135,6 +151,8 @@ def predict_(
     ] = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
@@ -145,8 +163,11 @@ def predict_(
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, errors_json, outside_of_range, predict
 
+    check_outputs(out=out, json_file=json_file)
     model = load_model(model_path)
-    columns = read_columns(file, [input_column] + ([output_column] if output_column else []))
+    with show_patience(f"reading {file.name}"):
+        columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
+    print_assumptions(file, columns.assumptions)
     inputs = columns.values[input_column]
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
@@ -234,10 +255,13 @@ class PolicyOption(Enum):
 
 
 @app.command()
+@layout_options
 @show_compilation()
 def invert(
     model_path: ModelArgument,
-    file: Annotated[Path, typer.Argument(metavar="TARGETS.csv", help="CSV file with a header.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="TARGETS.csv", help="Table of targets (text, .gz, .mat, .xlsx, .parquet).")
+    ],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
     policy: Annotated[
@@ -246,6 +270,8 @@ def invert(
     ] = PolicyOption.NEAREST,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
 ) -> None:
     """Compute the set-points that bring a model's output to one target after another.
 
@@ -258,8 +284,11 @@ def invert(
     from bench.results.models import check_unit, invert_targets
     from bench.units import header_with_unit
 
+    check_outputs(out=out, json_file=json_file)
     model = load_model(model_path)
-    columns = read_columns(file, [column])
+    with show_patience(f"reading {file.name}"):
+        columns = read_columns(file, [column], options=reading)
+    print_assumptions(file, columns.assumptions)
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
     found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)

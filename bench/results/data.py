@@ -1,9 +1,9 @@
-"""Columns of measurements, from a CSV file or from the journal of a run."""
+"""Columns of measurements, from a file or from the journal of a run."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,18 @@ import numpy.typing as npt
 
 from bench.errors import DataError
 from bench.journal import Record
+from bench.results.reading.matlab import HDF5, read_matlab
+from bench.results.reading.options import ReadingOptions
+from bench.results.reading.parquet import read_parquet
+from bench.results.reading.spreadsheet import read_spreadsheet
+from bench.results.reading.table import ReadColumns
+from bench.results.reading.text import reading_errors
+from bench.results.reading.text_table import read_text
 
 FEWEST_ROWS = 10
 """Fewer samples than this identify nothing."""
+
+_OLD_SPREADSHEET = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 
 _LONGEST_PLATEAU = 0.5
 """Share of the samples that may repeat the one before without a word."""
@@ -34,32 +43,51 @@ class Columns:
         Each of shape (rows,), by the name that was asked for; every value is finite.
     units : mapping of str to str
         Unit by the same names, empty where the source does not say.
+    assumptions : str
+        What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
     """
 
     source: str
     values: Mapping[str, Floats]
     units: Mapping[str, str]
+    assumptions: str = ""
 
 
-def read_columns(path: Path, names: Sequence[str], *, at_least: int = 1) -> Columns:
-    """Read columns of a CSV file, or the readings of a run.
+def read_columns(
+    path: Path, names: Sequence[str], *, at_least: int = 1, options: ReadingOptions | None = None
+) -> Columns:
+    """Read columns of a file of measurements, or the readings of a run.
 
     Parameters
     ----------
     path : Path
-        A CSV file with a header line, or the folder or the journal of a run.
+        A table of text, which may be compressed by gzip, a MATLAB file, a spreadsheet or a Parquet file; or the
+        folder or the journal of a run.
     names : sequence of str
-        Columns, as the header has them; a unit in brackets at the end, as in `force [N]`, may be left out.
+        Columns, as the header has them; a unit at the end, as in `force [N]`, may be left out. Or their numbers,
+        from 1.
     at_least : int
         Fewest rows that make sense.
+    options : ReadingOptions, optional
+        What is known of the layout of a file; the rest is found.
 
     Raises
     ------
     DataError
-        If the file cannot be read, a column is missing, a cell is empty, not a number or not finite, or rows
-        are too few: names row and column. Rows count from 1 below the header.
+        If the file cannot be read or can be read in several ways, a column is missing, a cell is empty, not a number
+        or not finite, or rows are too few: names row and column, and the option that may help. Rows count from 1
+        below the header.
+    ConfigurationError
+        If an option does not apply.
     """
-    columns = _from_run(path, names) if _is_run(path) else _from_csv(path, names)
+    options = options or ReadingOptions()
+    if path.is_dir() or path.suffix == ".sqlite":
+        options.check_only(path, "a run")
+        columns = _from_run(path, names)
+    else:
+        found = _reader(path)(path, names, options)
+        values = dict(zip(names, found.values, strict=True))
+        columns = Columns(str(path), values, dict(zip(names, found.units, strict=True)), ", ".join(found.notes))
     rows = len(next(iter(columns.values.values())))
     if rows < at_least:
         raise DataError(f"{path}: has {rows} rows of data; at least {at_least} are needed")
@@ -104,16 +132,19 @@ def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequ
         raise DataError(f"{path} cannot be written: {error}") from None
 
 
-def split_unit(header: str) -> tuple[str, str]:
-    """Return name and unit of a column header such as `force [N]`; the unit is empty when there is none."""
-    name, bracket, rest = header.strip().rpartition(" [")
-    if bracket and rest.endswith("]"):
-        return name, rest[:-1]
-    return header.strip(), ""
-
-
-def _is_run(path: Path) -> bool:
-    return path.is_dir() or path.suffix == ".sqlite"
+def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadColumns]:
+    """Return what reads a kind of file, by its ending or its first bytes."""
+    with reading_errors(path), path.open("rb") as file:
+        start = file.read(len(_OLD_SPREADSHEET))
+    if path.suffix.lower() == ".mat" or start.startswith((HDF5, b"MATLAB")):
+        return read_matlab
+    if path.suffix.lower() in (".xlsx", ".xlsm"):
+        return read_spreadsheet
+    if start.startswith(b"PAR1"):
+        return read_parquet
+    if start == _OLD_SPREADSHEET or start.startswith(b"PK\x03\x04"):
+        raise DataError(f"{path}: this kind of file is not read; save it as .xlsx or CSV")
+    return read_text
 
 
 def _from_run(path: Path, names: Sequence[str]) -> Columns:
@@ -130,53 +161,3 @@ def _from_run(path: Path, names: Sequence[str]) -> Columns:
         if bad.size:
             raise DataError(f"{path}: step {bad[0]}, column {name}: there is no value")
     return Columns(str(path), values, units)
-
-
-def _from_csv(path: Path, names: Sequence[str]) -> Columns:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, strict=True)
-            header = next(rows, None)
-            if not header or not any(cell.strip() for cell in header):
-                raise DataError(f"{path}: is empty; expected a header line with column names")
-            places = {name: _place(path, header, name) for name in names}
-            values: dict[str, list[float]] = {name: [] for name in names}
-            for number, row in enumerate(rows, start=1):
-                if not row:
-                    continue
-                for name, place in places.items():
-                    values[name].append(_cell(path, row, number, name, place))
-    except FileNotFoundError:
-        raise DataError(f"{path} does not exist") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read as CSV: {error}") from None
-    return Columns(
-        str(path),
-        {name: np.array(column, dtype=np.float64) for name, column in values.items()},
-        {name: split_unit(header[place])[1] for name, place in places.items()},
-    )
-
-
-def _place(path: Path, header: Sequence[str], name: str) -> int:
-    exact = [i for i, cell in enumerate(header) if cell.strip() == name]
-    places = exact or [i for i, cell in enumerate(header) if split_unit(cell)[0] == name]
-    if not places:
-        known = ", ".join(cell.strip() for cell in header)
-        raise DataError(f"{path}: has no column {name!r}; it has: {known}")
-    if len(places) > 1:
-        raise DataError(f"{path}: has {len(places)} columns {name!r}; name one with its unit, as in the header")
-    return places[0]
-
-
-def _cell(path: Path, row: Sequence[str], number: int, name: str, place: int) -> float:
-    where = f"{path}: row {number}, column {name}"
-    if place >= len(row) or not row[place].strip():
-        raise DataError(f"{where}: is empty; expected a number")
-    try:
-        # Python reads 1_000 as a number; no measuring program writes one so.
-        value = float(row[place].replace("_", "?"))
-    except ValueError:
-        raise DataError(f"{where}: {row[place].strip()!r} is not a number") from None
-    if not np.isfinite(value):
-        raise DataError(f"{where}: {row[place].strip()} is not a finite number")
-    return value

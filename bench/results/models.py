@@ -40,6 +40,7 @@ from bench.identification import (
 )
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.reading.options import ReadingOptions
 
 Floats = npt.NDArray[np.float64]
 
@@ -66,6 +67,8 @@ class IdentifiedFile:
         Which cells of the Preisach plane the input has swept; None for a model without one.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
+    assumptions : str
+        What was assumed about the layout of the file; empty for a run.
     """
 
     file: ModelFile
@@ -75,6 +78,7 @@ class IdentifiedFile:
     outputs: Floats
     coverage: Coverage | None = None
     trials: CrossValidation | None = None
+    assumptions: str = ""
 
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
@@ -149,16 +153,17 @@ def identify_file(
     smoothing: float = 0.0,
     skip: int = 0,
     cross_validated: bool = False,
+    reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
-    """Identify a model from a CSV file or a run.
+    """Identify a model from a file of measurements or a run.
 
     Parameters
     ----------
     path : Path
-        CSV file with a header, or the folder of a run.
+        A file that `read_columns` reads, or the folder of a run.
     input_column, output_column : str
-        Columns of the model's input and output.
+        Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
     smoothing : float
@@ -167,6 +172,8 @@ def identify_file(
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
+    reading : ReadingOptions, optional
+        What is known of the layout of the file.
     **options
         `initial` and the options of the model, as in `identify`; None leaves the model's own default.
 
@@ -184,7 +191,7 @@ def identify_file(
         raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
     if skip < 0:
         raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
-    columns = read_columns(path, (input_column, output_column), at_least=FEWEST_ROWS)
+    columns = read_columns(path, (input_column, output_column), at_least=FEWEST_ROWS, options=reading)
     inputs, outputs = columns.values[input_column], columns.values[output_column]
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
@@ -216,7 +223,9 @@ def identify_file(
         "kkt": found.certificate.kkt_residual,
     }
     file = ModelFile(model, found.model, memory, provenance)
-    return IdentifiedFile(file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials)
+    return IdentifiedFile(
+        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
+    )
 
 
 def _shape(operator: Operator[Any]) -> dict[str, float]:
@@ -351,10 +360,13 @@ class ComparedModels:
         By the model file's name.
     unit : str
         Unit of the output.
+    assumptions : str
+        What was assumed about the layout of the file; empty for a run.
     """
 
     comparisons: Mapping[str, Comparison]
     unit: str
+    assumptions: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
@@ -365,7 +377,13 @@ class ComparedModels:
 
 
 def compare_models(
-    paths: Sequence[Path], data: Path, input_column: str | None, output_column: str | None, *, skip: int = 0
+    paths: Sequence[Path],
+    data: Path,
+    input_column: str | None,
+    output_column: str | None,
+    *,
+    skip: int = 0,
+    reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
 
@@ -374,11 +392,13 @@ def compare_models(
     paths : sequence of Path
         Model files.
     data : Path
-        CSV file or run.
+        A file that `read_columns` reads, or a run.
     input_column, output_column : str or None
         Columns; those that the first model was identified from if None.
     skip : int
         First rows that drive the memory but do not count.
+    reading : ReadingOptions, optional
+        What is known of the layout of the file.
 
     Raises
     ------
@@ -392,7 +412,7 @@ def compare_models(
         given or str(files[0].provenance.get(key, ""))
         for key, given in (("input", input_column), ("output", output_column))
     ]
-    columns = read_columns(data, names)
+    columns = read_columns(data, names, options=reading)
     inputs, outputs = (columns.values[name] for name in names)
     if not 0 <= skip < inputs.size:
         raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
@@ -402,7 +422,8 @@ def compare_models(
         check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = file.operator
-    return ComparedModels(compare(operators, inputs, outputs, skip=skip), files[0].operator.output_unit)
+    comparisons = compare(operators, inputs, outputs, skip=skip)
+    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions)
 
 
 def assess_designs(

@@ -12,7 +12,17 @@ from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 
-EXTRAS = {"rerun", "rerun_cli", "rerun_bindings", "pyarrow", "matplotlib", "mpl_toolkits", "filterpy"}
+EXTRAS = {
+    "rerun",
+    "rerun_cli",
+    "rerun_bindings",
+    "pyarrow",
+    "matplotlib",
+    "mpl_toolkits",
+    "filterpy",
+    "openpyxl",
+    "pandas",
+}
 PACKAGES = ("bench", "drivers", "sim_devices", "protocols", "rigs")
 
 

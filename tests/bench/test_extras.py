@@ -14,6 +14,7 @@ SCRIPT = Path(__file__).with_name("run_without_extras.py")
 RUN = ("run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2")
 IDENTIFY = ("--input", "tec_temperature", "--output", "curvature", "--model", "polynomial", "--degree", "3")
 DASHBOARD, REPORT = "pip install 'actuator-bench[dashboard]'", "pip install 'actuator-bench[report]'"
+SPREADSHEET = "pip install 'actuator-bench[spreadsheet]'"
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +34,16 @@ def without_extras(folder, finished_process):
         "compare": ["compare", folder / "model.json", "--data", "RUN", "--figures", folder / "figures"],
         "report": ["report", "RUN"],
         "export csv": ["export", "RUN", "--format", "csv", "--out", folder],
+        "identify csv": ["identify", folder / "readings.csv", *IDENTIFY],
+        "identify xlsx": ["identify", folder / "data.xlsx", *IDENTIFY],
+        "identify parquet": ["identify", folder / "data.parquet", *IDENTIFY],
         "export parquet": ["export", "RUN", "--format", "parquet", "--out", folder],
         "export rrd": ["export", "RUN", "--format", "rrd", "--out", folder],
         "export png": ["export", "RUN", "--format", "png", "--out", folder],
         "reproduce": ["reproduce", "vo2", "--out", folder / "studies"],
     }
+    (folder / "data.xlsx").write_bytes(b"PK\x03\x04")
+    (folder / "data.parquet").write_bytes(b"PAR1")
     texts = [[str(argument) for argument in command] for command in commands.values()]
     finished = finished_process(
         [sys.executable, str(SCRIPT), json.dumps(texts), str(folder / "runs")], folder, {**os.environ}
@@ -69,7 +75,7 @@ def test_a_run_says_once_that_it_has_no_recording(without_extras, folder):
 
 
 def test_what_needs_no_extra_works(without_extras, folder):
-    for name in ("list", "identify", "export csv"):
+    for name in ("list", "identify", "export csv", "identify csv"):
         code, out, err = without_extras[0][name]
         assert (code, err) == (0, ""), name
         assert "not installed" not in out
@@ -82,6 +88,8 @@ def test_what_needs_no_extra_works(without_extras, folder):
     [
         ("live", "the live view", DASHBOARD),
         ("identify with figures", "a figure", REPORT),
+        ("identify xlsx", "reading a spreadsheet", SPREADSHEET),
+        ("identify parquet", "reading a parquet file", REPORT),
         ("compare", "a figure", REPORT),
         ("report", "a figure", REPORT),
         ("reproduce", "a figure", REPORT),

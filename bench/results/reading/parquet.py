@@ -1,0 +1,48 @@
+"""Columns of a Parquet file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bench.errors import DataError
+from bench.extras import needed_for
+from bench.results.reading.heads import find_place, make_heads
+from bench.results.reading.options import ReadingOptions
+from bench.results.reading.table import ReadColumns
+from bench.results.reading.text import reading_errors
+
+
+def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+    """Read columns of a Parquet file.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, a column is missing or not of numbers, or a value is missing or not finite.
+    ConfigurationError
+        If an option does not apply.
+    MissingExtraError
+        If the library for Parquet files is not installed.
+    """
+    options.check_only(path, "a Parquet file")
+    with needed_for("reading a parquet file", "report"):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    with reading_errors(path):
+        try:
+            texts = pq.read_schema(path).names
+            heads = make_heads(texts)
+            places = [find_place(path, heads, len(heads), name) for name in names]
+            table = pq.ParquetFile(path).read(columns=[texts[place] for place in places])
+            found = [table.column(texts[place]) for place in places]
+            values = [np.asarray(column.cast(pa.float64()).to_numpy(), dtype=np.float64) for column in found]
+        except (pa.ArrowException, KeyError) as error:
+            raise DataError(f"{path} cannot be read as Parquet: {error}") from None
+    for name, column in zip(names, values, strict=True):
+        bad = np.flatnonzero(~np.isfinite(column))
+        if bad.size:
+            raise DataError(f"{path}: row {bad[0] + 1}, column {name}: is empty or not a finite number")
+    return ReadColumns(values, [heads[place].unit for place in places], ("Parquet",))
