@@ -127,7 +127,7 @@ class _Hold:
 def _holds(recording: Recording, signal: str, dynamics: Dynamics) -> list[_Hold]:
     """Return the settled part of each hold that has readings enough."""
     values = recording.columns[signal]
-    rows = np.flatnonzero((recording.since_change > _settled_after(recording, dynamics)) & np.isfinite(values))
+    rows = np.flatnonzero(_settled(recording, dynamics) & np.isfinite(values))
     parts = np.split(rows, np.flatnonzero(np.diff(recording.last_change[rows])) + 1)
     return [_Hold(values[part], recording.is_reading[part]) for part in parts if part.size >= _LEAST_OF_HOLD]
 
@@ -271,7 +271,7 @@ class Part:
         """Return the pairs of settled rows of the same hold and kind, by the time between them and by slope."""
         r, count = self._recording, self.still.size
         firsts, seconds, kinds = [], [], []
-        settled = r.since_change[:count] > _settled_after(r, self._dynamics)
+        settled = _settled(r, self._dynamics)[:count]
         for kind in (False, True):
             rows = np.flatnonzero((r.is_reading[:count] == kind) & settled)
             holds = r.last_change[rows]
@@ -336,17 +336,13 @@ def _noise(found: Sequence[float | None], resolution: float) -> Noise:
     )
 
 
-def _settled_after(recording: Recording, dynamics: Dynamics) -> float:
-    """Return the time after a change of the set-point from which the rest counts as still, s."""
+def _settled(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
+    """Return at which rows the rest counts as still: so long after a change of the set-point, by its size."""
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency
-    longest = float(np.abs(np.diff(recording.setpoints, prepend=recording.driven[0])).max()) / actuator.rate
-    return max(0.5, _SETTLED * (constant + response.lag) + actuator.delay + min(longest, 0.3 * _hold(recording)))
-
-
-def _hold(recording: Recording) -> float:
-    """Return the usual time between two changes of the set-point, s."""
-    return float(np.median(np.diff(recording.changes)))
+    moves = np.abs(np.diff(recording.setpoints, prepend=recording.driven[0]))[recording.last_change]
+    needed = _SETTLED * (constant + response.lag) + actuator.delay + moves / actuator.rate
+    return np.asarray(recording.since_change > np.maximum(needed, 0.5))
 
 
 def _deviation(differences: Floats) -> float | None:

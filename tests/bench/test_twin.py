@@ -23,7 +23,7 @@ from sim_devices.twin_laboratory import SpecimenPlant
 
 pytestmark = pytest.mark.slow
 
-CREEP = {"hot": 70.0, "cool": 50.0, "duration": 30.0}
+CREEP = {"hot": 70.0, "cool": 50.0, "duration": 60.0}
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +36,22 @@ def measured(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def twin(measured, tmp_path_factory):
+def model(measured, tmp_path_factory):
+    """Its model, identified from the loops."""
+    path = tmp_path_factory.mktemp("model") / "model.json"
+    identified = bench.identify(bench.load(measured[1]), "preisach-nonmonotonic", levels=12, plane=(30.0, 70.0))
+    identified.file.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def twin(measured, model, tmp_path_factory):
     """Its twin, made by the command, and what the command wrote for programs."""
     folder = tmp_path_factory.mktemp("twin")
     out, found = folder / "twin.toml", folder / "twin.json"
+    options = ["--rig", "vo2", "--model", str(model), "--out", str(out), "--json", str(found)]
     with pytest.raises(SystemExit) as stopped:
-        main(["twin", *map(str, measured), "--rig", "vo2", "--out", str(out), "--json", str(found)])
+        main(["twin", *map(str, measured), *options])
     assert not stopped.value.code
     return out, json.loads(found.read_text())
 
@@ -89,9 +99,8 @@ def test_equal_seeds_give_equal_sessions(twin, tmp_path):
     assert not np.array_equal(first, other)
 
 
-def test_a_run_under_control_is_rehearsed_on_the_twin(twin, measured, tmp_path):
-    model, found = tmp_path / "model.json", tmp_path / "rehearsal.json"
-    bench.identify(bench.load(measured[1]), "preisach-nonmonotonic", levels=8).file.save(model)
+def test_a_run_under_control_is_rehearsed_on_the_twin(twin, model, tmp_path):
+    found = tmp_path / "rehearsal.json"
     settings = [f"--set=model={model}", "--set=count=4"]
     with pytest.raises(SystemExit) as stopped:
         main(["rehearse", "tracking", "--rig", str(twin[0]), "--seed", "7", "--json", str(found), *settings])
