@@ -62,10 +62,11 @@ class Catalogue:
         problems += packaged.problems
         packages |= {name: package for name, package in packaged.packages.items() if package != registry.OWN_PACKAGE}
         models = identifiable_models()
-        # Not listed by themselves; what cannot be loaded is named all the same.
+        # Not listed by themselves; what another package cannot load is named all the same.
         groups: tuple[registry.Group, ...] = ("devices", "laboratories", "derived_signals", "commands")
         for group in groups:
-            loaded(registry.entries(group), lambda _, entry: entry.load())
+            foreign = {name: entry for name, entry in registry.entries(group).items() if not entry.own}
+            loaded(foreign, lambda _, entry: entry.load())
         return cls(
             rigs=loaded(packaged_rigs(problems), lambda name, _: load_rig(name)),
             protocols=packaged.protocols,

@@ -86,12 +86,13 @@ class Engine:
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None = None,
+        zero: float | None = None,
     ) -> None:
         self._station = station
         self._clock = station.clock
         self._journal = journal
         self._interrupts = interrupts
-        self._run = RunAtHand(station, journal, observers, interrupts, ask)
+        self._run = RunAtHand(station, journal, observers, interrupts, ask, zero)
         self._patience = station.description.file.safety.patience
         self._work: dict[type[Message], Callable[[Any], Reading]] = {
             Step: self._step,
@@ -112,7 +113,8 @@ class Engine:
 
         With a past it goes on where its record ends, once the specimen is back where it was.
         """
-        self._run.zero = self._clock.now() if past is None else past.zero
+        if past is not None:
+            self._run.zero = past.zero
         self._clock.interrupted = self._interrupts.abort_requested
         if isinstance(self._clock, PacedClock):
             self._clock.restart_pace()

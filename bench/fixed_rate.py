@@ -11,7 +11,7 @@ from bench.control.loops import BlockController, Floats, SampledController
 from bench.errors import ConfigurationError, LimitError
 from bench.protocol.vocabulary import LATENESS, FixedRate, Reading
 from bench.rig import Look
-from bench.running import NOT_AT_WORK, RunAtHand, traced
+from bench.running import NOT_AT_WORK, RunAtHand, row_of, traced
 from bench.settling import Settled
 
 _PERIODS_OF_GRACE = 5
@@ -51,6 +51,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     setpoints = [f"{name}_setpoint" for name in message.actuators]
     limits = list(zip(message.actuators, message.limits, strict=False))
     read = run.station.quick_reader((*inputs, *message.watched))
+    measured = row_of(inputs)
     move = run.station.mover(message.actuators)
     samples = max(1, round(message.duration * message.rate))
     started = clock.now()
@@ -76,7 +77,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             run.station.promise(_GRACE + _PERIODS_OF_GRACE * period, f"a loop at {message.rate:g} Hz")
         now = clock.now()
         values.update(read())
-        commands = update(now - start, tuple([values[name] for name in inputs]))
+        commands = update(now - start, measured(values))
         if len(commands) != len(setpoints):
             raise ConfigurationError(
                 f"the controller of {', '.join(message.actuators)} gave {len(commands)} set-points; "

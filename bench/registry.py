@@ -85,6 +85,12 @@ class Entry:
 
 
 @cache
+def _name(package: metadata.Distribution) -> str:
+    """Return the name of a package, for which all of its metadata is parsed."""
+    return package.name
+
+
+@cache
 def entries(group: Group) -> Mapping[str, Entry]:
     """Return what is registered in a group, by name, in alphabetical order.
 
@@ -94,7 +100,7 @@ def entries(group: Group) -> Mapping[str, Entry]:
         raise ValueError(f"group: expected one of {', '.join(GROUPS)}, got {group!r}")
     found: dict[str, Entry] = {}
     for point in metadata.entry_points(group=f"bench.{group}"):
-        package = point.dist.name if point.dist is not None else "unknown"
+        package = _name(point.dist) if point.dist is not None else "unknown"
         entry = Entry(group, point.name, package, point.value)
         other = found.setdefault(point.name, entry)
         if other != entry:

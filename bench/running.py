@@ -83,6 +83,8 @@ class RunAtHand:
         What the operator and the system ask for.
     ask : callable, optional
         Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
+    zero : float, optional
+        Time of the clock at which the record begins to count, s; now if not given.
 
     Attributes
     ----------
@@ -95,7 +97,7 @@ class RunAtHand:
     trace : dict of str to float
         What a controller thinks, for the record.
     zero : float
-        Time of the clock at which the run started, s.
+        Time of the clock at which the record begins to count, s.
     """
 
     def __init__(
@@ -105,16 +107,17 @@ class RunAtHand:
         observers: Iterable[Observer],
         interrupts: Interrupts,
         ask: Callable[[str], str] | None,
+        zero: float | None = None,
     ) -> None:
         self.station = station
         self.clock = station.clock
         self.period = station.description.file.telemetry.period
         self.names = tuple(signal.name for signal in journal.signals)
-        self._row = _row_of(self.names)
+        self._row = row_of(self.names)
         self.phase = ""
         self.steps = 0
         self.trace = NOT_AT_WORK
-        self.zero = self.clock.now()
+        self.zero = self.clock.now() if zero is None else zero
         self.ask = ask
         self._journal = journal
         self._observers = tuple(observers)
@@ -183,9 +186,12 @@ class RunAtHand:
 
         Raises AbortError if the run has to end, and what has tripped the station meanwhile.
         """
-        self.raise_if_aborted()
+        interrupts = self._interrupts
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         self.station.sleep_until(instant)
-        self.raise_if_aborted()
+        if interrupts.abort_reason is not None:
+            self.raise_if_aborted()
         if (seconds := self.clock.suspension()) > 0:
             # The next reading finds what the watchdogs have done meanwhile.
             self.event(
@@ -306,7 +312,7 @@ def traced(trace: Trace) -> dict[str, float]:
     return dict(zip(_TRACE_AND_LATENESS, thoughts, strict=True))
 
 
-def _row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+def row_of(names: Sequence[str]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
     """Return what takes the values of some signals out of those of all, in their order."""
     if len(names) == 1:
         (name,) = names

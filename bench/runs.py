@@ -197,7 +197,9 @@ def carry_out(
         files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
         models = [] if dashboard_class is None else [*models_among(files, "the files of the run").values()]
         meta = _asked(run, attachment, rig_file)
-        meta |= metadata(run.protocol, stated, description, slots, planned, clock.date())
+        # One zero for all times: the epoch of the record.
+        zero, epoch = clock.now(), clock.date()
+        meta |= metadata(run.protocol, stated, description, slots, planned, epoch)
         resumption = None
         if again is not None:
             resumption = again.fed(run.protocol, parameters, slots, description, clock, by_hand=guardian is None)
@@ -241,7 +243,7 @@ def carry_out(
         progress = ProgressDisplay(console, run.protocol.name, signals, shown, length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
-        engine = Engine(station, journal, observers, interrupts, ask)
+        engine = Engine(station, journal, observers, interrupts, ask, zero)
         if again is None:
             engine.warn(warnings)
         outcome = engine.run(run.protocol, parameters, resumption)

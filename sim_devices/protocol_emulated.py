@@ -209,10 +209,12 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             except (FramingError, ConnectionError) as error:
                 raise self._ended(error) from None
             return len(sent)
-        self._clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
+        clock = self._clock
+        clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
         self._hear()
         answer = self._stream.receive(sent)
-        self._clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
+        if answer:
+            clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         self._received += answer
         return len(sent)
 

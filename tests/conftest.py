@@ -6,6 +6,7 @@ import select
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 from contextlib import contextmanager
 from itertools import chain, groupby
@@ -90,6 +91,31 @@ def finished_process():
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def warm_process(finished_process, tmp_path_factory):
+    """Do as `finished_process` for `python -m` and `python -c`, where a cold start is not what is tested."""
+    if not hasattr(os, "fork"):
+        yield finished_process
+        return
+    outputs = [str(tmp_path_factory.mktemp("warm") / name) for name in ("stdout", "stderr")]
+    command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py"))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as server:
+
+        def run(command, folder, environment):
+            assert command[0] == sys.executable
+            request = {
+                "arguments": [str(argument) for argument in command[1:]],
+                "folder": str(folder),
+                "environment": dict(os.environ) if environment is None else environment,
+                "outputs": outputs,
+            }
+            server.stdin.write(json.dumps(request) + "\n")
+            code = int(server.stdout.readline())
+            return subprocess.CompletedProcess(command, code, *(Path(path).read_text() for path in outputs))
+
+        yield run
 
 
 @pytest.fixture

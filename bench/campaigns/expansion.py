@@ -13,7 +13,6 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from bench import registry
-from bench.campaign import Study
 from bench.campaigns.file import REFERENCE, CampaignFile, ModelsTable, RunsTable, as_override, axes, dotted
 from bench.campaigns.known_rig import KnownRig
 from bench.campaigns.sources import PROGRAMS, code_digest, digest, file_digest
@@ -24,6 +23,7 @@ from bench.hysteresis import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
 from bench.results.models import check_options, model_options
 from bench.rig_file import RigFile
+from bench.studies import Study
 
 _LONGEST_NAME = 120
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")

@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 from rich.console import Console
 
 from bench import registry
-from bench.campaign import Campaign, Study
 from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import Record
@@ -22,6 +21,7 @@ from bench.results.models import identify_file
 from bench.results.run_folder import RunFolder
 from bench.results.tracking import results_json
 from bench.runs import Run, carry_out
+from bench.studies import Campaign, Study
 from bench.workers import Workers
 
 DONE_NAME = "campaign.json"

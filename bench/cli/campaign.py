@@ -142,20 +142,17 @@ def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None
     if estimate.laboratory_seconds:
         on = "1 core" if cores == 1 else f"{cores} cores"
         hours, wall = estimate.laboratory_seconds / 3600, _duration(estimate.wall_seconds / cores)
-        line += f"; {hours:.1f} h of laboratory time, about {wall} on {on}"
+        line += f"; {hours:.1f} h of laboratory time, {wall} on {on}"
         if estimate.unknown:
             line += f", and {estimate.unknown} tasks of unknown length"
     console.print(line, highlight=False)
 
 
 def _duration(seconds: float) -> str:
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 90
-        else f"{seconds / 60:.0f} min"
-        if seconds < 5400
-        else f"{seconds / 3600:.1f} h"
-    )
+    # The pace of the plant alone is known: what a run takes besides counts among short ones.
+    if seconds < 60:
+        return "less than a minute"
+    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
 
 
 def _list(expansion: Expansion, before: dict[str, Done]) -> None:

@@ -97,7 +97,9 @@ def _print_runs(found: RunComparison) -> None:
     for name in ("run", "status", "reason", "steps", "seconds", "result"):
         values = getattr(first, name), getattr(second, name)
         if values != ("", ""):
-            table.add_row(name, *(Text("" if value is None else str(value)) for value in values))
+            known = ("" if value is None else value for value in values)
+            texts = (f"{value:.1f} s" if name == "seconds" and value != "" else str(value) for value in known)
+            table.add_row("duration" if name == "seconds" else name, *map(Text, texts))
     console.print(table)
     if found.differences:
         table = Table("key", "first", "second", title="what differs", title_justify="left")

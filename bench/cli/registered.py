@@ -79,7 +79,7 @@ class Studies(RegisteredCommands):
             ] = None,
             json_file: JsonOption = None,
         ) -> None:
-            from bench.campaign import reproduce
+            from bench.studies import reproduce
 
             result = reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console, workers=workers)
             write_json(json_file, result)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markdown import Markdown
 from rich.markup import escape
 from rich.table import Table
 
@@ -270,6 +269,8 @@ def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, A
 
 def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: ANN401 - a ProtocolDefinition
     """Print a protocol's help: what it does and what can be set; with a rig, its defaults and units."""
+    from rich.markdown import Markdown
+
     from bench.rig_file import load_rig
 
     file = load_rig(rig) if rig is not None else None

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markdown import Markdown
 from rich.table import Table as Columns
 
 from bench.devices import Signal
@@ -55,6 +54,9 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
     MissingExtraError
         If matplotlib is not installed.
     """
+    # A Markdown parser is dear to import, and each study imports this module.
+    from rich.markdown import Markdown
+
     check_matplotlib()
     with Record(run) as record:
         folder = _make_folder(out or record.path.parent / "report")

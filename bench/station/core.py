@@ -30,6 +30,9 @@ class State(Enum):
     """In the safe state, as the bench asked for it."""
 
 
+_ARMED = State.ARMED
+
+
 class StationCore:
     """The state of a station.
 
@@ -44,6 +47,8 @@ class StationCore:
     ----------
     state : State
         How far it is.
+    over : bool
+        Whether it is in its safe state for good.
     cause : BenchError or None
         What tripped it.
     late : bool
@@ -64,16 +69,12 @@ class StationCore:
         self._asked = False
         self._seen: float | None = None
         self.state = State.IDLE
+        self.over = False
         self.cause: BenchError | None = None
         self.late = False
         self.holding = False
         self.pause = ""
         self._acts_at = math.inf
-
-    @property
-    def over(self) -> bool:
-        """Whether the station is in its safe state for good."""
-        return self.state in (State.TRIPPED, State.ENDED)
 
     def begin(self, now: float) -> None:
         """Begin to look at the interlocks, every interval from `now` on."""
@@ -116,7 +117,11 @@ class StationCore:
         """Return when there is something to do next: a look, or the end of the promise."""
         if self.over:
             return math.inf
-        return min(self._next_look, self._acts_at, self._lease())
+        # Plain comparisons: this is asked with each sample of a fast loop.
+        due = self._next_look if self._next_look < self._acts_at else self._acts_at
+        if self.state is _ARMED and not self._asked and self._lease_end < due:
+            due = self._lease_end
+        return due
 
     def look_due(self, now: float) -> bool:
         """Return whether the interlocks have to be looked at; the next look is an interval later then."""
@@ -193,12 +198,12 @@ class StationCore:
     def trip(self, cause: BenchError) -> None:
         """End the run in the safe state; the first cause counts."""
         if not self.over:
-            self.state, self.cause = State.TRIPPED, cause
+            self.state, self.over, self.cause = State.TRIPPED, True, cause
 
     def end(self) -> None:
         """End the run in the safe state, as the bench asks for it."""
         if not self.over:
-            self.state = State.ENDED
+            self.state, self.over = State.ENDED, True
 
     def _lease(self) -> float:
         # While a request is carried out the bench waits, and cannot be late.

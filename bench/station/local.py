@@ -110,7 +110,7 @@ class LocalStation(Station):
                 for actuator, value in zip(devices, setpoints, strict=True)
                 if value != actuator.setpoint
             ]
-            # None is sent when another is wrong.
+            # None is sent when another is wrong; of one alone `set` sees it by itself.
             if len(changed) > 1:
                 for actuator, value in changed:
                     actuator.check(value)

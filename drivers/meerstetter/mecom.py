@@ -181,7 +181,10 @@ class TECLine:
         received = self._received
         if not received:
             # All of it may be there, as it always is on an emulated line.
-            received += self._port.read_all()
+            answer = self._port.read_all()
+            if answer.find(b"\r") == len(answer) - 1 >= 0:
+                return bytes(answer[:-1])
+            received += answer
         while (end := received.find(b"\r")) < 0:
             if len(received) < _ACKNOWLEDGE_LENGTH:
                 missing = _ACKNOWLEDGE_LENGTH - len(received)

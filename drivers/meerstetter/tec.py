@@ -72,6 +72,10 @@ class _State(IntEnum):
     RESET_PENDING = 5
 
 
+_STATES = {int(state): state for state in _State}
+"""States by their value, sooner than by the class."""
+
+
 _DEVICE_TYPE = Parameter(100, "device type", of_channel=False)
 _SERIAL_NUMBER = Parameter(102, "serial number", of_channel=False)
 _FIRMWARE = Parameter(103, "firmware version", of_channel=False)
@@ -192,6 +196,9 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._reads_blocks = False
         self._names = tuple(signal.name for signal in self.signals)
+        self._sent = Status.completed(name, clock)
+        self._limits: dict[TECMode, Limits] = {}
+        """Those of the modes so far, as each set-point is compared with them."""
 
     @classmethod
     def _open_line(cls, name: str, settings: TECSettings, clock: Clock) -> TECLine:  # noqa: ARG003
@@ -219,9 +226,14 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     @property
     def limits(self) -> Limits:
         """The allowed set-points: the settings' `temperature_limits` in °C, or ± `current_limit` in A."""
-        if self._mode is TECMode.TEMPERATURE:
-            return Limits(*self._settings.temperature_limits, "°C")
-        return Limits(-self._settings.current_limit, self._settings.current_limit, "A")
+        limits = self._limits.get(self._mode)
+        if limits is None:
+            if self._mode is TECMode.TEMPERATURE:
+                limits = Limits(*self._settings.temperature_limits, "°C")
+            else:
+                limits = Limits(-self._settings.current_limit, self._settings.current_limit, "A")
+            self._limits[self._mode] = limits
+        return limits
 
     def set(self, value: float) -> Status:
         """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
@@ -244,7 +256,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         elif self._line.repeats != repeats:
             self._check_output(self._read(_STATUS))
         if self._mode is TECMode.CURRENT:
-            return Status.completed(self.name, self._clock)
+            return self._sent
         timeout = self._settings.stable_timeout
         return Status(self.name, self._clock, lambda: self._arrived(value), timeout=timeout)
 
@@ -518,10 +530,10 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return self._named_state(self._read(_STATUS))
 
     def _named_state(self, value: float) -> _State:
-        try:
-            return _State(int(value))
-        except ValueError:
-            raise DeviceError(self.name, f"reports a device status {value:g} that the protocol lacks") from None
+        state = _STATES.get(int(value))
+        if state is None:
+            raise DeviceError(self.name, f"reports a device status {value:g} that the protocol lacks")
+        return state
 
     def _check(self) -> _State:
         """Return the state if it is ready or run; raise what is wrong otherwise."""

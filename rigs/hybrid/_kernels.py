@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 from typing import NamedTuple
 
+import numpy as np
 from numba import njit
 
 from bench.hysteresis._checks import Floats
@@ -31,10 +33,6 @@ class Filter(NamedTuple):
     """Step (s), conductances along the beam and from the tip to air (W/K), heat capacities of base and tip (J/K)."""
     bending: Floats
     """Range of the polynomial, low and high (K), its middle and half its width (K)."""
-    powers: Floats
-    """Of the polynomial of the deflection, highest first."""
-    slopes: Floats
-    """Of its derivative, likewise."""
     points: Floats
     seen: Floats
     expected: Floats
@@ -42,6 +40,66 @@ class Filter(NamedTuple):
     factor: Floats
     gain: Floats
     """Room for sigma points, what is read in them, its mean and covariance, a Cholesky factor, and the gain."""
+    powers: Floats
+    """Of the polynomial of the deflection, highest first."""
+    slopes: Floats
+    """Of its derivative, likewise."""
+
+
+_SHAPES = (
+    (STATES,),
+    (STATES, STATES),
+    (STATES,),
+    (READINGS,),
+    (5,),
+    (4,),
+    (POINTS, STATES),
+    (POINTS, READINGS),
+    (READINGS,),
+    (READINGS, READINGS),
+    (STATES, STATES),
+    (STATES, READINGS),
+)
+"""Of the parts of a filter, up to the polynomial."""
+
+_PLACES = tuple(accumulate((math.prod(shape) for shape in _SHAPES), initial=0))
+"""Where each part begins, and at last the polynomial."""
+
+
+def allocate(powers: int) -> tuple[Floats, Filter]:
+    """Return zeros for a filter as one array, and its parts as views; the polynomial has so many powers.
+
+    One array passes into a compiled function within a microsecond, a tuple of many takes ten.
+    """
+    shapes = (*_SHAPES, (powers,), (powers - 1,))
+    sizes = [math.prod(shape) for shape in shapes]
+    numbers = np.zeros(sum(sizes))
+    parts = np.split(numbers, np.cumsum(sizes)[:-1])
+    return numbers, Filter(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+
+
+@njit(cache=True)
+def _parts(numbers: Floats) -> Filter:
+    """Return the parts of a filter, as `allocate` does."""
+    at = _PLACES
+    polynomial = numbers[at[12] :]
+    powers = (polynomial.size + 1) // 2
+    return Filter(
+        numbers[at[0] : at[1]],
+        numbers[at[1] : at[2]].reshape((STATES, STATES)),
+        numbers[at[2] : at[3]],
+        numbers[at[3] : at[4]],
+        numbers[at[4] : at[5]],
+        numbers[at[5] : at[6]],
+        numbers[at[6] : at[7]].reshape((POINTS, STATES)),
+        numbers[at[7] : at[8]].reshape((POINTS, READINGS)),
+        numbers[at[8] : at[9]],
+        numbers[at[9] : at[10]].reshape((READINGS, READINGS)),
+        numbers[at[10] : at[11]].reshape((STATES, STATES)),
+        numbers[at[11] : at[12]].reshape((STATES, READINGS)),
+        polynomial[:powers],
+        polynomial[powers:],
+    )
 
 
 @njit(cache=True)
@@ -111,7 +169,23 @@ def _deflection(rise: float, f: Filter) -> float:
 
 
 @njit(cache=True)
-def predict(constant: float, slope: float, f: Filter) -> None:
+def predict(constant: float, slope: float, numbers: Floats) -> None:
+    """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
+    _predict(constant, slope, _parts(numbers))
+
+
+@njit(cache=True)
+def predict_and_correct(
+    constant: float, slope: float, base: float, tip: float, deflection: float, numbers: Floats
+) -> None:
+    """Advance as `predict`, then take in rises of base and tip (K) and the deflection (m)."""
+    f = _parts(numbers)
+    _predict(constant, slope, f)
+    _correct(base, tip, deflection, f)
+
+
+@njit(cache=True)
+def _predict(constant: float, slope: float, f: Filter) -> None:
     """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
     dt, along, air, base_capacity, tip_capacity = f.network
     _spread(f)
@@ -128,7 +202,7 @@ def predict(constant: float, slope: float, f: Filter) -> None:
 
 
 @njit(cache=True)
-def correct(base: float, tip: float, deflection: float, f: Filter) -> None:
+def _correct(base: float, tip: float, deflection: float, f: Filter) -> None:
     """Take in rises of base and tip (K) and the deflection (m)."""
     _spread(f)
     points, seen, expected, variance, factor, gain = f.points, f.seen, f.expected, f.variance, f.factor, f.gain

@@ -37,6 +37,8 @@ from rigs.hybrid.model import HybridModel
 
 STROKE = 9e-6
 """Largest deflection of either sign that the piezo part is asked for, m."""
+_ROOM = 4
+"""Room for the reference that comes, in lengths of the known one."""
 _THERMAL_GAIN = 3e4
 """Heat fed back per missing deflection where there is no piezo part, W/m."""
 
@@ -60,17 +62,25 @@ class _Preview:
         self._slopes = slopes / (slopes @ (x * (half + 1.0) * period))
         self._width = 2 * half + 1
         ahead = round(lead / period)
-        self._values = np.array([reference(k * period) for k in range(-half, half + 1 + ahead)])
+        values = [reference(k * period) for k in range(-half, half + 1 + ahead)]
+        # The known reference moves along the array, and back to its beginning once it has come to the end.
+        self._known = len(values)
+        self._values = np.array(values + [0.0] * (_ROOM * self._known))
+        self._begin = 0
         self._next = half + 1 + ahead
 
     def advance(self, t: float) -> tuple[float, float, float]:
         """Return the smoothed reference now (m), and ahead (m) with its derivative (m/s)."""
-        values = self._values
-        now = float(self._weights @ values[: self._width])
-        window = values[-self._width :]
+        values, width, begin = self._values, self._width, self._begin
+        end = begin + self._known
+        now = float(self._weights @ values[begin : begin + width])
+        window = values[end - width : end]
         ahead, rate = float(self._weights @ window), float(self._slopes @ window)
-        values[:-1] = values[1:]
-        values[-1] = self._reference(t + self._next * self._period)
+        if end == len(values):
+            values[: self._known] = values[begin:]
+            begin, end = 0, self._known
+        values[end] = self._reference(t + self._next * self._period)
+        self._begin = begin + 1
         return now, ahead, rate
 
 

@@ -235,32 +235,21 @@ class UnscentedEstimate(ThermalEstimate):
         from rigs.hybrid import _kernels
 
         super().__init__(bending)
-        self._predict, self._correct = _kernels.predict, _kernels.correct
+        self._predict, self._predict_and_correct = _kernels.predict, _kernels.predict_and_correct
         self._network = network
         self._period = period
         self._step = period * every
         self._noise = noise
-        states, readings, points = _kernels.STATES, _kernels.READINGS, _kernels.POINTS
-        reading_noise = np.square([noise.thermistor, noise.thermistor, noise.deflection])
-        reading_noise[2] /= every
-        self._filter = _kernels.Filter(
-            mean=np.zeros(states),
-            covariance=np.eye(states),
-            walk=np.square([noise.base, noise.tip, noise.heat, noise.offset]) * self._step,
-            reading_noise=reading_noise,
-            network=np.array(
-                [self._step, network.along, network.tip_air, network.base_capacity, network.tip_capacity]
-            ),
-            bending=np.array([bending.low, bending.high, bending.middle, bending.half]),
-            powers=np.array(bending.powers),
-            slopes=np.array(bending.slopes),
-            points=np.zeros((points, states)),
-            seen=np.zeros((points, readings)),
-            expected=np.zeros(readings),
-            variance=np.zeros((readings, readings)),
-            factor=np.zeros((states, states)),
-            gain=np.zeros((states, readings)),
-        )
+        self._numbers, self._filter = _kernels.allocate(len(bending.powers))
+        parts = self._filter
+        parts.covariance[:] = np.eye(_kernels.STATES)
+        parts.walk[:] = np.square([noise.base, noise.tip, noise.heat, noise.offset]) * self._step
+        parts.reading_noise[:] = np.square([noise.thermistor, noise.thermistor, noise.deflection])
+        parts.reading_noise[2] /= every
+        parts.network[:] = [self._step, network.along, network.tip_air, network.base_capacity, network.tip_capacity]
+        parts.bending[:] = [bending.low, bending.high, bending.middle, bending.half]
+        parts.powers[:] = bending.powers
+        parts.slopes[:] = bending.slopes
         self._sum, self._count = 0.0, 0
 
     def begin(self, deflection: float, base: float, tip: float) -> None:
@@ -279,21 +268,20 @@ class UnscentedEstimate(ThermalEstimate):
 
     def correct(self, base: float, tip: float, current: float) -> None:
         """Predict, and update with the mean of the deflections since the last thermal sample."""
-        self._predict(*self._network.heat_flow(current), self._filter)
+        constant, slope = self._network.heat_flow(current)
         if self._count:
-            self._take_in(base, tip)
+            # The mean of the readings is that of half a period before their last.
+            age = 0.5 * (self._count - 1) * self._period
+            mean = self._sum / self._count + self.rate * age
+            self._sum, self._count = 0.0, 0
+            self._predict_and_correct(constant, slope, base, tip, mean, self._numbers)
+        else:
+            self._predict(constant, slope, self._numbers)
         here, there, _, offset = self._filter.mean.tolist()
         n = self._network
         cooling = ((here - there) * n.along - n.tip_air * there) / n.tip_capacity
         self.rate = self._bending.slope(there) * cooling
         self.value = self._bending.deflection(there) + offset
-
-    def _take_in(self, base: float, tip: float) -> None:
-        # The mean of the readings is that of half a period before their last.
-        age = 0.5 * (self._count - 1) * self._period
-        mean = self._sum / self._count + self.rate * age
-        self._sum, self._count = 0.0, 0
-        self._correct(base, tip, mean, self._filter)
 
     def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
         """Return the offset of the deflection and its standard deviation, m."""

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult
 from bench.workers import Pending
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable
 from bench.workers import Pending
 from rigs.muscles.identification import (
     MODELS,

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.campaign import Campaign, Study, StudyResult
 from bench.results.figures import Curve, plot_panels
+from bench.studies import Campaign, Study, StudyResult
 from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths, start_runs
 
 MUSCLES = {

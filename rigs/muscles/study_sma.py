@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.identification.two_stage import predict_series
 from bench.results.figures import (
     Curve,
@@ -22,6 +21,7 @@ from bench.results.figures import (
     plot_tracking,
 )
 from bench.results.tracking import TargetResults
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from rigs.muscles.characterization import (
     TITLES,
     Characterization,

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.errors import DataError
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
@@ -22,6 +21,7 @@ from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.workers import Pending
 
 Floats = npt.NDArray[np.float64]

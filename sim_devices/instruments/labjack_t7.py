@@ -457,7 +457,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             volts -= self._sources[settings.negative]()
         noise, step, lowest, highest = scale or settings.scale
         volts = round((volts + noise * next(self._normals)) / step) * step
-        volts = volts if lowest <= volts <= highest else min(max(volts, lowest), highest)
+        if not lowest <= volts <= highest:
+            volts = min(max(volts, lowest), highest)
         if held is not None:
             held[channel] = volts
         return volts

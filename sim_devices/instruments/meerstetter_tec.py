@@ -287,11 +287,14 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def deadline(self) -> float:
         """Return when the watchdog, a restart, the reset of an error or a check of the protections is due (s)."""
-        # A plain comparison: this is asked with each sample of a fast loop.
+        # Plain comparisons: this is asked with each sample of a fast loop.
         due = self._supervision_due
-        for other in (self._watchdog_due, self._restart_due, self._recovery_due):
-            if other < due:
-                due = other
+        if self._watchdog_due < due:
+            due = self._watchdog_due
+        if self._restart_due < due:
+            due = self._restart_due
+        if self._recovery_due < due:
+            due = self._recovery_due
         return due
 
     def expire(self) -> None:

@@ -189,10 +189,12 @@ class RegisterInstrument(ABC):
                 return self._reader(readers, pack)
             if len(registers) == 1:
                 return self._writer(registers[0], unpack)
+        if not writing:
+            return self._frame_reader([readers for readers, _ in parts], pack)
         begin, end, after_frame, isfinite = self._begin, self._end, self._after_frame, math.isfinite
 
         def carry_out(packet: bytes) -> bytes:
-            given = iter(unpack(packet) if writing else ())
+            given = iter(unpack(packet))
             values: list[float] = []
             begin()
             try:
@@ -243,6 +245,27 @@ class RegisterInstrument(ABC):
 
         read = readers[0]
         return read_one if len(readers) == 1 else read_all
+
+    def _frame_reader(self, frames: Sequence[Sequence[Callable[[], float]]], pack: Callable[..., bytes]) -> Packet:
+        """Return what reads several frames, between which outputs may be followed."""
+        begin, end, after_frame = self._begin, self._end, self._after_frame
+
+        def read_frames(packet: bytes) -> bytes:  # noqa: ARG001
+            values: list[float] = []
+            begin()
+            try:
+                for readers in frames:
+                    for read in readers:
+                        values.append(read())
+                    after_frame()
+                answer = pack(*values)
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return answer
+
+        return read_frames
 
     def _writer(self, register: Register, unpack: Callable[[bytes], tuple[float, ...]]) -> Packet:
         """Return what writes one register."""

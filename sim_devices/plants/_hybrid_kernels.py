@@ -1,8 +1,8 @@
 """Compiled inner loops of the hybrid cantilever plant.
 
-The constants below name the places in the plain arrays of the state, which pass into a compiled function within a
-microsecond; coefficients go by name. Temperatures here are rises above the mean room temperature, in K;
-everything else is in SI units, and a positive current heats the beam.
+The constants below name the places in one plain array of all numbers, which passes into a compiled function within a
+microsecond, where a tuple of arrays takes five; inside, its parts go by name. Temperatures here are rises above the
+mean room temperature, in K; everything else is in SI units, and a positive current heats the beam.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba import njit
 
 from sim_devices.plants import cooler
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
-from sim_devices.plants.grid import Floats, Record
+from sim_devices.plants.grid import Floats
 
 # Nodes of the thermal chain, each joined to the next: insulated end and front of the block, back and
 # actuator face of the TEC, then the elements of the beam from its base to its tip.
@@ -71,13 +71,45 @@ SHAPE_SIZE = 5
 FIRST_GAIN = FIRST_RATE + REAL_MODES
 FAST_COEFFICIENT_SIZE = FIRST_GAIN + REAL_MODES
 
-# Everything that the deflection of the tip depends on is one array, which passes into a compiled function sooner than
-# many: node temperatures, their change over the step under way, their shares in the bending, the shape of the bent
-# beam, fast state, and constants of the fast part.
-TIP_PARTS = (NODES, NODES, NODES, SHAPE_SIZE, FAST_SIZE, FAST_COEFFICIENT_SIZE)
+
+class Coefficients(NamedTuple):
+    """Constants of the thermal step, in SI units."""
+
+    step: float
+    kelvin: float
+    seebeck: float
+    resistance: float
+    room_decay: float
+    room_kick: float
+    loop_proportional: float
+    loop_integral: float
+    maximum_current: float
+
+
+# All numbers of a plant are one array: node temperatures, their change over the step under way, their shares in the
+# bending, the shape of the bent beam, fast state, constants of the fast part, slow state, command, constants of the
+# thermal step, node table, and the factorised matrix of a step.
+PARTS = (
+    NODES,
+    NODES,
+    NODES,
+    SHAPE_SIZE,
+    FAST_SIZE,
+    FAST_COEFFICIENT_SIZE,
+    STATE_SIZE,
+    COMMAND_SIZE,
+    len(Coefficients._fields),
+    NODE_ROWS * NODES,
+    FACTOR_ROWS * NODES,
+)
 INCREMENT, SHARE, SHAPE = NODES, 2 * NODES, 3 * NODES
 FAST = SHAPE + SHAPE_SIZE
 FAST_COEFFICIENTS = FAST + FAST_SIZE
+STATE = FAST_COEFFICIENTS + FAST_COEFFICIENT_SIZE
+_COMMANDS = STATE + STATE_SIZE
+_COEFFICIENTS = _COMMANDS + COMMAND_SIZE
+_NODE_TABLE = _COEFFICIENTS + len(Coefficients._fields)
+_FACTORS = _NODE_TABLE + NODE_ROWS * NODES
 
 
 class Thermal(NamedTuple):
@@ -89,38 +121,60 @@ class Thermal(NamedTuple):
     """Change of them over the latest step that is known, K."""
     state: Floats
     command: Floats
-    c: Record
+    c: Coefficients
     nodes: Floats
     factors: Floats
     """State, commands, coefficients, node table and factorised matrix."""
 
 
 @njit(cache=True)
-def take_commands(rise: Floats, state: Floats, command: Floats, c: Record) -> bool:
+def _thermal(plant: Floats) -> Thermal:
+    """Return the thermal part of a plant, as views."""
+    c = plant[_COEFFICIENTS:_NODE_TABLE]
+    return Thermal(
+        plant[:INCREMENT],
+        plant[INCREMENT:SHARE],
+        plant[STATE:_COMMANDS],
+        plant[_COMMANDS:_COEFFICIENTS],
+        Coefficients(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]),
+        plant[_NODE_TABLE:_FACTORS].reshape((NODE_ROWS, NODES)),
+        plant[_FACTORS:].reshape((FACTOR_ROWS, NODES)),
+    )
+
+
+@njit(cache=True)
+def take_commands(plant: Floats) -> None:
+    """Set room temperature and current for the step that begins here."""
+    _take_commands(_thermal(plant))
+
+
+@njit(cache=True)
+def _take_commands(thermal: Thermal) -> bool:
     """Set room temperature and current for the step that begins here; return whether the current is saturated."""
+    rise, _, state, command, c, _, _ = thermal
     state[ROOM] = state[FLUCTUATION] + command[ROOM_STEP]
     if command[CLOSED] == 0.0:
         state[CURRENT] = command[COMMAND]
         return False
-    heat = c[0].loop_proportional * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
-    pumped = c[0].seebeck * (c[0].kelvin + rise[FACE])
-    square = pumped * pumped + 2.0 * c[0].resistance * heat
+    heat = c.loop_proportional * (command[TARGET] - rise[FACE]) + state[INTEGRAL]
+    pumped = c.seebeck * (c.kelvin + rise[FACE])
+    square = pumped * pumped + 2.0 * c.resistance * heat
     # Of the two currents that give this heat the smaller; below the strongest cooling there is none.
     wanted = 2.0 * heat / (pumped + math.sqrt(max(square, 0.0)))
-    limit = min(command[LIMIT], c[0].maximum_current)
+    limit = min(command[LIMIT], c.maximum_current)
     state[CURRENT] = min(max(wanted, -limit), limit)
     saturated: bool = square < 0.0 or abs(wanted) > limit
     return saturated
 
 
 @njit(cache=True)
-def factorise(current: float, c: Record, nodes: Floats, factors: Floats) -> None:
+def factorise(current: float, c: Coefficients, nodes: Floats, factors: Floats) -> None:
     """Factorise the matrix of a step, which is tridiagonal and depends on the current alone."""
-    half = 0.5 * c[0].seebeck * current
+    half = 0.5 * c.seebeck * current
     before = 0.0
     for j in range(NODES):
         after = 0.5 * nodes[LINK, j]
-        diagonal = nodes[CAPACITY, j] / c[0].step + 0.5 * nodes[AIR, j] + before + after
+        diagonal = nodes[CAPACITY, j] / c.step + 0.5 * nodes[AIR, j] + before + after
         if j == BACK:
             diagonal += half
         elif j == FACE:
@@ -135,7 +189,13 @@ def factorise(current: float, c: Record, nodes: Floats, factors: Floats) -> None
 
 
 @njit(cache=True)
-def look_ahead(thermal: Thermal) -> None:
+def look_ahead(plant: Floats) -> None:
+    """Find the change of the temperatures over the step that begins here."""
+    _look_ahead(_thermal(plant))
+
+
+@njit(cache=True)
+def _look_ahead(thermal: Thermal) -> None:
     """Find the change of the temperatures over the step that begins here.
 
     The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
@@ -143,12 +203,12 @@ def look_ahead(thermal: Thermal) -> None:
     the step, extrapolated from the step before.
     """
     rise, increment, state, command, c, nodes, factors = thermal
-    saturated = take_commands(rise, state, command, c)
+    saturated = _take_commands(thermal)
     if command[CLOSED] != 0.0:
         error = command[TARGET] - rise[FACE]
         # A saturated loop integrates only what leads out of saturation.
         if not saturated or error * state[CURRENT] < 0.0:
-            state[INTEGRAL] += c[0].loop_integral * error
+            state[INTEGRAL] += c.loop_integral * error
     current = state[CURRENT]
     room = state[ROOM]
     if current != state[FACTORED]:
@@ -158,12 +218,12 @@ def look_ahead(thermal: Thermal) -> None:
     for j in range(BEAM, NODES):
         excess = rise[j] + 0.5 * increment[j] - room
         increment[j] = -nodes[EXCESS, j] * math.sqrt(math.sqrt(abs(excess))) * excess
-    joule = 0.5 * c[0].resistance * current * current
-    pumped = c[0].seebeck * current
+    joule = 0.5 * c.resistance * current * current
+    pumped = c.seebeck * current
     for j in range(BEAM):
         increment[j] = 0.0
-    increment[BACK] = joule - pumped * (c[0].kelvin + rise[BACK])
-    increment[FACE] = joule + pumped * (c[0].kelvin + rise[FACE])
+    increment[BACK] = joule - pumped * (c.kelvin + rise[BACK])
+    increment[FACE] = joule + pumped * (c.kelvin + rise[FACE])
 
     # Heat into each node, and forward elimination on the way.
     inflow = 0.0
@@ -183,40 +243,48 @@ def look_ahead(thermal: Thermal) -> None:
 
 
 @njit(cache=True)
-def advance_steps(normals: Floats, ahead: bool, thermal: Thermal) -> None:
-    """Complete one grid step for each of `normals`; `ahead` says whether the first step's change is known."""
-    rise, increment, state, command, c, _, _ = thermal
+def advance_steps(normals: Floats, ahead: bool, begin_next: bool, plant: Floats) -> None:
+    """Complete one grid step for each of `normals`; `ahead` says whether the first step's change is known.
+
+    `begin_next` is whether that of the step behind them is to be found too.
+    """
+    thermal = _thermal(plant)
+    rise, increment, state, _, c, _, _ = thermal
     for row in range(normals.size):
         if not ahead:
-            look_ahead(thermal)
+            _look_ahead(thermal)
         ahead = False
         for j in range(NODES):
             rise[j] += increment[j]
-        state[FLUCTUATION] = c[0].room_decay * state[FLUCTUATION] + c[0].room_kick * normals[row]
-    take_commands(rise, state, command, c)
+        state[FLUCTUATION] = c.room_decay * state[FLUCTUATION] + c.room_kick * normals[row]
+    if begin_next:
+        _look_ahead(thermal)
+    else:
+        _take_commands(thermal)
 
 
 @njit(cache=True)
-def bending(fraction: float, tip: Floats) -> tuple[float, float]:
+def bending(fraction: float, plant: Floats) -> tuple[float, float]:
     """Add up the bending of the beam, after a fraction of the step under way, in [0, 1].
 
     Returns the thermal deflection of the tip and the factor of the piezo deflection. Either is the local value
     weighted by the distance to the tip.
     """
-    shape = tip[SHAPE:FAST]
+    shape = plant[SHAPE:FAST]
     bent = 0.0
     warm = 0.0
     for j in range(BEAM, NODES):
-        weight = tip[SHARE + j]
-        d = tip[j] + fraction * tip[INCREMENT + j] + shape[STRAIGHT]
+        weight = plant[SHARE + j]
+        d = plant[j] + fraction * plant[INCREMENT + j] + shape[STRAIGHT]
         bent += weight * d * (1.0 + d * (shape[QUADRATIC] + d * shape[CUBIC]))
         warm += weight * d
     return shape[SENSITIVITY] * bent, 1.0 + shape[WARM_GAIN] * warm
 
 
 @njit(cache=True)
-def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats, nodes: Floats) -> float:
+def heat_to_air(fraction: float, plant: Floats) -> float:
     """Add up the heat flow from all nodes to the air."""
+    rise, increment, state, _, _, nodes, _ = _thermal(plant)
     total = 0.0
     for j in range(NODES):
         excess = rise[j] + fraction * increment[j] - state[ROOM]
@@ -225,9 +293,9 @@ def heat_to_air(fraction: float, rise: Floats, increment: Floats, state: Floats,
 
 
 @njit(cache=True)
-def piezo_deflection(elapsed: float, tip: Floats) -> float:
+def piezo_deflection(elapsed: float, plant: Floats) -> float:
     """Evaluate the piezo deflection, at the temperature of the straight beam, some time after the last voltage."""
-    fast, f = tip[FAST:FAST_COEFFICIENTS], tip[FAST_COEFFICIENTS:]
+    fast, f = plant[FAST:FAST_COEFFICIENTS], plant[FAST_COEFFICIENTS:STATE]
     phase = f[FREQUENCY] * elapsed
     swing = math.exp(-f[DAMPING] * elapsed)
     total: float = f[STEADY] * fast[DRIVE]
@@ -238,10 +306,10 @@ def piezo_deflection(elapsed: float, tip: Floats) -> float:
 
 
 @njit(cache=True)
-def deflection(fraction: float, elapsed: float, tip: Floats) -> float:
+def deflection(fraction: float, elapsed: float, plant: Floats) -> float:
     """Add up the deflection of the tip; takes what `bending` and `piezo_deflection` take."""
-    thermal, warming = bending(fraction, tip)
-    total: float = thermal + warming * piezo_deflection(elapsed, tip)
+    thermal, warming = bending(fraction, plant)
+    total: float = thermal + warming * piezo_deflection(elapsed, plant)
     return total
 
 
@@ -269,9 +337,9 @@ def hysteresis(lag: float, change: float, f: Floats) -> float:
 
 
 @njit(cache=True)
-def apply_voltage(voltage: float, elapsed: float, tip: Floats) -> None:
+def apply_voltage(voltage: float, elapsed: float, plant: Floats) -> None:
     """Change the voltage, some time after the last change."""
-    fast, f = tip[FAST:FAST_COEFFICIENTS], tip[FAST_COEFFICIENTS:]
+    fast, f = plant[FAST:FAST_COEFFICIENTS], plant[FAST_COEFFICIENTS:STATE]
     lag = hysteresis(fast[LAG], voltage - fast[VOLTAGE], f)
     drive = f[GAIN] * voltage - lag + f[VOLTAGE_QUADRATIC] * voltage * voltage
     step = drive - fast[DRIVE]

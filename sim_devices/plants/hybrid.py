@@ -28,10 +28,8 @@ from sim_devices.plants.grid import (
     ABSOLUTE_ZERO,
     GRID_TOLERANCE,
     Floats,
-    Record,
     check_temperature,
     fluctuation,
-    record,
 )
 from sim_devices.plants.hybrid_parameters import HybridParameters, piezo_dynamics, thermal_sensitivity
 
@@ -77,32 +75,33 @@ class HybridCantilever(CooledPlant[HybridParameters]):
 
     def __init__(self, parameters: HybridParameters, rng: np.random.Generator) -> None:
         super().__init__(parameters, rng)
-        self._nodes = _node_table(parameters)
-        self._coefficients = _coefficients(parameters)
-        self._tip = np.zeros(sum(kernels.TIP_PARTS))
-        self._rise, self._increment, share, shape, self._fast, self._fast_coefficients = np.split(
-            self._tip, np.cumsum(kernels.TIP_PARTS)[:-1]
-        )
+        self._ambient = parameters.ambient_temperature
+        self._numbers = np.zeros(sum(kernels.PARTS))
+        (
+            self._rise,
+            self._increment,
+            share,
+            shape,
+            self._fast,
+            self._fast_coefficients,
+            self._state,
+            self._command,
+            coefficients,
+            nodes,
+            _,
+        ) = np.split(self._numbers, np.cumsum(kernels.PARTS)[:-1])
         share[:] = _shares()
         shape[:] = _shape(parameters)
         self._fast_coefficients[:] = _fast_coefficients(parameters)
-        self._state = np.zeros(kernels.STATE_SIZE)
-        self._command = np.zeros(kernels.COMMAND_SIZE)
+        coefficients[:] = _coefficients(parameters)
+        self._nodes = nodes.reshape(kernels.NODE_ROWS, kernels.NODES)
+        self._nodes[:] = _node_table(parameters)
         # Whether the change over the step under way is known, and the time since the voltage last changed.
         self._ahead = False
         self._elapsed = 0.0
 
         deviation = parameters.ambient_sd * float(self._noise.standard_normal())
         self._rise[:] = deviation
-        self._thermal = kernels.Thermal(
-            self._rise,
-            self._increment,
-            self._state,
-            self._command,
-            self._coefficients,
-            self._nodes,
-            np.zeros((kernels.FACTOR_ROWS, kernels.NODES)),
-        )
         self._state[kernels.FLUCTUATION] = deviation
         self._state[kernels.FACTORED] = math.nan
         self._take_commands()
@@ -113,20 +112,21 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         if dt >= 0.0 and pending + GRID_TOLERANCE < self._step:
             # What the base does with less than a step.
             self._pending = pending
+            if not self._ahead and pending > GRID_TOLERANCE:
+                kernels.look_ahead(self._numbers)
+                self._ahead = True
         else:
             super().advance(dt)
         self._elapsed += dt
-        if not self._ahead and self._pending > GRID_TOLERANCE:
-            kernels.look_ahead(self._thermal)
-            self._ahead = True
 
     def _take_steps(self, normals: Floats) -> None:
-        kernels.advance_steps(normals, self._ahead, self._thermal)
-        self._ahead = False
+        begin_next = self._pending > GRID_TOLERANCE
+        kernels.advance_steps(normals, self._ahead, begin_next, self._numbers)
+        self._ahead = begin_next
 
     def _take_commands(self) -> None:
         if not self._ahead:
-            kernels.take_commands(self._rise, self._state, self._command, self._coefficients)
+            kernels.take_commands(self._numbers)
 
     def _loop_target(self, celsius: float) -> float:
         return celsius - self._parameters.ambient_temperature
@@ -170,7 +170,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         """
         if not abs(voltage) <= self._parameters.maximum_voltage:
             raise ValueError(f"voltage must lie within ±{self._parameters.maximum_voltage} V, not {voltage} V")
-        kernels.apply_voltage(voltage, self._elapsed, self._tip)
+        kernels.apply_voltage(voltage, self._elapsed, self._numbers)
         self._elapsed = 0.0
 
     @property
@@ -181,14 +181,14 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         rise: float = self._rise.item(node)
         if self._ahead:
             rise += self._pending / self._step * self._increment.item(node)
-        return self._parameters.ambient_temperature + rise
+        return self._ambient + rise
 
     def _bending(self) -> tuple[float, float]:
-        parts: tuple[float, float] = kernels.bending(self._fraction, self._tip)
+        parts: tuple[float, float] = kernels.bending(self._fraction, self._numbers)
         return parts
 
     def _unwarmed_piezo_deflection(self) -> float:
-        return float(kernels.piezo_deflection(self._elapsed, self._tip))
+        return float(kernels.piezo_deflection(self._elapsed, self._numbers))
 
     @property
     def base_temperature(self) -> float:
@@ -247,14 +247,14 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         """Deflection of the tip, m."""
         # In one call, as a fast loop asks for it with each sample.
         total: float = kernels.deflection(
-            self._pending / self._step if self._ahead else 0.0, self._elapsed, self._tip
+            self._pending / self._step if self._ahead else 0.0, self._elapsed, self._numbers
         )
         return total
 
     @property
     def heat_to_air(self) -> float:
         """Heat flow from all parts to the air, W; in the steady state ``current * tec_voltage``."""
-        return float(kernels.heat_to_air(self._fraction, self._rise, self._increment, self._state, self._nodes))
+        return float(kernels.heat_to_air(self._fraction, self._numbers))
 
     @property
     def stored_heat(self) -> float:
@@ -348,12 +348,12 @@ def _shape(parameters: HybridParameters) -> Floats:
     return values
 
 
-def _coefficients(parameters: HybridParameters) -> Record:
+def _coefficients(parameters: HybridParameters) -> kernels.Coefficients:
     """Prepare the numbers that the compiled thermal step needs."""
     p = parameters
     room_decay, room_kick = fluctuation(p.ambient_sd, p.ambient_time, p.step)
     capacity = p.face_capacity + p.bimorph.line_capacity * p.bimorph.length
-    return record(
+    return kernels.Coefficients(
         step=p.step,
         kelvin=p.ambient_temperature - ABSOLUTE_ZERO,
         seebeck=p.seebeck,

@@ -108,12 +108,12 @@ def emulate(
         identity = secrets.token_hex(8)
         control_socket = ControlSocket(_control_listener(control), served, identity)
         stack.callback(control_socket.close)
+        if not _is_loopback(host):
+            warn(f"everybody who reaches {host} can command these instruments, and nothing asks for a password")
         content = _endpoints(served, clock, control_socket.address, identity)
         if json_file is not None:
             _write_at_once(json_file, content)
             stack.callback(_remove, json_file, identity)
-        if not _is_loopback(host):
-            warn(f"everybody who reaches {host} can command these instruments, and nothing asks for a password")
         _print(served, control_socket.address)
         Server(served, control_socket, log).run(lambda: interrupts.abort_requested() or interrupts.pause_requested)
         for each_served in served:

@@ -93,6 +93,9 @@ class MeComServer(WireServer):
     def receive(self, data: bytes) -> bytes:
         """Take bytes from the host, in pieces of any size; return what the device sends."""
         with self._device.world.lock:
+            if not self._received and data.find(b"\r") == len(data) - 1 >= 0:
+                # One whole frame, as it mostly is.
+                return self._serve(data[:-1])
             *frames, rest = (self._received + data).split(b"\r")
             # A new start sign begins a new frame.
             start = rest.rfind(b"#")
@@ -252,7 +255,7 @@ def _encode(row: Parameter, *values: float) -> str:
 
 
 def _decode(row: Parameter, digits: str) -> float:
-    value: float = struct.unpack(f">{_form(row)}", bytes.fromhex(digits))[0]
+    value: float = struct.unpack(">i" if row.kind == "INT32" else ">f", bytes.fromhex(digits))[0]
     if math.isnan(value):
         raise RequestRefusedError(ServerError.OUT_OF_RANGE)
     return value

@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from bench import registry
-from bench.campaign import Study, StudyResult
 from bench.campaigns.cluster import ClusterExecutor, check_address
 from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
 from bench.campaigns.expansion import expand
@@ -24,6 +23,7 @@ from bench.errors import ConfigurationError
 from bench.journal import Record
 from bench.locks import Holder, Locks
 from bench.runs import carry_out
+from bench.studies import Study, StudyResult
 from bench.workers import Workers
 
 PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
@@ -307,7 +307,7 @@ class TestTasks:
     def test_nothing_is_done_in_a_dry_run(self, campaign, tmp_path, capsys):
         assert start(campaign(STAIRS), "--out", tmp_path / "out", "--dry-run") == 0
         said = capsys.readouterr().out
-        assert said.startswith("4 runs to do; 0.0 h of laboratory time, about 0 s on ")
+        assert said.startswith("4 runs to do; 0.0 h of laboratory time, less than a minute on ")
         assert said.count("climb/increment=") == 4
         assert not (tmp_path / "out").exists()
 

@@ -270,7 +270,7 @@ class TestRun:
         ("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130)], ids=lambda v: str(v)
     )
     def test_a_signal_ends_the_process_in_the_safe_state(self, tmp_path, sent, code):
-        command = ["run", "creep", *WATCHED, "--clock", "x2", "--out", str(tmp_path)]
+        command = ["run", "creep", *WATCHED, "--no-rehearse", "--clock", "x2", "--out", str(tmp_path)]
         process = subprocess.Popen(
             [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
             stdin=subprocess.DEVNULL,
@@ -292,7 +292,7 @@ class TestRun:
             assert record.meta["safe_state"] == {"tec": "safe", "psd": "safe"}
 
     def test_a_killed_process_leaves_a_readable_record(self, bench, tmp_path):
-        command = ["run", "creep", *WATCHED, "--clock", "x5", "--out", str(tmp_path)]
+        command = ["run", "creep", *WATCHED, "--no-rehearse", "--clock", "x5", "--out", str(tmp_path)]
         process = subprocess.Popen(
             [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
             stdin=subprocess.DEVNULL,

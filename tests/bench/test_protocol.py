@@ -311,12 +311,15 @@ class TestPlan:
 
         assert plan(define(idle), Nothing()).steps == 0
 
-    def test_a_protocol_that_never_ends_is_refused(self):
+    def test_a_protocol_that_never_ends_is_refused(self, monkeypatch):
+        assert sys.modules["bench.protocol.plan"].LONGEST == 1_000_000
+        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
+
         def endless(parameters):
             while True:
                 yield Step({}, Dwell(0.0))
 
-        with pytest.raises(ConfigurationError, match="endless does not end within 1000000 steps"):
+        with pytest.raises(ConfigurationError, match="endless does not end within 10000 steps"):
             plan(define(endless), Nothing())
 
     @pytest.mark.timeout(60)

@@ -77,6 +77,13 @@ class TestEntries:
         assert (entries["wait"].own, entries["wait"].package) == (False, "outside-coil")
         assert entries["wait"].load().__name__ == "outside_wait"
 
+    @pytest.mark.parametrize("group", registry.GROUPS)
+    def test_each_of_our_own_can_be_imported(self, group):
+        """`bench list` imports none of the groups that it does not show."""
+        for entry in registry.entries(group).values():
+            if entry.own:
+                assert entry.load() is not None
+
     def test_an_unknown_group(self):
         with pytest.raises(ValueError, match="group: expected one of rigs, protocols"):
             registry.entries("colours")
@@ -108,7 +115,7 @@ class TestEntries:
 class TestBroken:
     """An entry that cannot be imported is named and skipped; it is an error only for those who ask for it."""
 
-    @pytest.mark.parametrize("group", ["rigs", "protocols", "models", "controllers", "studies"])
+    @pytest.mark.parametrize("group", registry.GROUPS)
     def test_is_named_and_skipped(self, install, list_, group):
         install("outside-broken", {group: ["broken = outside_gone:THING"]})
         code, out, errors = list_()

@@ -1,7 +1,6 @@
 """The contracts as `pytest --pyargs bench.contracts` runs them, for devices of the bench and of a stranger."""
 
 import re
-import subprocess
 import sys
 
 import pytest
@@ -116,12 +115,12 @@ BROKEN = {
 
 
 @pytest.fixture
-def contracts(tmp_path):
+def contracts(tmp_path, warm_process):
     """Return a function that runs the contracts in a stranger's folder, and returns exit code and output."""
 
     def run(*arguments):
         command = [sys.executable, "-m", "pytest", "--verbose", "--pyargs", "bench.contracts", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300, check=False)
+        done = warm_process(command, tmp_path, None)
         return done.returncode, done.stdout + done.stderr
 
     return run

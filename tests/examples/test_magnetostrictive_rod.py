@@ -24,7 +24,7 @@ for command in map(json.loads, sys.argv[1:]):
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory, finished_process):
+def python(tmp_path_factory, warm_process):
     """Install the package in a folder of its own; return a function that runs Python with it."""
     home = tmp_path_factory.mktemp("installed")
     # A copy, as building leaves files beside the source.
@@ -32,7 +32,7 @@ def python(tmp_path_factory, finished_process):
     environment = {**os.environ, "PYTHONPATH": str(home / "site"), "COLUMNS": "120"}
 
     def run(*arguments, cwd=home, both=False):
-        done = finished_process([sys.executable, *map(str, arguments)], cwd, environment)
+        done = warm_process([sys.executable, *map(str, arguments)], cwd, environment)
         assert done.returncode == 0, done.stdout + done.stderr
         return (done.stdout, done.stderr) if both else done.stdout
 

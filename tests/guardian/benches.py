@@ -35,8 +35,10 @@ def connected(rig: EmulatedRig, file: str | None = None, **overrides: str) -> It
 
 
 def _leave(station: RemoteStation) -> None:
-    station.clock.interrupted = lambda: False
-    station.end()
+    # One that has ended needs no rescue, which would be a second process in each test.
+    if station._process.returncode is None:
+        station.clock.interrupted = lambda: False
+        station.end()
     station.close()
     with suppress(ProcessLookupError):
         os.kill(station._process.pid, signal.SIGKILL)

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -135,10 +136,13 @@ class GuardedRun:
                 db = sqlite3.connect(f"file:{next(self._runs.glob('*/journal.sqlite'), '')}?mode=ro", uri=True)
                 try:
                     found = db.execute("SELECT t FROM events WHERE text = ?", (text,)).fetchone()
+                    meta = {key: json.loads(value) for key, value in db.execute("SELECT key, value FROM meta")}
                 finally:
                     db.close()
                 if found:
-                    return float(found[0])
+                    # The record counts from the start of the run, the laboratory from its own.
+                    began, served = (datetime.fromisoformat(meta[key]) for key in ("epoch", "laboratory_epoch"))
+                    return (began - served).total_seconds() + float(found[0])
             assert self.process.poll() is None, f"it ended, exit code {self.process.returncode}: {self.said[-500:]}"
             time.sleep(0.02)
         raise AssertionError(f"{text!r} was never recorded")

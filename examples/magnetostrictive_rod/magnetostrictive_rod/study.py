@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.campaign import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.results.models import errors_json, identify_file
 from bench.runs import RunResult
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.workers import Pending
 
 MODELS: Mapping[str, Mapping[str, Any]] = {"quadratic-play": {}, "preisach-signed": {"plane": (-2.4, 2.4)}}

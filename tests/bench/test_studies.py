@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bench.campaign import reproduce
 from bench.errors import BenchError, ConfigurationError
 from bench.journal import Record
+from bench.studies import reproduce
 
 sys.path.append(str(Path(__file__).parent))
 import small_study
