@@ -42,11 +42,14 @@ def tracked(run: Path) -> tuple[float, float]:
         names = [signal.name for signal in record.signals]
         controlled, reference = names.index(record.meta["controls"]), names.index("reference")
     errors: list[list[float]] = []
+    target = np.nan
     for step in steps:
+        # The readings at a target are not under control: the step before them has the reference.
         if step.label == "reach":
             errors.append([])
+            target = step.values[reference]
         elif step.label == "reading":
-            errors[-1].append(step.values[controlled] - step.values[reference])
+            errors[-1].append(step.values[controlled] - target)
     means = [np.mean(each) for each in errors]
     return steps[-1].finished, float(np.sqrt(np.mean(np.square(means))))
 
