@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
 .PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
-.PHONY: studies resume-trials clean
+.PHONY: studies resume-trials twin-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -92,6 +92,10 @@ interlock-times: $(SETUP)
 # ones.
 resume-trials: $(SETUP)
 	$(BIN)/python tests/bench/resume_trials.py
+
+# Tracking runs on twins, beside those on the plants that they were identified from: durations and errors.
+twin-trials: $(SETUP)
+	$(BIN)/python tests/bench/twin_trials.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -8,7 +8,7 @@ from typing import ClassVar
 from bench.clock import Clock
 from bench.devices import Actuator, Identity, Limits, Signal, Status
 from bench.errors import DeviceConnectionError, DeviceError
-from bench.twin.device import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings
+from bench.twin.device import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings, number_text
 from drivers.device import LineActuator, LineDevice
 from drivers.quantities import identity_of
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, open_port
@@ -117,7 +117,7 @@ class TwinActuator(LineActuator[TwinSettings, TwinLine], TwinSensor, Actuator):
         self.check(value)
         if self._settings.setpoint_time:
             self._clock.sleep(self._settings.setpoint_time)
-        answer = self._line.ask(f"{SET} {value!r}")
+        answer = self._line.ask(f"{SET} {number_text(value)}")
         if answer != DONE:
             raise DeviceError(self.name, f"answered {answer!r} to a set-point of {value:g} {self._table.unit}")
         self._setpoint = value

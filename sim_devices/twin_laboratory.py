@@ -41,23 +41,22 @@ class TwinLaboratorySettings(TwinTable):
 class SpecimenPlant:
     """A specimen on its grid of time, however calls divide the time; see `bench.twin.specimen`.
 
-    A set-point acts from the instant at which it comes, as the mean over the step of the grid in which it does.
+    A set-point acts from the instant at which it comes, as the mean over the step of the grid in which it does. An
+    actuator that follows at once has it at the end of that step.
 
     Parameters
     ----------
     specimen : Specimen
         The specimen at rest.
-    step : float
-        Of the grid, s.
-    delay : float
-        After which a set-point acts, s.
     initial : float
         Set-point at the beginning.
     """
 
-    def __init__(self, specimen: Specimen, step: float, delay: float, initial: float) -> None:
+    def __init__(self, specimen: Specimen, initial: float) -> None:
         self.specimen = specimen
-        self._step, self._delay = step, delay
+        actuator = specimen.dynamics.actuator
+        self._step, self._delay = specimen.dynamics.step, actuator.delay
+        self._at_once = actuator.order == 0
         self._time = 0.0
         self._taken = 0
         self._level = initial
@@ -85,7 +84,8 @@ class SpecimenPlant:
             instant, value = self._coming.pop(0)
             place = max((instant - begin) / self._step, 0.0)
             first = int(place)
-            setpoints[first] += (1.0 - (place - first)) * (value - self._level)
+            share = 1.0 if self._at_once else 1.0 - (place - first)
+            setpoints[first] += share * (value - self._level)
             setpoints[first + 1 :] = value
             self._level = value
         return setpoints
@@ -103,7 +103,7 @@ class TwinLaboratory(EmulatedLaboratory):
         self._session = settings.session_offset * float(session_stream.standard_normal())
         self._specimen = Specimen(settings.operators, settings.dynamics, drive.rest, specimen_stream)
         at_rest = (drive.rest - drive.offset) / drive.gain
-        self.plant = SpecimenPlant(self._specimen, settings.step, drive.delay, at_rest)
+        self.plant = SpecimenPlant(self._specimen, at_rest)
         self._at_rest = at_rest
         world = World(self.plant, clock)
         self._outputs = dict.fromkeys(settings.devices, math.nan)

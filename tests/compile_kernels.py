@@ -12,6 +12,7 @@ from bench.hysteresis import Preisach, uniform_levels
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
 from bench.identification.least_squares import fit
+from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
 from rigs.hybrid.model import identify_polynomial
@@ -50,6 +51,13 @@ def hybrid_estimate() -> None:
     estimate.correct(0.0, 0.0, 0.0)
 
 
+def twin() -> None:
+    """Move the specimen of a twin."""
+    operator = Preisach(uniform_levels(0.0, 1.0, 4), np.ones(10), 0.0, None, (0.0, 1.0))
+    response = ResponseDynamics(shares=(0.1,), times=(1.0,))
+    Specimen((operator,), Dynamics(0.02, ActuatorDynamics(frequency=1.0), response), 0.0).advance(np.ones(4))
+
+
 def laboratories() -> None:
     """Open each: it compiles its loops."""
     for rig in ("vo2", "sma", "mckibben", "coiled-polymer", "hybrid"):
@@ -60,4 +68,5 @@ def laboratories() -> None:
 if __name__ == "__main__":
     operators()
     hybrid_estimate()
+    twin()
     laboratories()

@@ -23,10 +23,12 @@ GRID = 0.02
 """Step of time with which drives are simulated, s; shorter for one of a shorter time constant."""
 LONGEST_PART = 2000.0
 """Part of a run that is used for dynamics, s."""
+MEDIAN_OF_DIFFERENCES = 0.954
+"""Median of the magnitude of the difference of two normal numbers, in standard deviations."""
 _INSTANT = 0.03
 """Standard uncertainty of the instant at which a reading saw the drive, s."""
-_MEDIAN_OF_DIFFERENCES = 0.954
-"""Median of the magnitude of the difference of two normal numbers, in standard deviations."""
+_ON_TIME = 1e-9
+"""Difference of times that are equal, s."""
 _EARLY = 0.1
 """Time by which a change of the set-point may come before its record says so, s."""
 
@@ -72,6 +74,11 @@ def at_rows(recording: Recording, values: Floats, first: float, step: float, del
 def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float, end: float) -> Floats:
     """Return the position (before gain and offset) that the drive had at each row up to `end` s."""
     initial = (float(recording.driven[0]) - dynamics.offset) / dynamics.gain
+    if dynamics.order == 0:
+        times = recording.times[recording.times <= end]
+        # A reading that is complete as a set-point is sent has not seen it.
+        levels = np.concatenate([[initial], recording.setpoints])
+        return np.asarray(levels[np.searchsorted(recording.changes, times - dynamics.delay - _ON_TIME)])
     setpoints = recording.on_grid(step, initial, end)
     out = np.empty((2, setpoints.size))
     _kernels.follow(
@@ -155,6 +162,15 @@ def grid_step(dynamics: ActuatorDynamics) -> float:
     return GRID if dynamics.frequency == 0.0 else float(np.clip(0.25 / dynamics.frequency, 0.005, GRID))
 
 
+def latency(dynamics: ActuatorDynamics) -> float:
+    """Return the time by which a reading sees what the grid of an actuator shows late, s.
+
+    An actuator that follows at once has moved at the end of a step of the grid: what is read within the step has not
+    seen it.
+    """
+    return dynamics.delay + (grid_step(dynamics) if dynamics.order == 0 else 0.0)
+
+
 def _candidates(slow: float, recordings: Sequence[Recording]) -> list[dict[str, float]]:
     """Return the numbers of each candidate with their first guesses."""
     rate = {"rate": _fastest(recordings)}
@@ -169,7 +185,7 @@ def _weights(recording: Recording) -> Floats:
     moves = np.abs(np.diff(recording.driven))
     rates = moves / np.maximum(np.diff(recording.times), 1e-3)
     fastest = np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
-    noise = max(float(np.median(moves)) / _MEDIAN_OF_DIFFERENCES, 1e-6 * float(np.ptp(recording.driven)))
+    noise = max(float(np.median(moves)) / MEDIAN_OF_DIFFERENCES, 1e-6 * float(np.ptp(recording.driven)))
     return np.asarray(1.0 / np.sqrt(noise**2 + (_INSTANT * fastest) ** 2))
 
 

@@ -9,7 +9,8 @@
 `output?`         the set-point, or `nan` if the output is off
 ================  ==============================================================================================
 
-A request that makes no sense, or a set-point beyond the limits, is answered by `refused`.
+A request that makes no sense, or a set-point beyond the limits, is answered by `refused`. Numbers have one width: the
+time of a line does not depend on what is read.
 """
 
 from __future__ import annotations
@@ -22,6 +23,11 @@ from bench.twin.tables import SetpointTable, SignalTable
 IDENTITY, MEASURE, GLANCE, SET, OFF, OUTPUT = "identity?", "measure?", "glance?", "set", "off", "output?"
 DONE, REFUSED = "done", "refused"
 END = b"\n"
+
+
+def number_text(value: float) -> str:
+    """Return a number with all its digits, in 25 characters."""
+    return f"{value:+25.16e}"
 
 
 class TwinSettings(DriverSettings):

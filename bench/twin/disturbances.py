@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
-from bench.twin.actuator import at_rows
+from bench.twin.actuator import MEDIAN_OF_DIFFERENCES, at_rows, latency
 from bench.twin.recording import Recording
 from bench.twin.specimen import Dynamics, Specimen, Wander
 
@@ -35,11 +35,13 @@ _SETTLED = 4.0
 _NEAR = 2e-3
 """Share of the range of the drive over which the slope is taken."""
 _LEAST_OF_HOLD = 3
-_FAR = 6.0
-"""Readings of a hold whose middle counts; distance of an outlier in standard deviations."""
-_RARE = 0.05
+"""Readings of a hold whose middle counts."""
+_FAR, _DIGITS = 6.0, 1.5
+"""Distance of an outlier from that middle, in standard deviations and in last digits."""
+_RARE, _SEEN = 0.05, 3
+"""Greatest share of outliers, and their least number."""
 _QUANTILES = 9
-"""Greatest share of outliers, and how many of their quantiles are kept."""
+"""How many of their quantiles are kept."""
 _SEED = 0
 """Of the simulations, the same for each trial."""
 
@@ -58,6 +60,8 @@ class Noise:
         Share of readings that are further off than noise and last digit explain.
     outliers : tuple of float
         By how much these are off: quantiles.
+    relative_outliers : bool
+        Whether these are shares of what is read, not in its unit.
     """
 
     reading: float = 0.0
@@ -65,6 +69,7 @@ class Noise:
     resolution: float = 0.0
     outlier_share: float = 0.0
     outliers: tuple[float, ...] = ()
+    relative_outliers: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,28 +85,84 @@ class _Pairs:
 
 def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
     """Return the noise of a signal that stands still within holds, such as what is read of the drive."""
-    found: dict[bool, list[Floats]] = {True: [], False: []}
-    middles, deviations = [], []
-    for r in recordings:
-        values = r.columns[signal]
-        late = (r.since_change > _settled_after(r, dynamics)) & np.isfinite(values)
-        for kind, differences in found.items():
-            rows = np.flatnonzero((r.is_reading == kind) & late)
-            same = np.diff(r.last_change[rows]) == 0
-            differences.append(np.diff(values[rows])[same])
-        rows = np.flatnonzero(late)
-        for hold in np.split(values[rows], np.flatnonzero(np.diff(r.last_change[rows])) + 1):
-            if hold.size >= _LEAST_OF_HOLD:
-                middles.append(float(np.median(hold)))
-                deviations.append(hold - middles[-1])
-    noise = _noise([_deviation(np.concatenate(found[kind])) for kind in (True, False)], np.array(middles))
-    off = np.concatenate(deviations) if deviations else np.empty(0)
-    far = off[np.abs(off) > max(_FAR * max(noise.reading, noise.quick), 0.75 * noise.resolution)]
-    # What wanders through a hold is no outlier.
-    if not outliers or not 3 <= far.size <= _RARE * off.size:
+    holds = [hold for r in recordings for hold in _holds(r, signal, dynamics)]
+    resolution = _resolution(np.concatenate([hold.values for hold in holds])) if holds else 0.0
+    off = [np.zeros(hold.values.size, dtype=bool) for hold in holds]
+    far, levels = np.empty(0), np.empty(0)
+    if outliers and holds:
+        off = _outliers(holds, resolution)
+        far = np.concatenate([h.values[o] - h.middle for h, o in zip(holds, off, strict=True)])
+        levels = np.concatenate([np.full(int(o.sum()), h.middle) for h, o in zip(holds, off, strict=True)])
+    found = []
+    for kind in (True, False):
+        kept = [h.values[(h.is_reading == kind) & ~o] for h, o in zip(holds, off, strict=True)]
+        found.append(_deviation(np.concatenate([np.diff(each) for each in kept])) if kept else None)
+    noise = _noise(found, resolution)
+    if far.size < _SEEN:
         return noise
-    levels = np.quantile(far, np.linspace(0.0, 1.0, _QUANTILES))
-    return replace(noise, outlier_share=far.size / off.size, outliers=tuple(levels.tolist()))
+    relative = _is_relative(far, levels)
+    sizes = far / levels if relative else far
+    quantiles = np.quantile(sizes, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
+    count = sum(hold.values.size for hold in holds)
+    return replace(
+        noise,
+        outlier_share=far.size / count,
+        outliers=tuple(quantiles.tolist()),
+        relative_outliers=relative,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Hold:
+    """What was read of a signal while it stood, and which of it are readings, not quick ones."""
+
+    values: Floats
+    is_reading: NDArray[np.bool_]
+
+    @property
+    def middle(self) -> float:
+        return float(np.median(self.values))
+
+
+def _holds(recording: Recording, signal: str, dynamics: Dynamics) -> list[_Hold]:
+    """Return the settled part of each hold that has readings enough."""
+    values = recording.columns[signal]
+    rows = np.flatnonzero(_settled(recording, dynamics) & np.isfinite(values))
+    parts = np.split(rows, np.flatnonzero(np.diff(recording.last_change[rows])) + 1)
+    return [_Hold(values[part], recording.is_reading[part]) for part in parts if part.size >= _LEAST_OF_HOLD]
+
+
+def _outliers(holds: Sequence[_Hold], resolution: float) -> list[NDArray[np.bool_]]:
+    """Return which readings of each hold are off: rare ones, each alone between two that are not."""
+    distances = [np.abs(hold.values - hold.middle) for hold in holds]
+    limits = {}
+    for kind in (True, False):
+        every = np.abs(np.concatenate([np.diff(h.values[h.is_reading == kind]) for h in holds]))
+        # A median knows nothing of outliers.
+        deviation = float(np.median(every)) / MEDIAN_OF_DIFFERENCES if every.size else 0.0
+        limits[kind] = max(_FAR * deviation, _DIGITS * resolution)
+    found = []
+    for distance, hold in zip(distances, holds, strict=True):
+        off = distance > np.where(hold.is_reading, limits[True], limits[False])
+        # What stays away from the middle moves; it is no outlier.
+        beside = np.append(False, off[:-1]) | np.append(off[1:], False)
+        found.append(off & ~beside)
+    count = sum(int(each.sum()) for each in found)
+    if not _SEEN <= count <= _RARE * sum(each.size for each in found):
+        return [np.zeros_like(each) for each in found]
+    return found
+
+
+def _is_relative(far: Floats, levels: Floats) -> bool:
+    """Return whether outliers are in proportion to what is read, by the likelihood of log-normal magnitudes.
+
+    Both hypotheses have as many numbers, and their magnitudes differ by a factor that is known: the one in which
+    their logarithms scatter less is more likely.
+    """
+    if not np.all(levels != 0.0):
+        return False
+    magnitudes = np.log(np.abs(far))
+    return float(np.std(magnitudes - np.log(np.abs(levels)))) < float(np.std(magnitudes))
 
 
 def identify_disturbances(
@@ -185,7 +246,7 @@ class Part:
         specimen = Specimen(self._operators, dynamics, self._first, rng)
         before = specimen.response
         _, response = specimen.advance(self._setpoints)
-        return at_rows(self._recording, response, before, dynamics.step, dynamics.actuator.delay)
+        return at_rows(self._recording, response, before, dynamics.step, latency(dynamics.actuator))
 
     def _local_slopes(self, count: int) -> Floats:
         """Return by how much the model's response depends on the drive at each row, by its greater slope."""
@@ -210,7 +271,7 @@ class Part:
         """Return the pairs of settled rows of the same hold and kind, by the time between them and by slope."""
         r, count = self._recording, self.still.size
         firsts, seconds, kinds = [], [], []
-        settled = r.since_change[:count] > _settled_after(r, self._dynamics)
+        settled = _settled(r, self._dynamics)[:count]
         for kind in (False, True):
             rows = np.flatnonzero((r.is_reading[:count] == kind) & settled)
             holds = r.last_change[rows]
@@ -261,38 +322,36 @@ def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], sign
             deviations.append(_deviation(np.concatenate(differences)) if differences else None)
         found.append(min((each for each in deviations if each is not None), default=None))
     every = np.concatenate([r.columns[signal] for r in recordings])
-    return _noise(found, every)
+    return _noise(found, _resolution(every[np.isfinite(every)]))
 
 
-def _noise(found: Sequence[float | None], values: Floats) -> Noise:
+def _noise(found: Sequence[float | None], resolution: float) -> Noise:
     """Return the noise of readings and quick readings; where one is not known, it is that of the other."""
     reading, quick = found
     known = reading if reading is not None else quick if quick is not None else 0.0
     return Noise(
         known if reading is None else reading,
         known if quick is None else quick,
-        _resolution(values[np.isfinite(values)]),
+        resolution,
     )
 
 
-def _settled_after(recording: Recording, dynamics: Dynamics) -> float:
-    """Return the time after a change of the set-point from which the rest counts as still, s."""
+def _settled(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
+    """Return at which rows the rest counts as still: so long after a change of the set-point, by its size."""
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency
-    longest = float(np.abs(np.diff(recording.setpoints, prepend=recording.driven[0])).max()) / actuator.rate
-    return max(0.5, _SETTLED * (constant + response.lag) + actuator.delay + min(longest, 0.3 * _hold(recording)))
-
-
-def _hold(recording: Recording) -> float:
-    """Return the usual time between two changes of the set-point, s."""
-    return float(np.median(np.diff(recording.changes)))
+    moves = np.abs(np.diff(recording.setpoints, prepend=recording.driven[0]))[recording.last_change]
+    needed = _SETTLED * (constant + response.lag) + actuator.delay + moves / actuator.rate
+    return np.asarray(recording.since_change > np.maximum(needed, 0.5))
 
 
 def _deviation(differences: Floats) -> float | None:
     """Return the standard deviation of the numbers of which these are differences; None of too few."""
     if differences.size < _FEWEST:
         return None
-    return float(np.median(np.abs(differences)) / 0.954) or float(np.sqrt(np.mean(differences**2) / 2.0))
+    return float(np.median(np.abs(differences)) / MEDIAN_OF_DIFFERENCES) or float(
+        np.sqrt(np.mean(differences**2) / 2.0)
+    )
 
 
 def _resolution(values: Floats) -> float:

@@ -34,8 +34,6 @@ _MODELS: Mapping[str, Mapping[str, Any]] = {
 """Models of which cross-validation chooses one where none is given, with their options."""
 _NODES = 65
 """Pairs by which a derived signal and what it comes from follow from each other."""
-_ARRIVED = 6.0
-"""Distance at which a set-point has been reached, in standard deviations of a quick reading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +139,9 @@ class IdentifiedTwin:
                 (name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one")
             )
             if noise.outliers:
-                rows.append(
-                    (
-                        "  outliers",
-                        f"{100.0 * noise.outlier_share:.2g} %, up to {number(max(map(abs, noise.outliers)), unit)}",
-                    )
-                )
+                most = max(map(abs, noise.outliers))
+                size = f"{100.0 * most:.2g} % of it" if noise.relative_outliers else number(most, unit)
+                rows.append(("  outliers", f"{100.0 * noise.outlier_share:.2g} % of the readings, by up to {size}"))
         for name, wander, unit in (
             ("wander of the drive", self.wander, drive),
             ("drift of the response", self.drift, response),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bench.hysteresis import Operator, Preisach, uniform_levels
 from bench.hysteresis._checks import Floats
 from bench.twin import _kernels
-from bench.twin.actuator import LONGEST_PART, at_rows, grid_step
+from bench.twin.actuator import LONGEST_PART, at_rows, grid_step, latency
 from bench.twin.recording import Recording
 from bench.twin.specimen import ActuatorDynamics, ResponseDynamics
 
@@ -106,9 +106,9 @@ def identify_response(
         seen = seen_by_specimen(r, actuator, dynamics, end)
         outputs = model.evaluate(seen)
         whole = dynamics.gain * outputs + np.array(dynamics.shares) @ late_parts(outputs, step, dynamics.times)
-        error = r.responded - at_rows(r, whole, whole[0], step, actuator.delay)
+        error = r.responded - at_rows(r, whole, whole[0], step, latency(actuator))
         offset = float(np.median(error[r.is_reading]))
-        inputs.append(at_rows(r, seen, seen[0], step, actuator.delay))
+        inputs.append(at_rows(r, seen, seen[0], step, latency(actuator)))
         errors.append(error - offset)
         offsets.append(offset)
         readings.append(r.is_reading)
@@ -142,7 +142,7 @@ def _identify_dynamics(
         for r, end in parts:
             outputs = model.evaluate(seen_by_specimen(r, actuator, response, end))
             every = np.vstack([outputs, late_parts(outputs, step, times)])
-            found.append([at_rows(r, row, row[0], step, actuator.delay) for row in every])
+            found.append([at_rows(r, row, row[0], step, latency(actuator)) for row in every])
         return np.concatenate([np.array(each) for each in found], axis=1).T
 
     def fitted(columns: Floats, whole: bool) -> tuple[float, Floats]:

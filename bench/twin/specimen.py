@@ -164,7 +164,7 @@ class Specimen:
         rng: np.random.Generator | None = None,
     ) -> None:
         self._operators = operators
-        self._dynamics = dynamics
+        self.dynamics = dynamics
         self._rng = rng
         actuator, response = dynamics.actuator, dynamics.response
         position = (start - actuator.offset) / actuator.gain
@@ -187,7 +187,7 @@ class Specimen:
 
         Returns drive and response after each step, shape (N,).
         """
-        dynamics, count = self._dynamics, setpoints.size
+        dynamics, count = self.dynamics, setpoints.size
         actuator, response = dynamics.actuator, dynamics.response
         normals = np.zeros((3, count)) if self._rng is None else self._rng.standard_normal((count, 3)).T.copy()
         scale = 0.0 if self._rng is None else 1.0 / abs(actuator.gain)
@@ -216,8 +216,8 @@ class Specimen:
     def _drifts(self, normals: Floats) -> Floats:
         from scipy.signal import lfilter
 
-        drift = self._dynamics.drift
-        decay = math.exp(-self._dynamics.step / drift.time)
+        drift = self.dynamics.drift
+        decay = math.exp(-self.dynamics.step / drift.time)
         kicks = drift.deviation * math.sqrt(1.0 - decay**2) * normals
         values, _ = lfilter([1.0], [1.0, -decay], kicks, zi=[decay * self._drift])
         self._drift = float(values[-1])

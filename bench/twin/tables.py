@@ -76,6 +76,7 @@ class NoiseTable(_Table):
     resolution: float = Field(default=0.0, ge=0, description="last digit of a reading; 0 for none")
     outlier_share: float = Field(default=0.0, ge=0, le=1, description="share of readings that are further off")
     outliers: tuple[float, ...] = Field(default=(), description="by how much these are off, quantiles")
+    relative_outliers: bool = Field(default=False, description="whether they are shares of what is read")
 
 
 class DriveTable(_Table):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,6 +37,10 @@ def write_twin(runs: Sequence[Path], rig: str, out: Path, model: Path | None = N
         raise ConfigurationError(f"--out {out}: expected a name that ends in .toml, as all rig files do")
     if out.exists():
         raise ConfigurationError(f"--out {out} exists already; a twin is never overwritten")
+    # Identification takes its time: first what would make it vain.
+    if not os.access(out.parent, os.W_OK):
+        reason = "no permission" if out.parent.is_dir() else f"there is no folder {out.parent}"
+        raise ConfigurationError(f"--out {out} cannot be written: {reason}")
     file = load_rig(rig)
     twin = identify_twin(runs, file, model)
     text = rig_text(twin, file, rig, out)

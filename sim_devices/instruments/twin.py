@@ -8,7 +8,19 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from bench.devices import Identity, Signal
-from bench.twin.device import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, REFUSED, SET, TwinSettings
+from bench.twin.device import (
+    DONE,
+    END,
+    GLANCE,
+    IDENTITY,
+    MEASURE,
+    OFF,
+    OUTPUT,
+    REFUSED,
+    SET,
+    TwinSettings,
+    number_text,
+)
 from bench.twin.tables import NoiseTable
 from sim_devices.instruments.emulated import EmulatedInstrument
 from sim_devices.wire import WireServer
@@ -70,7 +82,7 @@ class EmulatedTwin(EmulatedInstrument):
     def obey(self, request: str) -> str:
         """Carry a request out; return the answer."""
         if request in (MEASURE, GLANCE):
-            return " ".join(repr(self._read(name, quick=request == GLANCE)) for name in self._meters)
+            return " ".join(number_text(self._read(name, quick=request == GLANCE)) for name in self._meters)
         if request == IDENTITY:
             identity = self._identity
             return ",".join((identity.maker, identity.model, identity.serial_number, identity.firmware))
@@ -98,8 +110,8 @@ class EmulatedTwin(EmulatedInstrument):
         true, noise = self._meters[name]
         value = true() + self._draw(noise.quick if quick else noise.reading)
         if noise.outliers and self._rng.random() < noise.outlier_share:
-            value += self._rng.choice(noise.outliers)
-            return float(value)
+            size = float(self._rng.choice(noise.outliers))
+            return value * (1.0 + size) if noise.relative_outliers else value + size
         return round(value / noise.resolution) * noise.resolution if noise.resolution else value
 
 

@@ -15,6 +15,7 @@ from bench.journal import Record
 from bench.rig_file import load_rig
 from bench.twin import _kernels
 from bench.twin.actuator import identify_actuator
+from bench.twin.disturbances import noise_of
 from bench.twin.recording import Recording
 from bench.twin.specimen import ActuatorDynamics, Dynamics, Specimen, Unevenness, Wander
 from bench.twin.write import write_twin
@@ -30,17 +31,27 @@ def measured(tmp_path_factory):
     """Short runs on the emulated cantilever, which is built differently from any twin."""
     folder = tmp_path_factory.mktemp("measured")
     creep = bench.run("creep", "vo2", out=folder, seed=1, **CREEP)
-    loops = bench.run("damped-oscillation", "vo2", out=folder, seed=1, increment=2.0, half_cycles=12)
+    loops = bench.run("damped-oscillation", "vo2", out=folder, seed=1, increment=4.0, half_cycles=8)
     return creep.folder, loops.folder
 
 
 @pytest.fixture(scope="module")
-def twin(measured, tmp_path_factory):
+def model(measured, tmp_path_factory):
+    """Its model, identified from the loops."""
+    path = tmp_path_factory.mktemp("model") / "model.json"
+    identified = bench.identify(bench.load(measured[1]), "preisach-nonmonotonic", levels=12, plane=(30.0, 70.0))
+    identified.file.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def twin(measured, model, tmp_path_factory):
     """Its twin, made by the command, and what the command wrote for programs."""
     folder = tmp_path_factory.mktemp("twin")
     out, found = folder / "twin.toml", folder / "twin.json"
+    options = ["--rig", "vo2", "--model", str(model), "--out", str(out), "--json", str(found)]
     with pytest.raises(SystemExit) as stopped:
-        main(["twin", *map(str, measured), "--rig", "vo2", "--out", str(out), "--json", str(found)])
+        main(["twin", *map(str, measured), *options])
     assert not stopped.value.code
     return out, json.loads(found.read_text())
 
@@ -86,6 +97,16 @@ def test_equal_seeds_give_equal_sessions(twin, tmp_path):
     )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_a_run_under_control_is_rehearsed_on_the_twin(twin, model, tmp_path):
+    found = tmp_path / "rehearsal.json"
+    settings = [f"--set=model={model}", "--set=count=4"]
+    with pytest.raises(SystemExit) as stopped:
+        main(["rehearse", "tracking", "--rig", str(twin[0]), "--seed", "7", "--json", str(found), *settings])
+    assert not stopped.value.code
+    run = bench.run("tracking", twin[0], out=tmp_path, seed=7, model=str(model), count=4)
+    assert json.loads(found.read_text())["seconds"] == pytest.approx(run.readings["finished"][-1], rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -146,6 +167,11 @@ def recording_of(dynamics, noise=0.0):
     drive = np.interp(times, grid * np.arange(1, held.size + 1), out[0], left=0.0) + noise * rng.standard_normal(
         times.size
     )
+    return recording_from(times, drive, changes, setpoints)
+
+
+def recording_from(times, drive, changes, setpoints):
+    """A recording of a drive, read at some times."""
     return Recording(
         path=Path("run"), meta={}, signals=(), steps=(), times=times, is_reading=np.ones(times.size, dtype=bool),
         columns={"drive": drive, "response": drive}, changes=changes, setpoints=setpoints, drive="drive",
@@ -170,6 +196,32 @@ def test_the_order_of_an_actuator_is_found_with_its_numbers(dynamics):
     assert math.isinf(dynamics.rate) or found.rate == pytest.approx(dynamics.rate, rel=0.05)
 
 
+@pytest.mark.parametrize("relative", [True, False])
+def test_outliers_in_proportion_to_the_drive_are_told_from_others(relative):
+    rng = np.random.default_rng(2)
+    changes, setpoints = 50.0 * np.arange(60), rng.uniform(1.0, 5.0, 60)
+    times = np.arange(0.0, 3000.0, 0.5)
+    drive = setpoints[np.searchsorted(changes, times - 1e-9, side="right").clip(1) - 1]
+    off = rng.random(times.size) < 0.01
+    drive = drive + 1e-4 * rng.standard_normal(times.size)
+    drive[off] += (0.01 * drive[off] if relative else 0.03) * rng.choice([-1.0, 1.0], int(off.sum()))
+    recording = recording_from(times, drive, changes, setpoints)
+    noise = noise_of([recording], "drive", Dynamics(0.02), outliers=True)
+    assert noise.relative_outliers == relative
+    assert noise.outlier_share == pytest.approx(float(off.mean()), rel=0.1)
+    assert np.abs(noise.outliers) == pytest.approx(0.01 if relative else 0.03, rel=0.1)
+    assert noise.reading == pytest.approx(1e-4, rel=0.1)
+
+
+def test_an_actuator_that_follows_at_once_has_no_delay():
+    """Readings that are complete as the next set-point is sent saw the one before."""
+    changes, setpoints = np.arange(1.0, 16.0) * 0.497, np.tile([1.0, 3.0, 2.0], 5)
+    times = np.sort(np.concatenate([changes, changes + 0.05]))
+    levels = np.concatenate([[0.0], setpoints])[np.searchsorted(changes, times)]
+    found = identify_actuator([recording_from(times, levels, changes, setpoints)]).dynamics
+    assert (found.order, found.delay) == (0, 0.0)
+
+
 def test_how_calls_divide_the_time_does_not_matter():
     play = PrandtlIshlinskii(np.array([0.0, 0.5]), np.array([1.0, 1.0]), input_range=(-2.0, 2.0))
     dynamics = Dynamics(
@@ -178,7 +230,7 @@ def test_how_calls_divide_the_time_does_not_matter():
 
     def ends(pieces):
         specimen = Specimen((play,), dynamics, 0.0, np.random.default_rng(1))
-        plant = SpecimenPlant(specimen, 0.02, 0.0, 0.0)
+        plant = SpecimenPlant(specimen, 0.0)
         for target in (1.0, -1.0):
             plant.set(target)
             for _ in range(pieces):
