@@ -5,10 +5,11 @@ import os
 import select
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import chain, groupby
 from pathlib import Path
 
@@ -154,3 +155,21 @@ def reproduce(bench, tmp_path):
         return out, campaign
 
     return run
+
+
+@pytest.fixture
+def edit_journal():
+    """Change the journal of a run by SQL, as if it had been written so."""
+    from bench.journal.rows import checksum
+
+    def edit(path, *statements):
+        with closing(sqlite3.connect(path)) as db, db:
+            for statement in statements:
+                db.execute(statement)
+            for table in ("meta", "signals", "steps", "telemetry", "events"):
+                rows = db.execute(f"SELECT * FROM {table}").fetchall()
+                key = db.execute(f"SELECT * FROM {table} LIMIT 0").description[0][0]
+                renewed = [(checksum(row[:-1]), row[0]) for row in rows]
+                db.executemany(f"UPDATE {table} SET checksum = ? WHERE {key} = ?", renewed)
+
+    return edit

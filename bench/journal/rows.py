@@ -59,9 +59,11 @@ _PATTERNS = {
     "events": "nnttt",
     "files": "ttt",
 }
-"""The kinds of a row's columns, numbers or texts; one number a signal may follow."""
+"""The kinds of a row's columns, numbers or texts; one number a signal may follow, and then `_TEXTS_BEHIND`."""
 
-TEXTS = {table: pattern.count("t") for table, pattern in _PATTERNS.items()}
+_TEXTS_BEHIND = {"steps": 1}
+
+TEXTS = {table: pattern.count("t") + _TEXTS_BEHIND.get(table, 0) for table, pattern in _PATTERNS.items()}
 """Quantity of texts in a row."""
 
 _FEW_ROWS = 3
@@ -256,7 +258,7 @@ def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
     if TEXTS[table] != len(texts) or pattern.count("n") > count:
         return None
     row = [next(values[kind == "t"]) for kind in pattern]
-    return *row, *values[0]
+    return *row, *values[0], *values[1]
 
 
 def checksum(row: Sequence[str | float | None]) -> int:

@@ -115,8 +115,8 @@ class Injector:
 
         connect = Store._connect
 
-        def broken_connect(store):
-            connect(store)
+        def broken_connect(store, *wait):
+            connect(store, *wait)
             if store.path.is_relative_to(folder):
                 breaking()
 

@@ -267,7 +267,8 @@ def _find_break(file: TextFile, layout: Layout) -> int | None:
             begun = True
         elif begun and cells:
             texts = [cell.strip() for cell in cells]
-            if blank or len(cells) != layout.columns or texts == heads[: len(texts)]:
+            # A column of remarks may be empty in all rows that were looked at, and so not count as one.
+            if blank or len(cells) not in (layout.columns, len(heads)) or texts == heads[: len(texts)]:
                 return number
         blank = 0
     return None

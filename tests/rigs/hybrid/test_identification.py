@@ -1,7 +1,6 @@
 """From runs of the hybrid to its model: on samples that are made up, and on short runs recorded here."""
 
 import math
-import sqlite3
 
 import numpy as np
 import pytest
@@ -61,16 +60,12 @@ def found(runs):
 
 
 @pytest.fixture
-def changed(runs, tmp_path):
+def changed(runs, tmp_path, edit_journal):
     """Copy a run and change its journal; return the copy."""
 
     def change(name, *statements):
         (tmp_path / FILE_NAME).write_bytes((runs[name] / FILE_NAME).read_bytes())
-        db = sqlite3.connect(tmp_path / FILE_NAME)
-        for statement in statements:
-            db.execute(statement)
-        db.commit()
-        db.close()
+        edit_journal(tmp_path / FILE_NAME, *statements)
         return tmp_path
 
     return change

@@ -1,6 +1,6 @@
 """From runs of a muscle to models, on short runs of the rig `sma` recorded here."""
 
-import sqlite3
+import re
 
 import numpy as np
 import pytest
@@ -108,14 +108,16 @@ class TestReading:
     @pytest.mark.parametrize("other", ["length-voltage", "length-force", "length-verification", "creep"])
     def test_another_protocol_is_no_resting_one(self, runs, other):
         with pytest.raises(
-            DataError, match=f"{runs[other].name}: is a run of {other}; expected one of force-voltage$"
+            DataError, match=f"{re.escape(runs[other].name)}: is a run of {other}; expected one of force-voltage$"
         ):
             read_resting(runs[other])
 
     @pytest.mark.parametrize("other", ["force-voltage", "creep"])
     def test_another_protocol_has_no_series(self, runs, other):
         expected = "length-voltage or length-force or length-verification"
-        with pytest.raises(DataError, match=f"{runs[other].name}: is a run of {other}; expected one of {expected}$"):
+        with pytest.raises(
+            DataError, match=f"{re.escape(runs[other].name)}: is a run of {other}; expected one of {expected}$"
+        ):
             read_series(runs[other])
 
     @pytest.mark.parametrize(
@@ -132,12 +134,9 @@ class TestReading:
         ids=["samples", "signal", "aborted", "unfinished"],
     )
     @pytest.mark.parametrize(("protocol", "read"), [("force-voltage", read_resting), ("length-voltage", read_series)])
-    def test_what_a_run_lacks_is_named(self, runs, tmp_path, protocol, read, statement, words):
+    def test_what_a_run_lacks_is_named(self, runs, tmp_path, edit_journal, protocol, read, statement, words):
         (tmp_path / FILE_NAME).write_bytes((runs[protocol] / FILE_NAME).read_bytes())
-        db = sqlite3.connect(tmp_path / FILE_NAME)
-        db.execute(statement)
-        db.commit()
-        db.close()
+        edit_journal(tmp_path / FILE_NAME, statement)
         with pytest.raises(DataError, match=words) as caught:
             read(tmp_path)
         assert str(tmp_path) in str(caught.value)
