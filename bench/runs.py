@@ -161,7 +161,6 @@ def carry_out(
     faults = () if run.faults is None else read_schedule(run.faults)
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
-    warnings: tuple[str, ...] = ()
     with ExitStack() as stack:
         clock, attachment = _clock(run, rig_file, stack)
         if interrupts is None:
@@ -184,14 +183,7 @@ def carry_out(
         slots = description.slots(run.protocol)
         planned = plan(run.protocol, parameters, slots)
         expected = planned if rehearsal is None else rehearsal.widened(planned)
-        check_before_moving(description, run.protocol, expected)
-        if expected.prompts and not (rig_file.emulated or operator_is_there):
-            raise ConfigurationError(
-                f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
-                "run it in a terminal, where an operator can answer"
-            )
-        if guardian is not None:
-            warnings = check_start(description, interval=1.0 / rig_file.safety.rate, interval_key="safety.rate")
+        warnings = _checked(run, description, expected, guarded=guardian is not None, attended=operator_is_there)
         if (reason := interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
         files = dict(original.files) if original else given_files(run.protocol, stated, rig_file, run.faults)
@@ -237,10 +229,8 @@ def carry_out(
             journal.when_short = dashboard.stop_recording
             if run.live:
                 console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
-        layout = rig_file.dashboard
-        shown = (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
         length = _expectation(rehearsal, planned)
-        progress = ProgressDisplay(console, run.protocol.name, signals, shown, length, clock.factor)
+        progress = ProgressDisplay(console, run.protocol.name, signals, _shown(description), length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
         ask = partial(ask_operator, console) if operator_is_there else None
         engine = Engine(station, journal, observers, interrupts, ask, zero)
@@ -251,6 +241,28 @@ def carry_out(
             dashboard.finish(outcome.status, outcome.reason)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _checked(
+    run: Run, description: RigDescription, expected: Plan, *, guarded: bool, attended: bool
+) -> tuple[str, ...]:
+    """Check what is known before anything moves; return what is accepted only as an operator is present."""
+    check_before_moving(description, run.protocol, expected)
+    file = description.file
+    if expected.prompts and not (file.emulated or attended):
+        raise ConfigurationError(
+            f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
+            "run it in a terminal, where an operator can answer"
+        )
+    if not guarded:
+        return ()
+    return check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate")
+
+
+def _shown(description: RigDescription) -> tuple[str, ...]:
+    """Return the signals that the progress display shows."""
+    layout = description.file.dashboard
+    return (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
 
 
 def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:

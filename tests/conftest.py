@@ -40,6 +40,9 @@ def pytest_collection_modifyitems(items):
     tests that compile little, and finds in the cache what the first has compiled for its studies.
     """
     studies = [item for item in items if getattr(item, "originalname", "") == "test_campaign"]
+    for study in studies:
+        # Two minutes on an idle machine; a busy one may take its time.
+        study.add_marker(pytest.mark.timeout(1800))
     modules = [list(group) for _, group in groupby((i for i in items if i not in studies), lambda i: i.path)]
     # Between two modules, so that the fixtures of a module are made once.
     for place, study in reversed(list(enumerate(studies))):

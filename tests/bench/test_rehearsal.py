@@ -261,10 +261,10 @@ class TestEnd:
     @pytest.mark.parametrize(
         ("name", "rig", "settings", "clock"),
         [
-            ("creep", "vo2", {"duration": 30}, "x100"),
-            ("tracking", "vo2", {"count": 4}, "x200"),
-            ("following", "vo2", {"duration": 100}, "x200"),
-            ("length-voltage", "sma", {"loads": "0.98, 2.94", "points": 11, "dwell": 5}, "x200"),
+            ("creep", "vo2", {"duration": 30}, "x50"),
+            ("tracking", "vo2", {"count": 4}, "x40"),
+            ("following", "vo2", {"duration": 100}, "x50"),
+            ("length-voltage", "sma", {"loads": "0.98, 2.94", "points": 11, "dwell": 5}, "x100"),
         ],
     )
     def test_it_fits_within_a_tenth(self, make, model, name, rig, settings, clock):
