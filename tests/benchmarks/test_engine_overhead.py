@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from bench import registry
 from bench.attachment import attach
 from bench.clock import VirtualClock
 from bench.devices import DriverSettings, Identity, Limits, Status
@@ -29,6 +30,9 @@ from bench.station.local import LocalStation
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.benchmark
+
+# The rig file below names classes of this module.
+registry.import_beside(Path(__file__))
 
 STEPS = 5000
 REQUESTS = 5000
