@@ -104,6 +104,8 @@ class Guardian:
         self._wake, self._woken = socket.socketpair()
         for each in (self._wake, self._woken):
             each.setblocking(False)
+        # Once: a host is looked up by its name, which takes long when its line is lost.
+        self._line_may_be_away = longest_away(rig.file, rig.devices)
         self._lines = LineThreads(rig.devices, lines_of(rig.file), rig.clock, self._longest_away, self._line_was_away)
         self._looking: set[str] = set()
         self._latest: dict[str, dict[str, float]] = {}
@@ -409,7 +411,7 @@ class Guardian:
         self._news += news_of(findings)
 
     def _longest_away(self, name: str) -> float:
-        longest = longest_away(self._rig.file, self._rig.devices, name)
+        longest = self._line_may_be_away[name]
         return min(longest, _BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:

@@ -46,6 +46,7 @@ class LocalStation(Station):
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
         self._lost: set[str] = set()
+        self._longest_away = longest_away(rig.file, rig.devices)
 
     @property
     def has_operator(self) -> bool:
@@ -205,8 +206,8 @@ class LocalStation(Station):
             return call()
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
-        longest = longest_away(self._rig.file, self._rig.devices, name)
-        seconds = reconnect(self._rig.devices[name], error, self.clock, longest, lambda: self._feed_others(name))
+        device, longest = self._rig.devices[name], self._longest_away[name]
+        seconds = reconnect(device, error, self.clock, longest, lambda: self._feed_others(name))
         self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
 

@@ -27,15 +27,18 @@ def lines_of(file: RigFile) -> dict[str, str]:
     return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
 
 
-def longest_away(file: RigFile, devices: Mapping[str, Device], name: str) -> float:
-    """Return for how long the line of a device may be away, s.
+def longest_away(file: RigFile, devices: Mapping[str, Device]) -> dict[str, float]:
+    """Return for how long the line of each device may be away, s; taken while all lines are there.
 
     It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
     it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
     """
     lines = lines_of(file)
-    watchdogs = (devices[other].watchdog for other, line in lines.items() if line == lines[name])
-    return min([file.safety.reconnect, *(_SHARE_OF_WATCHDOG * each for each in watchdogs if each)])
+    longest = dict.fromkeys(lines.values(), file.safety.reconnect)
+    for name, line in lines.items():
+        if watchdog := devices[name].watchdog:
+            longest[line] = min(longest[line], _SHARE_OF_WATCHDOG * watchdog)
+    return {name: longest[line] for name, line in lines.items()}
 
 
 def reconnect(

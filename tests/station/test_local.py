@@ -101,8 +101,9 @@ class TestReconnection:
             lines = lines_of(rig.file)
             assert lines["displacement"] == lines["piezo"] != lines["tec"]
             assert rig.devices["displacement"].watchdog is None
+            longest = longest_away(rig.file, rig.devices)
             for name in ("displacement", "piezo"):
-                assert longest_away(rig.file, rig.devices, name) == 0.6 * watchdog
+                assert longest[name] == 0.6 * watchdog
         finally:
             rig.close()
 
