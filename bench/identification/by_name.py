@@ -82,6 +82,7 @@ def identify(
                                 the inputs: thresholds are i maximum / plays), `origin` (0), `dead_zones` (0:
                                 number of thresholds of a map after the plays), `input_range`
     `polynomial`                without memory; options `degree` (12), `input_range`
+    `polynomial-plays`          polynomial and plays of either sign; options `degree` (3), `plays` (3), `input_range`
     ==========================  ==============================================================================
 
     `input_unit` and `output_unit` are options of each. Packages may register further models in `bench.models`; see

@@ -51,6 +51,9 @@ class Certificate:
     converged : bool
         Whether the conditions hold to the solver's tolerance. False if only columns too dependent on the
         passive ones were left to enter.
+    effective : float
+        Number of coefficients that the data determine, without the bias: the rank of the passive columns, less what
+        smoothness determines of them; nan if it is not known.
     """
 
     kkt_residual: float
@@ -60,6 +63,7 @@ class Certificate:
     swept: Flags
     iterations: int
     converged: bool
+    effective: float = float("nan")
 
     @property
     def coverage(self) -> float:
@@ -197,6 +201,7 @@ def fit_minimum_norm(
         swept=swept,
         iterations=1,
         converged=kkt <= 1e-8,
+        effective=float(rank),
     )
     return Fit(x, mean - float(means @ x), np.full(x.size, np.nan), certificate)
 
@@ -645,7 +650,8 @@ class _ActiveSet:
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
         inverse = self.factor.inverse() if passive.size else np.zeros((0, 0))
-        spare = np.count_nonzero(self.w) - 1.0 - self.effective(inverse)
+        effective = self.effective(inverse)
+        spare = np.count_nonzero(self.w) - 1.0 - effective
         if spare > 0.5:
             variance = float(self.w @ self.residual() ** 2) / spare
             uncertainties[:] = 0.0
@@ -658,5 +664,6 @@ class _ActiveSet:
             swept=self.swept,
             iterations=self.iterations,
             converged=kkt <= 1e-10,
+            effective=effective,
         )
         return Fit(coefficients, self.mean - float(self.means @ coefficients), uncertainties, certificate)

@@ -1,0 +1,380 @@
+"""Choice of a model by held-out errors: which model, how fine, with which reversible part, memory, sign and smoothing.
+
+1. Each model in each of its kinds is tried at its coarsest, in both orientations and from each initial memory, on two
+   folds. The best orientation and memory of each are kept; what errs many times more than the best is given up.
+2. Finer ones are tried as long as they gain, on all folds, then the weights of the roughness penalty.
+3. What is near the best is evaluated with whole units of the excitation left out, too.
+4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
+   error is within one standard error of the best, from the differences fold by fold, and at most 5 % above it.
+
+Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
+limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
+structure often predicts worse), hence the bound.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import product
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from bench.hysteresis import ModelSpec, find_model
+from bench.hysteresis._checks import Floats
+from bench.identification.by_name import Initial
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate, has_signs
+from bench.identification.folds import correlated_rows
+
+Task: TypeAlias = Callable[[], list[Evaluation]]
+Carry: TypeAlias = Callable[[Sequence[tuple[str, Task]]], Iterable[list[Evaluation]]]
+"""Carries named tasks out and returns their results in order."""
+
+SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+"""Weights of the roughness penalty that are tried."""
+
+# A candidate that errs so many times more than the best on the first folds is given up.
+_HOPELESS = 3.0
+# Structures for which all smoothing weights are tried, and within which factor of the best error.
+_SMOOTHED = 4
+_NEAR = 2.0
+# A finer order has to lower the error to this part, or no finer one is tried.
+_GAIN = 0.98
+# Errors this near are no difference: of smoothing weights the greatest is taken.
+_EQUAL = 1.01
+# What the simplest may err more than the best, however large the standard error.
+_WORSE = 1.05
+# Ratio of the two held-out errors from which the record is said to tell little of other inputs.
+_WARNED = 3.0
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is not to be chosen, as it is given.
+
+    Attributes
+    ----------
+    options : mapping of str to object
+        Options of models; each model takes those that it has.
+    initial, orientation, smoothing
+        As `Candidate`; None leaves the choice.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    initial: Initial | None = None
+    orientation: str | None = None
+    smoothing: float | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was tried, and what was chosen.
+
+    Attributes
+    ----------
+    evaluations : tuple of Evaluation
+        The best of each structure first, by their error; those given up and those that failed last.
+    best : Evaluation
+        That of the least held-out error.
+    chosen : Evaluation
+        The simplest within one standard error of it.
+    gap : int
+        Rows left out next to each block.
+    rows : int
+        Rows that were fitted and tested.
+    span : float
+        Range of the outputs, output units.
+    """
+
+    evaluations: tuple[Evaluation, ...]
+    best: Evaluation
+    chosen: Evaluation
+    gap: int
+    rows: int
+    span: float
+
+    def warnings(self) -> list[str]:
+        """Return what the held-out errors say against the chosen model, in sentences."""
+        found = []
+        chosen = self.chosen
+        if not chosen.units:
+            found.append(
+                "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown: "
+                "record smaller cycles too, as `bench design` proposes"
+            )
+        elif chosen.units_rms > _WARNED * chosen.rms:
+            found.append(
+                f"the error with whole cycles left out is {chosen.units_rms / chosen.rms:.1f} times that with blocks "
+                "left out: expect it on inputs unlike the record, and record more kinds of cycles"
+            )
+        return found
+
+
+def select(
+    measured: Measurements, models: Sequence[str], given: Given | None = None, carry: Carry | None = None
+) -> Selection:
+    """Return the model that predicts best what was left out of its fit, and what else was tried.
+
+    Parameters
+    ----------
+    measured : Measurements
+        The data; `gap` is found from the residuals.
+    models : sequence of str
+        Names of models of `identifiable_models`.
+    given : Given, optional
+        Settings that are not to be chosen.
+    carry : callable, optional
+        Carries tasks out, such as in worker processes; one after another in this process if not given.
+
+    Raises
+    ------
+    ValueError
+        If no model can be fitted: names each and why.
+    """
+    return _Search(measured, models, given or Given(), carry or _one_after_another).run()
+
+
+def _one_after_another(tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
+    return [task() for _, task in tasks]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A model in one of its kinds: everything but sizes, orientation, memory and smoothing."""
+
+    model: str
+    fixed: tuple[tuple[str, Any], ...]
+    sizes: tuple[tuple[str, tuple[Any, ...]], ...]
+
+    def options(self, step: int) -> dict[str, Any]:
+        """Return the options of the step-th size, 0 the coarsest."""
+        return dict(self.fixed) | {name: values[min(step, len(values) - 1)] for name, values in self.sizes}
+
+    @property
+    def steps(self) -> int:
+        """Number of sizes."""
+        return max((len(values) for _, values in self.sizes), default=1)
+
+
+class _Search:
+    def __init__(self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry) -> None:
+        self.measured, self.given, self.carry = measured, given, carry
+        self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
+        self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
+        self.given_up: list[Evaluation] = []
+
+    def run(self) -> Selection:
+        screened = self.screen()
+        least = min(each.rms for each in screened.values())
+        self.measured = replace(self.measured, gap=self._gap(min(screened.values(), key=lambda each: each.rms)))
+        left = {}
+        for kind, each in screened.items():
+            if each.rms > _HOPELESS * least:
+                self.given_up.append(each)
+            else:
+                left[kind] = each.candidate
+        self.refine(left, _HOPELESS * least)
+        self.smooth()
+        self.with_units()
+        return self.choose()
+
+    def screen(self) -> dict[_Kind, Evaluation]:
+        """Return each kind at its coarsest, with its best orientation and memory."""
+        tasks = []
+        for kind in self.kinds:
+            tries = [
+                Candidate(kind.model, kind.options(0), orientation, initial, self.given.smoothing or 0.0)
+                for orientation, initial in product(self._orientations(kind), self._memories(kind))
+            ]
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, most_folds=2)))
+        result, failures = {}, []
+        for kind, found in zip(self.kinds, self.carry(tasks), strict=True):
+            usable = [each for each in found if each.blocks]
+            if usable:
+                result[kind] = _best_memory(usable)
+            else:
+                failures.append(found[0])
+        self.given_up += failures
+        if not result:
+            raise ValueError("; ".join(dict.fromkeys(f"{each.candidate.model}: {each.failure}" for each in failures)))
+        return result
+
+    def refine(self, left: Mapping[_Kind, Candidate], hopeless: float) -> None:
+        """Evaluate finer and finer orders of each kind, as long as they gain."""
+        going = dict(left)
+        step = 0
+        while going:
+            names = list(going.items())
+            tasks = []
+            for kind, candidate in names:
+                sized = replace(candidate, options=kind.options(step))
+                weights = [sized.smoothing]
+                # A fine plane without any smoothing may fail where the same plane with some does not.
+                if self._is_smoothed(kind) and step:
+                    weights.append(1e-2)
+                tries = [replace(sized, smoothing=weight) for weight in weights]
+                tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=hopeless)))
+            step += 1
+            for (kind, _), found in zip(names, self.carry(tasks), strict=True):
+                before = min((each.rms for each in self.done[kind]), default=float("inf"))
+                self.done[kind] += found
+                now = min(each.rms for each in found)
+                if step >= kind.steps or not now < _GAIN * before:
+                    del going[kind]
+
+    def smooth(self) -> None:
+        """Try smaller and greater smoothing weights on the structures that are near the best, until the error rises."""
+        best = {kind: each for kind in self.kinds if (each := self._best(kind)) and self._is_smoothed(kind)}
+        least = min((each.rms for each in best.values()), default=0.0)
+        near = sorted((each.rms, self.kinds.index(kind)) for kind, each in best.items() if each.rms <= _NEAR * least)
+        going = [self.kinds[index] for _, index in near[:_SMOOTHED]]
+        while going:
+            tries = [(kind, each) for kind in going for each in self._neighbours(kind)]
+            tasks = [
+                (kind.model, partial(evaluate, self.measured, [each], hopeless=_NEAR * least)) for kind, each in tries
+            ]
+            for (kind, _), found in zip(tries, self.carry(tasks), strict=True):
+                self.done[kind] += found
+            going = [kind for kind in going if self._neighbours(kind)]
+
+    def _neighbours(self, kind: _Kind) -> list[Candidate]:
+        """Return the best candidate of a kind with the next smaller and greater smoothing, as far as not tried."""
+        best = self._best(kind)
+        assert best is not None
+        tried = {
+            each.candidate.smoothing
+            for each in self.done[kind]
+            if each.candidate.options == best.candidate.options
+        }  # fmt: skip
+        at = int(np.searchsorted(SMOOTHING, best.candidate.smoothing))
+        return [
+            replace(best.candidate, smoothing=weight)
+            for weight in SMOOTHING[max(at - 1, 0) : at + 2]
+            if weight not in tried
+        ]
+
+    def with_units(self) -> None:
+        """Leave whole units of the excitation out of the best of each structure that is near the best of all."""
+        if not self.measured.units():
+            return
+        finalists = {id(each): (kind, each) for kind in self.kinds for each in self._of_each_size(kind)}
+        least = min(each.rms for _, each in finalists.values())
+        near = [(kind, each) for kind, each in finalists.values() if each.rms <= _NEAR * least]
+        tasks = [
+            (kind.model, partial(evaluate, self.measured, [each.candidate], with_units=True)) for kind, each in near
+        ]
+        for (kind, each), found in zip(near, self.carry(tasks), strict=True):
+            self.done[kind].remove(each)
+            self.done[kind] += [replace(one, seconds=one.seconds + each.seconds) for one in found]
+
+    def choose(self) -> Selection:
+        """Return the table with what is chosen."""
+        finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
+        judged = [each for each in finalists if each.units] or finalists
+        best = min(judged, key=lambda each: _score(each).mean())
+        within = [each for each in judged if is_within_one_standard_error(each, best)]
+        chosen = min(within, key=lambda each: (each.free, _score(each).mean()))
+        others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
+        table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
+        measured = self.measured
+        return Selection(
+            tuple(table), best, chosen, measured.gap, int(measured.tested.sum()), float(np.ptp(measured.outputs))
+        )
+
+    @property
+    def _folds(self) -> int:
+        return len(self.measured.blocks())
+
+    def _whole(self, kind: _Kind) -> list[Evaluation]:
+        """Return the candidates of a kind that were not given up."""
+        return [each for each in self.done[kind] if len(each.blocks) == self._folds]
+
+    def _of_each_size(self, kind: _Kind) -> list[Evaluation]:
+        """Return the best smoothing of each size of a kind."""
+        sizes: dict[str, list[Evaluation]] = {}
+        for each in self._whole(kind):
+            sizes.setdefault(repr(sorted(each.candidate.options.items())), []).append(each)
+        return [best_smoothing(each) for each in sizes.values()]
+
+    def _best(self, kind: _Kind) -> Evaluation | None:
+        """Return the best candidate of a kind."""
+        return min(self._whole(kind), key=lambda each: each.rms, default=None)
+
+    def _is_smoothed(self, kind: _Kind) -> bool:
+        """Return whether a smoothing weight is to be chosen: it has a plane, signs, and none is given."""
+        spec = find_model(kind.model)
+        return self.given.smoothing is None and spec.constrained and any(name == "levels" for name, _ in kind.sizes)
+
+    def _orientations(self, kind: _Kind) -> Sequence[str]:
+        if not has_signs(kind.model):
+            return ("auto",)
+        return ("rising", "falling") if self.given.orientation is None else (self.given.orientation,)
+
+    def _memories(self, kind: _Kind) -> Sequence[Initial | None]:
+        spec = find_model(kind.model)
+        if getattr(spec.model, "memoryless", False):
+            return (None,)
+        if self.given.initial is not None:
+            return (self.given.initial,)
+        estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
+        return (None, "positive", *estimated, "skip")
+
+    def _gap(self, each: Evaluation) -> int:
+        """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
+        block = int(self.measured.tested.sum()) // 20
+        return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
+
+
+def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
+    """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
+    from bench.identification.evaluation import _Trial
+
+    trial = _Trial(measured, candidate)
+    found = trial.problem.fit(candidate.smoothing)
+    return trial.sign * (trial.outputs - found.bias - trial.problem.regressor.product(found.coefficients))
+
+
+def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
+    """Return whether an error is within one standard error of the best, and at most 5 % above it.
+
+    The standard error is that of the differences fold by fold: what is hard to predict is so for both.
+    """
+    first, second = _score(simple), _score(best)
+    difference = first - second
+    allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
+    return bool(difference.mean() <= allowed and first.mean() <= _WORSE**2 * second.mean())
+
+
+def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
+    """Return the try of the least error; of several within 1 % of it the smoothest."""
+    least = min(each.rms for each in tries)
+    return max(
+        (each for each in tries if each.rms <= _EQUAL * least), key=lambda each: (each.candidate.smoothing, -each.rms)
+    )
+
+
+def _best_memory(tries: Sequence[Evaluation]) -> Evaluation:
+    """Return the try of the least error; of several within 1 % of it that of the least error in the first rows."""
+    least = min(each.rms for each in tries)
+    return min((each for each in tries if each.rms <= _EQUAL * least), key=lambda each: each.start)
+
+
+def _score(each: Evaluation) -> Floats:
+    """Return the mean squared errors that decide, fold by fold: those of blocks, and of units where there are any."""
+    return np.array(each.blocks + each.units)
+
+
+def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:
+    """Return a model in each of its kinds: with the options that are given."""
+    assert spec.template is not None
+    taken = inspect.signature(spec.template).parameters
+    fixed = {name: value for name, value in given.options.items() if name in taken}
+    sizes = tuple((name, tuple(values)) for name, values in spec.sizes.items() if name not in fixed)
+    varied = {name: values for name, values in spec.variants.items() if name not in fixed}
+    return [
+        _Kind(model, (*fixed.items(), *zip(varied, choice, strict=True)), sizes)
+        for choice in product(*varied.values())
+    ]
