@@ -1,4 +1,4 @@
-"""Choice of a model by held-out errors: which model, how fine, with which reversible part, memory, sign and smoothing.
+"""Choice of a model by held-out errors: model, order, reversible part, initial memory, orientation and smoothing.
 
 1. Each model in each of its kinds is tried at its coarsest, in both orientations and from each initial memory, on two
    folds. The best orientation and memory of each are kept; what errs many times more than the best is given up.
@@ -226,7 +226,7 @@ class _Search:
                     del going[kind]
 
     def smooth(self) -> None:
-        """Try smaller and greater smoothing weights on the structures that are near the best, until the error rises."""
+        """Try smaller and greater smoothing weights on the structures near the best, until the error rises."""
         best = {kind: each for kind in self.kinds if (each := self._best(kind)) and self._is_smoothed(kind)}
         least = min((each.rms for each in best.values()), default=0.0)
         near = sorted((each.rms, self.kinds.index(kind)) for kind, each in best.items() if each.rms <= _NEAR * least)
