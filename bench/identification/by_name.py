@@ -13,6 +13,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, counted_weights
 from bench.identification.measures import Errors, measure_errors
+from bench.identification.options import check_options
 from bench.identification.orientation import (
     NAMES,
     Orientation,
@@ -82,7 +83,6 @@ def identify(
 ) -> Identification[Any]:
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
 
-    ==========================  ==============================================================================
     `preisach`                  nonnegative density; options `levels` (20), `plane` (range of the inputs),
                                 `reversible` ("none", "linear", "quadratic", or "polynomial" of `degree` 5 unless
                                 given), `input_range`
@@ -100,6 +100,11 @@ def identify(
     `input_unit` and `output_unit` are options of each. Packages may register further models in `bench.models`; see
     `ModelSpec`. The shape parameters of an operator (`Operator.shape_parameters`), on which its output does not
     depend linearly, are fitted together with its coefficients by variable projection.
+    =======
+    The models are the entries of the group `bench.models`, to which packages may add; see `ModelSpec`. The command
+    `bench list NAME` shows the options of one, and docs/reference/models.md explains them. The shape parameters of an
+    operator (`Operator.shape_parameters`), on which its output does not depend linearly, are fitted together with its
+    coefficients by variable projection.
 
     A model whose coefficients must not be negative has an output that rises with the input. With the `orientation`
     "falling" the coefficients must not be positive instead; with "auto" the one that fits better is taken.
@@ -129,7 +134,7 @@ def identify(
     orientation : {"auto", "rising", "falling"}
         Whether the output rises or falls with the input; only "auto" for a model of free signs.
     **options
-        As listed above; `levels` is the number of intervals or the increasing levels themselves.
+        The model's own; see `bench.identification.options.model_options`.
 
     Raises
     ------
@@ -226,10 +231,8 @@ def set_up_problem(
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     if smoothing and not spec.constrained:
         raise ValueError(f"smoothing: {model_name} takes the least-norm solution instead")
-    try:
-        template: Operator[Any] = spec.template(sequence, **options)
-    except TypeError as error:
-        raise ValueError(f"options of {model_name}: {error}") from None
+    check_options(model_name, options)
+    template: Operator[Any] = spec.template(sequence, **options)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
     counted = counted_weights(sequence.size, w, skip)

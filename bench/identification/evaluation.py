@@ -5,18 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-from bench.hysteresis import PolynomialPlays, find_model
+from bench.hysteresis import PolynomialPlays
 from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
 from bench.identification.folds import Flags, Fold, block_folds, unit_folds
 from bench.identification.least_squares import Fit
+from bench.identification.orientation import Orientation
 
-Orientation: TypeAlias = str
-"""`rising`, `falling`, or `auto` of a model whose coefficients have no sign."""
+# Turns smaller than this part of the range need not be kept when rows are left out.
+_LEAST_MOVE = 0.005
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,20 @@ class Measurements:
         until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
         rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
         return cls(inputs, outputs, rows, until if until <= inputs.size // 3 else 0)
+
+    def thinned(self, most: int) -> Measurements:
+        """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.
+
+        The memory of an operator that does not depend on the rate is the same with and without the rows between.
+        """
+        if self.inputs.size <= most:
+            return self
+        chosen = np.zeros(self.inputs.size, dtype=bool)
+        chosen[:: -(-self.inputs.size // most)] = True
+        kept = chosen.copy()
+        kept[turning_points(self.inputs, _LEAST_MOVE * float(np.ptp(self.inputs)))] = True
+        known = int(np.count_nonzero(kept[: self.known]))
+        return Measurements(self.inputs[kept], self.outputs[kept], (self.fitted & chosen)[kept], known, self.gap)
 
     @property
     def tested(self) -> Flags:
@@ -184,8 +200,10 @@ def _evaluate(
         if np.sqrt(np.mean([each.tested for each in done])) <= hopeless:
             done += [trial.leave_out(fold) for fold in blocks[2:]]
         by_unit = [trial.leave_out(fold) for fold in units] if len(done) == len(blocks) else []
-    except (ValueError, np.linalg.LinAlgError) as error:
-        return Evaluation(candidate, failure=str(error), seconds=time.process_time() - begin)
+    # A model of another package must not end the comparison of the others.
+    except Exception as error:
+        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        return Evaluation(candidate, failure=text, seconds=time.process_time() - begin)
     return Evaluation(
         candidate,
         blocks=tuple(each.tested for each in done),
@@ -195,6 +213,13 @@ def _evaluate(
         free=float(np.mean([each.free for each in done])),
         seconds=time.process_time() - begin,
     )
+
+
+def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
+    """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
+    problem = _Trial(measured, candidate).problem
+    found = problem.fit(candidate.smoothing)
+    return measured.outputs - found.bias - problem.regressor.product(found.coefficients)
 
 
 @dataclass(frozen=True)
@@ -210,8 +235,6 @@ class _Trial:
 
     def __init__(self, measured: Measurements, candidate: Candidate) -> None:
         self.measured, self.candidate = measured, candidate
-        self.sign = -1.0 if candidate.orientation == "falling" else 1.0
-        self.outputs = self.sign * measured.outputs
         self.problem = self._set_up(measured.fitted)
         spec, template = self.problem.spec, self.problem.template
         self.again = (
@@ -225,19 +248,20 @@ class _Trial:
         return set_up_problem(
             each.model,
             self.measured.inputs,
-            self.outputs,
+            self.measured.outputs,
             trained.astype(np.float64),
             0,
             each.smoothing,
             each.initial,
             dict(each.options),
+            orientation=each.orientation,
         )
 
     def leave_out(self, fold: Fold) -> _LeftOut:
         """Fit without a fold; return the errors."""
         problem = self._set_up(fold.trained) if self.again else self.problem
         found: Fit = problem.fit(self.candidate.smoothing, fold.trained.astype(np.float64))
-        errors = (self.outputs - found.bias - problem.regressor.product(found.coefficients)) ** 2
+        errors = (self.measured.outputs - found.bias - problem.regressor.product(found.coefficients)) ** 2
         first = self.measured.fitted & ~self.measured.tested
         trained = fold.trained.copy()
         trained[: problem.skip] = False
@@ -247,8 +271,3 @@ class _Trial:
             start=float(np.sqrt(errors[first].mean())) if first.any() else 0.0,
             free=effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive,
         )
-
-
-def has_signs(model: str) -> bool:
-    """Return whether a model's coefficients have signs, so that its output either rises or falls."""
-    return find_model(model).constrained

@@ -62,7 +62,7 @@ class MemoryTest:
 
     def to_json(self) -> dict[str, Any]:
         """Return the verdict for programs."""
-        found = {"holds": self.holds, "compared": self.compared, "text": self.text}
+        found: dict[str, Any] = {"holds": self.holds, "compared": self.compared, "text": self.text}
         if self.compared:
             found |= {"difference": self.difference, "percent": self.percent}
         return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,17 +29,34 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.prandtl_ishlinskii import PlayState
 from bench.identification.initial_memory import estimate_memory
 from bench.identification.least_squares import fit
+from bench.identification.levels import Spacing, quantile_levels
+from bench.identification.options import OptionHelp
 
 ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic", "polynomial"]
+
+InputRange: TypeAlias = Annotated[
+    tuple[float, float] | None, OptionHelp("operating range, input units", "the range of the inputs")
+]
+_Levels: TypeAlias = Annotated[
+    int | tuple[float, ...], OptionHelp("number of intervals of the plane, or the increasing levels, input units")
+]
+_Spacing: TypeAlias = Annotated[Spacing, OptionHelp("of the levels: uniform, or quantiles of the reversals")]
+_Plane: TypeAlias = Annotated[
+    tuple[float, float] | None, OptionHelp("ends of the plane, input units", "the range of the inputs")
+]
 
 # Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
 _LEAST_SLOPE = 0.02
 
 
-def _lattice(levels: int | ArrayLike, plane: tuple[float, float]) -> Floats:
-    if isinstance(levels, int | np.integer):
-        return uniform_levels(*plane, int(levels))
-    return _checks.increasing("levels", levels)
+def _lattice(inputs: Floats, levels: int | ArrayLike, plane: tuple[float, float], spacing: Spacing) -> Floats:
+    if not isinstance(levels, int | np.integer):
+        if spacing != "uniform":
+            raise ValueError(f"spacing: {spacing!r} needs a number of levels, not the levels themselves")
+        return _checks.increasing("levels", levels)
+    if spacing == "quantiles":
+        return quantile_levels(inputs, plane, int(levels))
+    return uniform_levels(*plane, int(levels))
 
 
 def _operating(inputs: Floats, plane: tuple[float, float], given: tuple[float, float] | None) -> tuple[float, float]:
@@ -59,17 +76,18 @@ def _input_span(inputs: Floats, name: str) -> tuple[float, float]:
 def _preisach(
     inputs: Floats,
     *,
-    levels: int | ArrayLike = 20,
-    plane: tuple[float, float] | None = None,
-    reversible: ReversibleKind = "none",
-    degree: int | None = None,
-    input_range: tuple[float, float] | None = None,
+    levels: _Levels = 20,
+    spacing: _Spacing = "uniform",
+    plane: _Plane = None,
+    reversible: Annotated[ReversibleKind, OptionHelp("part without memory, beside the density")] = "none",
+    degree: Annotated[int | None, OptionHelp("of the reversible part 'polynomial'", "5")] = None,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Preisach:
     if plane is None and isinstance(levels, int | np.integer):
         plane = _input_span(inputs, "plane")
-    lattice = _lattice(levels, plane or (0.0, 0.0))
+    lattice = _lattice(inputs, levels, plane or (0.0, 0.0), spacing)
     middle = 0.5 * float(lattice[0] + lattice[-1])
     span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
     if degree is not None and reversible != "polynomial":
@@ -97,15 +115,24 @@ def _preisach(
 def _nonmonotonic(
     inputs: Floats,
     *,
-    levels: int | ArrayLike = 20,
-    plane: tuple[float, float] | None = None,
-    reference: float | None = None,
-    input_range: tuple[float, float] | None = None,
+    levels: _Levels = 20,
+    spacing: _Spacing = "uniform",
+    plane: _Plane = None,
+    reference: Annotated[
+        float | None, OptionHelp("input at which the thermal term is zero", "the low end of the operating range")
+    ] = None,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Preisach:
     plain = _preisach(
-        inputs, levels=levels, plane=plane, input_range=input_range, input_unit=input_unit, output_unit=output_unit
+        inputs,
+        levels=levels,
+        spacing=spacing,
+        plane=plane,
+        input_range=input_range,
+        input_unit=input_unit,
+        output_unit=output_unit,
     )
     zero = plain.input_range[0] if reference is None else reference
     return replace(plain, reversible=ThermalExpansion(0.0, 0.0, *plain.plane, zero))
@@ -114,8 +141,8 @@ def _nonmonotonic(
 def _polynomial(
     inputs: Floats,
     *,
-    degree: int = 12,
-    input_range: tuple[float, float] | None = None,
+    degree: Annotated[int, OptionHelp("of the polynomial")] = 12,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Polynomial:
@@ -128,9 +155,9 @@ def _polynomial(
 def _polynomial_plays(
     inputs: Floats,
     *,
-    degree: int = 3,
-    plays: int = 3,
-    input_range: tuple[float, float] | None = None,
+    degree: Annotated[int, OptionHelp("of the polynomial")] = 3,
+    plays: Annotated[int, OptionHelp("number of plays, of thresholds evenly below half the range")] = 3,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> PolynomialPlays:
@@ -147,17 +174,19 @@ def _polynomial_plays(
 def _prandtl_ishlinskii(
     inputs: Floats,
     *,
-    plays: int = 15,
-    maximum: float | None = None,
-    origin: float = 0.0,
-    dead_zones: int = 0,
-    input_range: tuple[float, float] | None = None,
+    plays: Annotated[int, OptionHelp("number of plays; their thresholds are i maximum / plays, i from 0")] = 15,
+    maximum: Annotated[
+        float | None, OptionHelp("end of the thresholds, input units", "half the range of the inputs")
+    ] = None,
+    origin: Annotated[float, OptionHelp("input of the relaxed state, input units")] = 0.0,
+    dead_zones: Annotated[int, OptionHelp("thresholds of a rising map after the plays (Kuhnen 2003)")] = 0,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> PrandtlIshlinskii:
     if plays < 1:
         raise ValueError(f"plays: expected at least 1, got {plays}")
-    if isinstance(dead_zones, bool) or not isinstance(dead_zones, int) or dead_zones < 0:
+    if dead_zones < 0:
         raise ValueError(f"dead_zones: expected an integer >= 0, got {dead_zones!r}")
     low, high = _input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
     if high <= low:

@@ -23,11 +23,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from bench.hysteresis import ModelSpec, find_model
+from bench.hysteresis import ModelSpec, Operator, find_model
 from bench.hysteresis._checks import Floats
 from bench.identification.by_name import Initial
-from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate, has_signs
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate, residuals_of
 from bench.identification.folds import correlated_rows
+from bench.identification.orientation import Orientation, has_orientation
 
 Task: TypeAlias = Callable[[], list[Evaluation]]
 Carry: TypeAlias = Callable[[Sequence[tuple[str, Task]]], Iterable[list[Evaluation]]]
@@ -65,7 +66,7 @@ class Given:
 
     options: Mapping[str, Any] = field(default_factory=dict)
     initial: Initial | None = None
-    orientation: str | None = None
+    orientation: Orientation | None = None
     smoothing: float | None = None
 
 
@@ -165,6 +166,7 @@ class _Search:
         self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
+        self._has_plane: dict[_Kind, bool] = {}
 
     def run(self) -> Selection:
         screened = self.screen()
@@ -183,15 +185,17 @@ class _Search:
 
     def screen(self) -> dict[_Kind, Evaluation]:
         """Return each kind at its coarsest, with its best orientation and memory."""
-        tasks = []
+        tasks, kinds, failures = [], [], []
         for kind in self.kinds:
-            tries = [
-                Candidate(kind.model, kind.options(0), orientation, initial, self.given.smoothing or 0.0)
-                for orientation, initial in product(self._orientations(kind), self._memories(kind))
-            ]
-            tasks.append((kind.model, partial(evaluate, self.measured, tries, most_folds=2)))
-        result, failures = {}, []
-        for kind, found in zip(self.kinds, self.carry(tasks), strict=True):
+            try:
+                tries = self._first_tries(kind)
+            except (ValueError, TypeError) as error:
+                failures.append(Evaluation(Candidate(kind.model, kind.options(0)), failure=str(error)))
+            else:
+                kinds.append(kind)
+                tasks.append((kind.model, partial(evaluate, self.measured, tries, most_folds=2)))
+        result = {}
+        for kind, found in zip(kinds, self.carry(tasks), strict=True):
             usable = [each for each in found if each.blocks]
             if usable:
                 result[kind] = _best_memory(usable)
@@ -304,37 +308,38 @@ class _Search:
         return min(self._whole(kind), key=lambda each: each.rms, default=None)
 
     def _is_smoothed(self, kind: _Kind) -> bool:
-        """Return whether a smoothing weight is to be chosen: it has a plane, signs, and none is given."""
-        spec = find_model(kind.model)
-        return self.given.smoothing is None and spec.constrained and any(name == "levels" for name, _ in kind.sizes)
+        """Return whether a smoothing weight is to be chosen: the model has a plane and signs, and none is given."""
+        return (
+            self.given.smoothing is None and find_model(kind.model).constrained and self._has_plane.get(kind, False)
+        )
 
-    def _orientations(self, kind: _Kind) -> Sequence[str]:
-        if not has_signs(kind.model):
-            return ("auto",)
-        return ("rising", "falling") if self.given.orientation is None else (self.given.orientation,)
+    def _first_tries(self, kind: _Kind) -> list[Candidate]:
+        """Return a kind at its coarsest in each orientation and from each initial memory that it has.
 
-    def _memories(self, kind: _Kind) -> Sequence[Initial | None]:
+        Raises ValueError if the data do not suit it.
+        """
         spec = find_model(kind.model)
-        if getattr(spec.model, "memoryless", False):
-            return (None,)
-        if self.given.initial is not None:
-            return (self.given.initial,)
-        estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
-        return (None, "positive", *estimated, "skip")
+        assert spec.template is not None
+        template: Operator[Any] = spec.template(self.measured.inputs, **kind.options(0))
+        self._has_plane[kind] = bool(template.densities())
+        orientations: tuple[Orientation, ...] = ("auto",)
+        if has_orientation(spec, template):
+            given = self.given.orientation
+            orientations = ("rising", "falling") if given in (None, "auto") else (given,)
+        memories: tuple[Initial | None, ...] = (None,)
+        if not template.memoryless:
+            estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
+            memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
+        weight = self.given.smoothing if self.given.smoothing and spec.constrained else 0.0
+        return [
+            Candidate(kind.model, kind.options(0), orientation, initial, weight)
+            for orientation, initial in product(orientations, memories)
+        ]
 
     def _gap(self, each: Evaluation) -> int:
         """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
         block = int(self.measured.tested.sum()) // 20
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
-
-
-def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
-    """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
-    from bench.identification.evaluation import _Trial
-
-    trial = _Trial(measured, candidate)
-    found = trial.problem.fit(candidate.smoothing)
-    return trial.sign * (trial.outputs - found.bias - trial.problem.regressor.product(found.coefficients))
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
