@@ -71,7 +71,7 @@ def compare_(
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
         result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
-    print_assumptions(data, result.assumptions)
+    print_assumptions(data.name, result.assumptions)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):

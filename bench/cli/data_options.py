@@ -6,7 +6,6 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from threading import Event, Thread
 from typing import Annotated, Any
 
@@ -71,10 +70,10 @@ layout_options = offer_options(_layout, "reading")
 """Offer a command's users the options of the layout of a file, in place of its parameter `reading`."""
 
 
-def print_assumptions(file: Path, assumptions: str) -> None:
+def print_assumptions(name: str, assumptions: str) -> None:
     """Print in a line what was assumed about the layout of a file; nothing for a run."""
     if assumptions:
-        console.print(f"read {file.name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"read {name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager

@@ -72,12 +72,12 @@ class Measurements:
     def of(cls, inputs: Floats, outputs: Floats, fitted: Flags | None = None) -> Measurements:
         """Return measurements of which rows are tested from where the inputs have overwritten all memory they do.
 
-        If that takes more than a third of the rows, all are tested.
+        If that takes more than half of the rows, all are tested.
         """
         span = float(inputs.min()), float(inputs.max())
         until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
         rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
-        return cls(inputs, outputs, rows, until if until <= inputs.size // 3 else 0)
+        return cls(inputs, outputs, rows, until if until <= inputs.size // 2 else 0)
 
     def thinned(self, most: int) -> Measurements:
         """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.

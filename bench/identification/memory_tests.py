@@ -168,7 +168,7 @@ def _measure(differences: Floats, y: Floats) -> tuple[float, float, bool]:
     """Return the RMS of differences, in percent of the range as well, and whether it is small."""
     span = float(np.ptp(y)) or 1.0
     rms = float(np.sqrt(np.mean(differences**2)))
-    return rms, 100.0 * rms / span, rms <= np.hypot(_LIMIT * span, _NOISE * _noise(y))
+    return rms, 100.0 * rms / span, bool(rms <= np.hypot(_LIMIT * span, _NOISE * _noise(y)))
 
 
 def _noise(y: Floats) -> float:

@@ -279,7 +279,8 @@ POLYNOMIAL_PLAYS = ModelSpec(
     PolynomialPlays,
     _polynomial_plays,
     constrained=False,
-    sizes={"degree": (1, 3, 5), "plays": (2, 3, 5)},
+    variants={"degree": (1, 3, 5)},
+    sizes={"plays": (2, 5, 10)},
 )
 TWO_STAGE = ModelSpec("one operator inside another: length = H2[force - H1[voltage]]", TwoStage)
 SUMMED = ModelSpec("the difference of two operators: length = H3[force] - H4[voltage]", Summed)
