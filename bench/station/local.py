@@ -250,4 +250,3 @@ class LocalStation(Station):
     def _raise_if_tripped(self) -> None:
         if self._core.cause is not None:
             raise self._core.cause
-
