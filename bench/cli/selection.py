@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from bench.results.selection import SelectedModel, TestedModel
 
 # Rows of the printed table; all are in the file.
-_SHOWN = 15
+_SHOWN = 10
 
 
 @dataclass(frozen=True)

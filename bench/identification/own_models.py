@@ -280,7 +280,7 @@ POLYNOMIAL_PLAYS = ModelSpec(
     _polynomial_plays,
     constrained=False,
     variants={"degree": (1, 3, 5)},
-    sizes={"plays": (2, 5, 10)},
+    sizes={"plays": (2, 5)},
 )
 TWO_STAGE = ModelSpec("one operator inside another: length = H2[force - H1[voltage]]", TwoStage)
 SUMMED = ModelSpec("the difference of two operators: length = H3[force] - H4[voltage]", Summed)

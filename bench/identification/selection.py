@@ -5,7 +5,8 @@
 2. Finer ones are tried as long as they gain, on all folds, then the weights of the roughness penalty.
 3. What is near the best is evaluated with whole units of the excitation left out, too.
 4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
-   error is within one standard error of the best, from the differences fold by fold, and at most 5 % above it.
+   error is within one standard error of the best, from the differences fold by fold: always if it is within 2 % of it,
+   never if it is more than 5 % above.
 
 Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
 limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
@@ -41,13 +42,16 @@ SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _HOPELESS = 3.0
 # Structures for which all smoothing weights are tried, and within which factor of the best error.
 _SMOOTHED = 4
+_REMEMBERED = 2
 _NEAR = 2.0
 # A finer order has to lower the error to this part, or no finer one is tried.
 _GAIN = 0.98
-# Errors this near are no difference: of smoothing weights the greatest is taken.
-_EQUAL = 1.01
+# Errors this near are no difference: of smoothing weights the greatest is taken, of structures the simplest.
+_EQUAL = 1.02
 # What the simplest may err more than the best, however large the standard error.
 _WORSE = 1.05
+# Without units left out nothing bounds a density of either sign on other inputs: it has to be so much better.
+_UNBOUNDED = 1.2
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
 _WARNED = 3.0
 
@@ -167,6 +171,7 @@ class _Search:
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
         self._has_plane: dict[_Kind, bool] = {}
+        self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
 
     def run(self) -> Selection:
         screened = self.screen()
@@ -180,6 +185,7 @@ class _Search:
                 left[kind] = each.candidate
         self.refine(left, _HOPELESS * least)
         self.smooth()
+        self.remember()
         self.with_units()
         return self.choose()
 
@@ -260,6 +266,20 @@ class _Search:
             if weight not in tried
         ]
 
+    def remember(self) -> None:
+        """Try the other initial memories on the best, which were compared at the coarsest order only."""
+        best = sorted((each.rms, self.kinds.index(kind)) for kind in self.kinds if (each := self._best(kind)))
+        chosen = [self.kinds[index] for _, index in best[:_REMEMBERED]]
+        tasks = []
+        for kind in chosen:
+            one = self._best(kind)
+            assert one is not None
+            others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
+            tries = [replace(one.candidate, initial=memory) for memory in others]
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=_EQUAL * one.rms)))
+        for kind, found in zip(chosen, self.carry(tasks), strict=True):
+            self.done[kind] += found
+
     def with_units(self) -> None:
         """Leave whole units of the excitation out of the best of each structure that is near the best of all."""
         if not self.measured.units():
@@ -277,7 +297,7 @@ class _Search:
     def choose(self) -> Selection:
         """Return the table with what is chosen."""
         finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
-        judged = [each for each in finalists if each.units] or finalists
+        judged = [each for each in finalists if each.units] or self._bounded(finalists)
         best = min(judged, key=lambda each: _score(each).mean())
         within = [each for each in judged if is_within_one_standard_error(each, best)]
         chosen = min(within, key=lambda each: (each.free, _score(each).mean()))
@@ -287,6 +307,15 @@ class _Search:
         return Selection(
             tuple(table), best, chosen, measured.gap, int(measured.tested.sum()), float(np.ptp(measured.outputs))
         )
+
+    def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists without those of a plane and free signs, unless these are clearly better."""
+        free = {
+            kind.model for kind in self.kinds if self._has_plane.get(kind) and not find_model(kind.model).constrained
+        }
+        others = [each for each in finalists if each.candidate.model not in free]
+        least = min((each.rms for each in others), default=float("inf"))
+        return others + [each for each in finalists if each not in others and _UNBOUNDED * each.rms < least]
 
     @property
     def _folds(self) -> int:
@@ -301,7 +330,7 @@ class _Search:
         sizes: dict[str, list[Evaluation]] = {}
         for each in self._whole(kind):
             sizes.setdefault(repr(sorted(each.candidate.options.items())), []).append(each)
-        return [best_smoothing(each) for each in sizes.values()]
+        return [best_smoothing(_of_best_memory(each)) for each in sizes.values()]
 
     def _best(self, kind: _Kind) -> Evaluation | None:
         """Return the best candidate of a kind."""
@@ -330,6 +359,7 @@ class _Search:
         if not template.memoryless:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
+        self._memories[kind] = memories
         weight = self.given.smoothing if self.given.smoothing and spec.constrained else 0.0
         return [
             Candidate(kind.model, kind.options(0), orientation, initial, weight)
@@ -343,26 +373,36 @@ class _Search:
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
-    """Return whether an error is within one standard error of the best, and at most 5 % above it.
+    """Return whether an error is within one standard error of the best, or 2 %, and at most 5 % above it.
 
     The standard error is that of the differences fold by fold: what is hard to predict is so for both.
     """
     first, second = _score(simple), _score(best)
     difference = first - second
     allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
-    return bool(difference.mean() <= allowed and first.mean() <= _WORSE**2 * second.mean())
+    allowed = min(max(allowed, (_EQUAL**2 - 1.0) * second.mean()), (_WORSE**2 - 1.0) * second.mean())
+    return bool(difference.mean() <= allowed)
 
 
 def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
-    """Return the try of the least error; of several within 1 % of it the smoothest."""
+    """Return the try of the least error; of several within 2 % of it the smoothest."""
     least = min(each.rms for each in tries)
     return max(
         (each for each in tries if each.rms <= _EQUAL * least), key=lambda each: (each.candidate.smoothing, -each.rms)
     )
 
 
+def _of_best_memory(tries: Sequence[Evaluation]) -> list[Evaluation]:
+    """Return the tries from the initial memory of the best of them."""
+    memories: dict[Initial | None, list[Evaluation]] = {}
+    for each in tries:
+        memories.setdefault(each.candidate.initial, []).append(each)
+    chosen = _best_memory([min(each, key=lambda one: one.rms) for each in memories.values()])
+    return memories[chosen.candidate.initial]
+
+
 def _best_memory(tries: Sequence[Evaluation]) -> Evaluation:
-    """Return the try of the least error; of several within 1 % of it that of the least error in the first rows."""
+    """Return the try of the least error; of several within 2 % of it that of the least error in the first rows."""
     least = min(each.rms for each in tries)
     return min((each for each in tries if each.rms <= _EQUAL * least), key=lambda each: each.start)
 
