@@ -11,6 +11,7 @@ from rich.text import Text
 
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.models import InitialOption
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -40,11 +41,15 @@ def compare_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
     skip: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the models' own data those "
+            "that their identifications left out.",
         ),
-    ] = 0,
+    ] = None,
+    initial: InitialOption = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -59,9 +64,10 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or figures or reading != ReadingOptions():
+        if input_column or output_column or skip or initial or figures or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --figures and how a file is read are for models, with --data FILE"
+                "--input, --output, --skip, --initial, --figures and how a file is read are for models, "
+                "with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
@@ -70,8 +76,12 @@ def compare_(
 
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
-        result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
+        result = compare_models(
+            compared, data, input_column, output_column, skip=skip, initial=initial, reading=reading
+        )
     print_assumptions(data.name, result.assumptions)
+    if result.skip:
+        console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
