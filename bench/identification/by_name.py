@@ -13,6 +13,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit
 from bench.identification.measures import Errors, measure_errors
+from bench.identification.regularization import Regularization, choose_regularization
 from bench.identification.shape import fit_operator, fit_shape
 
 M = TypeVar("M", bound=Operator[Any])
@@ -44,6 +45,8 @@ class Identification(Generic[M]):
         State before the first sample from which the model was fitted.
     warnings : tuple of str
         What is odd about the data or not covered by them.
+    regularization : Regularization or None
+        The penalties of a density of either sign; None for other models, and without penalties.
     """
 
     model_name: str
@@ -55,6 +58,7 @@ class Identification(Generic[M]):
     skip: int
     initial_state: Any = None
     warnings: tuple[str, ...] = ()
+    regularization: Regularization | None = None
 
 
 def identify(
@@ -64,7 +68,8 @@ def identify(
     *,
     weights: ArrayLike | None = None,
     skip: int = 0,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     initial: Initial | None = None,
     **options: Any,  # noqa: ANN401 - each template names and types its own
 ) -> Identification[Any]:
@@ -74,7 +79,7 @@ def identify(
     `preisach`                  nonnegative density; options `levels` (20), `plane` (range of the inputs),
                                 `reversible` ("none", "linear", "quadratic", or "polynomial" of `degree` 5 unless
                                 given), `input_range`
-    `preisach-signed`           density of either sign, least norm; options as `preisach`
+    `preisach-signed`           density of either sign; options as `preisach`
     `preisach-nonmonotonic`     nonnegative density and thermal term (Zhang et al. 2013, eq. 12); options
                                 `levels` (20), `plane` (range of the inputs), `reference` (low end of the
                                 operating range: where the term is zero), `input_range`
@@ -106,8 +111,10 @@ def identify(
         Weight per sample, >= 0; default 1.
     skip : int
         Number of first samples left out of the cost because their memory is unknown.
-    smoothing : float
-        Weight of the roughness penalty of `fit`; only for nonnegative densities.
+    smoothing, ridge : float or None
+        Weights of the penalties of `fit` on the roughness and the size of a density. None is 0 for a nonnegative
+        density; for one of either sign it is chosen by cross-validation, see `choose_regularization`. With both
+        at 0 a density of either sign is the one of the least norm, which may be far off for other inputs.
     initial : {"negative", "positive", "skip", "estimate"} or None
         The memory before the first sample, as above.
     **options
@@ -118,8 +125,10 @@ def identify(
     ValueError
         If the name is unknown, an option does not belong to it, or the data are unfit; see `fit`.
     """
-    problem = set_up_problem(model_name, inputs, outputs, weights, skip, smoothing, initial, options)
-    solution = problem.fit(smoothing)
+    problem = set_up_problem(model_name, inputs, outputs, weights, skip, smoothing or 0.0, initial, options)
+    penalties = problem.regularization(smoothing, ridge)
+    solution = problem.fit(penalties.smoothing, ridge=penalties.ridge)
+    is_penalised = not problem.spec.constrained and (penalties.smoothing > 0.0 or penalties.ridge > 0.0)
     model = problem.template.with_coefficients(solution.coefficients, solution.bias)
     predicted = model.evaluate(problem.inputs, problem.state)
     return Identification(
@@ -132,6 +141,7 @@ def identify(
         skip=problem.skip,
         initial_state=problem.state,
         warnings=problem.warnings(),
+        regularization=penalties if is_penalised else None,
     )
 
 
@@ -148,11 +158,22 @@ class FitProblem:
     state: Any
     regressor: Regressor
 
-    def fit(self, smoothing: float, weights: Floats | None = None) -> Fit:
+    def regularization(self, smoothing: float | None, ridge: float | None) -> Regularization:
+        """Return the weights of the penalties, those chosen by cross-validation that are None.
+
+        They are 0 for models with signs, and for those without cells.
+        """
+        if not self.spec.constrained and not self.regressor.base.size and (smoothing or ridge):
+            raise ValueError(f"{'smoothing' if smoothing else 'ridge'}: this model has no cells of a density")
+        if self.spec.constrained or not self.regressor.base.size or (smoothing is not None and ridge is not None):
+            return Regularization(smoothing or 0.0, ridge or 0.0)
+        return choose_regularization(self.regressor, self.outputs, self.weights, self.skip, smoothing, ridge)
+
+    def fit(self, smoothing: float, weights: Floats | None = None, ridge: float = 0.0) -> Fit:
         """Return the coefficients for the problem's weights or others."""
         w = self.weights if weights is None else weights
         return fit_operator(
-            self.spec.constrained, self.template, self.regressor, self.outputs, w, self.skip, smoothing
+            self.spec.constrained, self.template, self.regressor, self.outputs, w, self.skip, smoothing, ridge
         )
 
     def warnings(self) -> tuple[str, ...]:
@@ -184,8 +205,6 @@ def set_up_problem(
     w = np.ones(sequence.size) if weights is None else _checks.samples("weights", weights)
     if initial not in (None, "negative", "positive", "skip", "estimate"):
         raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
-    if smoothing and not spec.constrained:
-        raise ValueError(f"smoothing: {model_name} takes the least-norm solution instead")
     try:
         template: Operator[Any] = spec.template(sequence, **options)
     except TypeError as error:

@@ -89,6 +89,7 @@ class IdentifiedFile:
         found = self.identification
         certificate = found.certificate
         operator = self.file.operator
+        penalties = found.regularization
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -101,7 +102,9 @@ class IdentifiedFile:
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
-            "smoothing": self.trials.best.smoothing if self.trials else None,
+            "smoothing": self.trials.best.smoothing if self.trials else penalties and penalties.smoothing,
+            "ridge": penalties and penalties.ridge,
+            "cross_validated_rms": penalties and penalties.rms,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
@@ -115,7 +118,7 @@ def model_options(model: str) -> tuple[str, ...]:
     own = inspect.signature(template).parameters if template is not None else {}
     # The first takes the inputs; the units are those of the columns.
     names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "skip", "initial", "cross_validated")
+    return (*names, "smoothing", "ridge", "skip", "initial", "cross_validated")
 
 
 def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -150,7 +153,8 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
     reading: ReadingOptions | None = None,
@@ -166,8 +170,8 @@ def identify_file(
         Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float, optional
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
@@ -205,9 +209,12 @@ def identify_file(
         if cross_validated:
             others = {name: value for name, value in options.items() if name != "levels"}
             orders = [options["levels"]] if "levels" in options else None
-            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
+            ridge = ridge or 0.0
+            trials = cross_validate(
+                model, inputs, outputs, smoothing=SMOOTHING, ridge=ridge, levels=orders, skip=skip, **others
+            )
             smoothing = trials.best.smoothing
-        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
+        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, ridge=ridge, **options)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
@@ -343,6 +350,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
         ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
