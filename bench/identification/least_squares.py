@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 # all that is left to enter, the threshold is lowered step by step.
 _DEPENDENT = (1e-12, 1e-13, 1e-14)
 _TOLERANCE = 1e-12
+# A gradient that is zero but for rounding.
+_LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.5
 # A smooth fit of at least this order starts from one of half the order.
@@ -40,7 +42,11 @@ class Certificate:
         the weighted norm of the centred outputs. 0 is exact optimality; for a minimum-norm solution |g| over
         all columns.
     passive, active : int
-        Number of coefficients that are free to move, and held at zero.
+        Number of coefficients that are free to move, and held at zero. For a minimum-norm solution the dimensions
+        of the range and of the null space.
+    exchangeable : int
+        Number of coefficients held at zero that could replace others without changing the fit: the minimiser is
+        not unique if there are any. For a minimum-norm solution the swept columns above the rank.
     condition : float
         Estimated condition number of the scaled passive columns (for a minimum-norm fit: of the range kept).
     swept : ndarray of bool, shape (K + q,)
@@ -56,6 +62,7 @@ class Certificate:
     kkt_residual: float
     passive: int
     active: int
+    exchangeable: int
     condition: float
     swept: Flags
     iterations: int
@@ -197,6 +204,7 @@ def fit_minimum_norm(
         kkt_residual=kkt,
         passive=int(rank),
         active=x.size - int(rank),
+        exchangeable=max(int(swept.sum()) - int(rank), 0),
         condition=float(singular[0] / singular[rank - 1]) if rank else 1.0,
         swept=swept,
         iterations=1,
@@ -665,9 +673,9 @@ class _ActiveSet:
     def result(self) -> Fit:
         passive = self.passive
         g = self.slope()
-        held = self.constrained.copy()
+        held = np.ones(self.x.size, dtype=bool)
         held[passive] = False
-        violation = np.where(held, np.maximum(g, 0.0), np.abs(g))
+        violation = np.where(held & self.constrained, np.maximum(g, 0.0), np.abs(g))
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
@@ -681,6 +689,8 @@ class _ActiveSet:
             kkt_residual=kkt,
             passive=passive.size,
             active=self.x.size - passive.size,
+            # A column that could enter without a gain depends on the passive ones, all of which can give way.
+            exchangeable=int(np.count_nonzero(held & self.usable & (np.abs(g) <= _LEVEL * self.size))),
             condition=self.factor.condition(self.products_of(passive, passive)),
             swept=self.swept,
             iterations=self.iterations,

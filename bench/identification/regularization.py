@@ -16,8 +16,9 @@ import numpy as np
 
 from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
-from bench.identification.cell_layout import CellLayout, Indices
+from bench.identification.cell_layout import CellLayout
 from bench.identification.least_squares import changing, check_penalties, mean_square, one_thread
+from bench.identification.normal_equations import normal_equations
 
 SMOOTHING = tuple((10.0 ** np.arange(-6.0, 2.1)).tolist())
 """Weights of the roughness penalty that are tried; see `fit`."""
@@ -26,8 +27,6 @@ RIDGE = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
 # The weights belong to the density, not to the plane: they are chosen on one of at most this order.
 _FINEST = 24
-# Samples whose rows are formed at a time.
-_ROWS = 4096
 # Added to the squared norm of each scaled column, so that columns without a penalty may be collinear.
 _FLOOR = 1e-13
 
@@ -101,7 +100,7 @@ def choose_regularization(
     fold = (np.maximum(np.arange(-skip, used), 0) * min(blocks, used) // used) % folds
     layout = CellLayout.of(regressor.base.size)
     coarse, layout, factor, size = _coarse(regressor, layout)
-    grams = _normal_equations(coarse, outputs, weights, skip, fold, folds)
+    grams = normal_equations(coarse, outputs, weights, skip, fold, folds)
     # Each fold needs samples that count.
     grams = grams[grams[:, -2, -2] > 0.0]
     if len(grams) < 2:
@@ -144,40 +143,6 @@ def _coarse(regressor: Regressor, layout: CellLayout) -> tuple[Regressor, CellLa
         # A Laplacian of twice the step is four times as great, on a quarter of the cells.
         rough, size = 0.25 * rough, 4.0 * size
     return regressor, layout, rough, size
-
-
-def _normal_equations(
-    regressor: Regressor, outputs: Floats, weights: Floats, skip: int, fold: Indices, folds: int
-) -> Floats:
-    """Return, for each fold, the weighted products of the columns, of ones and of the outputs with each other.
-
-    Columns and outputs have their means subtracted, so that little is cancelled later.
-    """
-    from bench.hysteresis import _kernels
-
-    count = regressor.shape[1] + 2
-    cells = regressor.base.size
-    result = np.zeros((folds, count, count))
-    w = np.where(np.arange(outputs.size) < skip, 0.0, weights)
-    centre = np.zeros(count)
-    row = regressor.base
-    for start in range(0, outputs.size, _ROWS):
-        chunk = slice(start, min(start + _ROWS, outputs.size))
-        dense = np.empty((chunk.stop - start, cells))
-        _kernels.dense_rows(
-            regressor.starts[start : chunk.stop + 1], regressor.cells, regressor.changes, row.copy(), dense
-        )
-        row = dense[-1].copy()
-        rows = np.column_stack([dense, regressor.extra[chunk], np.ones(len(dense)), outputs[chunk]])
-        if not start:
-            # Little is then cancelled in what follows.
-            centre[:] = rows.mean(axis=0)
-            centre[-2] = 0.0
-        rows -= centre
-        for k in range(folds):
-            chosen = rows[(fold[chunk] == k) & (w[chunk] > 0.0)]
-            result[k] += (chosen * w[chunk][(fold[chunk] == k) & (w[chunk] > 0.0), None]).T @ chosen
-    return result
 
 
 def _mean_square(regressor: Regressor, weights: Floats, skip: int) -> float:

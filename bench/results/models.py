@@ -38,6 +38,8 @@ from bench.identification import (
     first_order_reversals,
     identify,
 )
+from bench.identification.regularization import Regularization
+from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
 from bench.results.reading.options import ReadingOptions
@@ -65,6 +67,8 @@ class IdentifiedFile:
         The measurements.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
+    resolution : Resolution or None
+        What the data say of each coefficient; None for a model without a plane, or with one too fine for it.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
     assumptions : str
@@ -77,6 +81,7 @@ class IdentifiedFile:
     inputs: Floats
     outputs: Floats
     coverage: Coverage | None = None
+    resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
 
@@ -99,6 +104,8 @@ class IdentifiedFile:
             "converged": certificate.converged,
             "passive": certificate.passive,
             "active": certificate.active,
+            "rank": self.resolution.rank if self.resolution else None,
+            "exchangeable": certificate.exchangeable,
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
@@ -221,6 +228,11 @@ def identify_file(
     warnings += found.warnings
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    resolution: Resolution | None = None
+    if coverage is not None and coverage.swept.size <= AFFORDABLE:
+        regressor = found.model.regressor(inputs, found.initial_state)
+        weights = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        resolution = resolve(regressor, np.ones(inputs.size), found.skip, weights.smoothing, weights.ridge)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -233,7 +245,15 @@ def identify_file(
     }
     file = ModelFile(model, found.model, memory, provenance)
     return IdentifiedFile(
-        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
+        file,
+        found,
+        tuple(dict.fromkeys(warnings)),
+        inputs,
+        outputs,
+        coverage,
+        resolution,
+        trials,
+        columns.assumptions,
     )
 
 
@@ -351,7 +371,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
-        ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *_uniqueness(found, identified.resolution),
         *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
@@ -359,6 +379,28 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
     )
+
+
+def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
+    """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
+    certificate = found.certificate
+    is_least_norm = not find_model(found.model_name).constrained and found.regularization is None
+    if is_least_norm:
+        text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
+    else:
+        text = f"{certificate.passive} free, {certificate.active} held at zero"
+    lines = [("coefficients", text)]
+    if resolution is not None and not is_least_norm:
+        lines.append(("determined by data", resolution.summary()))
+    if certificate.exchangeable:
+        lines.append(
+            (
+                "not unique",
+                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                "changing the fit; they are resolved by --smoothing",
+            )
+        )
+    return lines
 
 
 @dataclass(frozen=True)
