@@ -13,7 +13,8 @@ from bench.identification.resolution import resolve
 def problem(seed, order, samples, term=None):
     rng = np.random.default_rng(seed)
     operator = Preisach(uniform_levels(-1.0, 1.0, order), np.zeros(order * (order + 1) // 2), reversible=term)
-    regressor = operator.regressor(rng.uniform(-1.1, 1.1, samples))
+    # To tenths: no cell is swept by next to nothing, and the rank is plain.
+    regressor = operator.regressor(np.round(rng.uniform(-1.1, 1.1, samples), 1))
     weights = rng.uniform(0.2, 2.0, samples)
     matrix = regressor.dense()
     centred = np.sqrt(weights)[:, None] * (matrix - weights @ matrix / weights.sum())
