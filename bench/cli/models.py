@@ -74,7 +74,18 @@ def identify_(
             "left out of its fit.",
         ),
     ] = "all",
-    smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None,
     skip: Annotated[
         int,
         typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
@@ -121,7 +132,12 @@ def identify_(
     check_outputs(out=out, figures=figures, json_file=json_file)
     names = ", ".join(file.name for file in files)
     columns = (input_column, output_column)
-    settings: dict[str, Any] = {"smoothing": smoothing, "initial": initial, "orientation": orientation}
+    settings: dict[str, Any] = {
+        "smoothing": smoothing,
+        "ridge": ridge,
+        "initial": initial,
+        "orientation": orientation,
+    }
     selected = None
     if is_comparison(model):
         if cross_validate or weights_column:

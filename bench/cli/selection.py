@@ -103,7 +103,7 @@ def choose_model(
     options : ModelOptions
         Options of models that are given.
     settings : dict
-        `smoothing`, `initial` and `orientation` as given.
+        `smoothing`, `ridge`, `initial` and `orientation` as given.
     comparing : Comparing
         The options of the comparison.
 
@@ -115,6 +115,8 @@ def choose_model(
     from bench.identification.selection import Given
     from bench.results.selection import named_models, select_model
 
+    if settings["ridge"] is not None:
+        raise ConfigurationError("--ridge goes with one --model NAME")
     if options.levels_to_try:
         raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
     orientation = settings["orientation"]
@@ -122,7 +124,7 @@ def choose_model(
         options.values,
         initial=settings["initial"],
         orientation=None if orientation == "auto" else orientation,
-        smoothing=settings["smoothing"] or None,
+        smoothing=settings["smoothing"],
     )
     found = select_model(
         files,

@@ -35,15 +35,15 @@ class Candidate:
         Whether the output rises or falls with the input; `auto` of a model without signs.
     initial : str or None
         Memory before the first sample, as `identify` takes it.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing : float or None
+        Weight of the roughness penalty; None leaves it, and that of the size, to the fit of a density of either sign.
     """
 
     model: str
     options: Mapping[str, Any] = field(default_factory=dict)
     orientation: Orientation = "rising"
     initial: Initial | None = None
-    smoothing: float = 0.0
+    smoothing: float | None = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +217,9 @@ def _evaluate(
 
 def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
     """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
-    problem = _Trial(measured, candidate).problem
-    found = problem.fit(candidate.smoothing)
-    return measured.outputs - found.bias - problem.regressor.product(found.coefficients)
+    trial = _Trial(measured, candidate)
+    found = trial.fit(trial.problem)
+    return measured.outputs - found.bias - trial.problem.regressor.product(found.coefficients)
 
 
 @dataclass(frozen=True)
@@ -237,6 +237,9 @@ class _Trial:
         self.measured, self.candidate = measured, candidate
         self.problem = self._set_up(measured.fitted)
         spec, template = self.problem.spec, self.problem.template
+        self.penalties = self.problem.regularization(
+            candidate.smoothing, None if candidate.smoothing is None else 0.0
+        )
         self.again = (
             spec.refine is not None or candidate.initial == "estimate" or bool(template.shape_parameters().names)
         )
@@ -251,16 +254,20 @@ class _Trial:
             self.measured.outputs,
             trained.astype(np.float64),
             0,
-            each.smoothing,
+            each.smoothing or 0.0,
             each.initial,
             dict(each.options),
             orientation=each.orientation,
         )
 
+    def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:
+        """Return the coefficients for the problem's weights or others, with the penalties of the candidate."""
+        return problem.fit(self.penalties.smoothing, weights, ridge=self.penalties.ridge)
+
     def leave_out(self, fold: Fold) -> _LeftOut:
         """Fit without a fold; return the errors."""
         problem = self._set_up(fold.trained) if self.again else self.problem
-        found: Fit = problem.fit(self.candidate.smoothing, fold.trained.astype(np.float64))
+        found = self.fit(problem, fold.trained.astype(np.float64))
         errors = (self.measured.outputs - found.bias - problem.regressor.product(found.coefficients)) ** 2
         first = self.measured.fitted & ~self.measured.tested
         trained = fold.trained.copy()

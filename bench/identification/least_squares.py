@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 # all that is left to enter, the threshold is lowered step by step.
 _DEPENDENT = (1e-12, 1e-13, 1e-14)
 _TOLERANCE = 1e-12
+# A gradient that is zero but for rounding.
+_LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.5
 # A smooth fit of at least this order starts from one of half the order.
@@ -40,7 +42,11 @@ class Certificate:
         the weighted norm of the centred outputs. 0 is exact optimality; for a minimum-norm solution |g| over
         all columns.
     passive, active : int
-        Number of coefficients that are free to move, and held at zero.
+        Number of coefficients that are free to move, and held at zero. For a minimum-norm solution the dimensions
+        of the range and of the null space.
+    exchangeable : int
+        Number of coefficients held at zero that could replace others without changing the fit: the minimiser is
+        not unique if there are any. For a minimum-norm solution the swept columns above the rank.
     condition : float
         Estimated condition number of the scaled passive columns (for a minimum-norm fit: of the range kept).
     swept : ndarray of bool, shape (K + q,)
@@ -59,6 +65,7 @@ class Certificate:
     kkt_residual: float
     passive: int
     active: int
+    exchangeable: int
     condition: float
     swept: Flags
     iterations: int
@@ -106,6 +113,7 @@ def fit(
     weights: ArrayLike | None = None,
     skip: int = 0,
     smoothing: float = 0.0,
+    ridge: float = 0.0,
 ) -> Fit:
     """Return bias b and coefficients x that minimise the sum of weight * (outputs - b - R x)².
 
@@ -129,13 +137,16 @@ def fit(
         Weight >= 0 of a roughness penalty: smoothing * (mean squared column norm) * |discrete Laplacian of
         the density on the plane|². Cells never swept then follow their neighbours. The fit starts from that on
         a plane of half the order. See `cross_validate` for a choice of the weight.
+    ridge : float
+        Weight >= 0 of a penalty on the size: ridge * (mean squared column norm) * |density|².
 
     Raises
     ------
     ValueError
         If a length does not fit, a number is not finite, a weight is negative, or nothing is left to fit.
     """
-    return fit_cells(CellLayout.of(regressor.base.size), regressor, outputs, nonnegative, weights, skip, smoothing)
+    layout = CellLayout.of(regressor.base.size)
+    return fit_cells(layout, regressor, outputs, nonnegative, weights, skip, smoothing, ridge)
 
 
 def fit_cells(
@@ -146,14 +157,14 @@ def fit_cells(
     weights: ArrayLike | None = None,
     skip: int = 0,
     smoothing: float = 0.0,
+    ridge: float = 0.0,
 ) -> Fit:
     """Return what `fit` does, for sparse columns whose places in the plane `layout` gives."""
     y, w = _cost(regressor, outputs, weights, skip)
     constrained = np.broadcast_to(np.asarray(nonnegative, dtype=bool), (regressor.shape[1],))
-    if not smoothing >= 0.0 or not np.isfinite(smoothing):
-        raise ValueError(f"smoothing: expected a finite number >= 0, got {smoothing}")
-    with _one_thread():
-        return _ActiveSet(regressor, y, w, constrained, layout, smoothing).solve()
+    check_penalties(smoothing, ridge)
+    with one_thread():
+        return _ActiveSet(regressor, y, w, constrained, layout, smoothing, ridge).solve()
 
 
 def fit_minimum_norm(
@@ -184,7 +195,7 @@ def fit_minimum_norm(
     matrix *= root[:, None]
     mean = float(w @ y / w.sum())
     target = root * (y[skip:] - mean)
-    with _one_thread():
+    with one_thread():
         # Sums of row differences carry rounding errors that must not count as rank.
         cutoff = max(matrix.shape) * np.finfo(np.float64).eps
         x, _, rank, singular = lstsq(matrix, target, cond=cutoff, lapack_driver="gelsd")
@@ -197,6 +208,7 @@ def fit_minimum_norm(
         kkt_residual=kkt,
         passive=int(rank),
         active=x.size - int(rank),
+        exchangeable=max(int(swept.sum()) - int(rank), 0),
         condition=float(singular[0] / singular[rank - 1]) if rank else 1.0,
         swept=swept,
         iterations=1,
@@ -204,6 +216,26 @@ def fit_minimum_norm(
         effective=float(rank),
     )
     return Fit(x, mean - float(means @ x), np.full(x.size, np.nan), certificate)
+
+
+def check_penalties(smoothing: float, ridge: float) -> None:
+    """Raise ValueError if a weight is negative or not finite."""
+    for name, weight in (("smoothing", smoothing), ("ridge", ridge)):
+        if not weight >= 0.0 or not np.isfinite(weight):
+            raise ValueError(f"{name}: expected a finite number >= 0, got {weight}")
+
+
+def changing(norms: Floats, scale: Floats, total: float) -> Flags:
+    """Return which columns vary by more than the rounding of their means, given norms about these and a total weight.
+
+    `scale` is the size of each column.
+    """
+    return np.asarray(norms > 1e-11 * np.sqrt(total) * np.maximum(scale, 1e-300))
+
+
+def mean_square(norms: Floats) -> float:
+    """Return the unit of the penalties' weights, from the norms of the cells' columns that change."""
+    return float((norms**2).mean()) if norms.size else 1.0
 
 
 def _cost(regressor: Regressor, outputs: ArrayLike, weights: ArrayLike | None, skip: int) -> tuple[Floats, Floats]:
@@ -237,7 +269,7 @@ def _blas() -> Any:  # noqa: ANN401
     return ThreadpoolController()
 
 
-def _one_thread() -> Any:  # noqa: ANN401
+def one_thread() -> Any:  # noqa: ANN401
     """Return a context in which BLAS uses one thread: its short vectors gain nothing from more."""
     import scipy.linalg  # noqa: F401 - the controller sees only libraries already loaded
 
@@ -354,6 +386,7 @@ class _ActiveSet:
         constrained: Flags,
         layout: CellLayout,
         smoothing: float,
+        ridge: float,
         *,
         absolute: bool = False,
     ) -> None:
@@ -372,21 +405,23 @@ class _ActiveSet:
         centred = extra - self.means[self.cells :]
         norms = np.concatenate([cell_norms, np.sqrt(w @ centred**2)])
         scale = np.concatenate([np.abs(regressor.base), np.abs(extra).max(axis=0, initial=0.0)])
-        # Below this a column's variation is the rounding of its mean.
-        self.swept: Flags = norms > 1e-11 * np.sqrt(self.total) * np.maximum(scale, 1e-300)
-        swept_norms = cell_norms[self.swept[: self.cells]]
-        mean_square = float((swept_norms**2).mean()) if swept_norms.size else 1.0
-        self.norms = np.where(self.swept, norms, np.sqrt(mean_square))
+        self.swept: Flags = changing(norms, scale, self.total)
+        unit = mean_square(cell_norms[self.swept[: self.cells]])
+        self.norms = np.where(self.swept, norms, np.sqrt(unit))
         self.extra = np.ascontiguousarray(centred / self.norms[self.cells :])
         self.usable = self.swept.copy()
         self.penalty: csr_array | None = None
-        self.smoothing = smoothing if absolute else smoothing * mean_square
-        if self.smoothing > 0.0 and layout.order:
-            from scipy.sparse import csr_array, diags_array
+        self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
+        rough = self.smoothing > 0.0 and layout.order > 0
+        if rough or (self.ridge > 0.0 and self.cells):
+            from scipy.sparse import csr_array, diags_array, eye_array
 
             scaling = diags_array(1.0 / self.norms[: self.cells])
-            self.penalty = csr_array(self.smoothing * (scaling @ layout.roughness() @ scaling))
-            self.usable[: self.cells] |= layout.layers == 0
+            matrix = self.ridge * eye_array(self.cells)
+            if rough:
+                matrix = matrix + self.smoothing * layout.roughness()
+                self.usable[: self.cells] |= layout.layers == 0
+            self.penalty = csr_array(scaling @ matrix @ scaling)
 
         self.mean = float(w @ y / self.total)
         self.centred = y - self.mean
@@ -594,19 +629,14 @@ class _ActiveSet:
         if self.layout.order < _COARSEST:
             return np.flatnonzero(signed)
         layout, parents = self.layout.coarser()
-        count, r = layout.cells.size, self.regressor
-        merged = Regressor(
-            base=np.bincount(parents, r.base, minlength=count).astype(np.float64),
-            starts=r.starts,
-            cells=parents[r.cells].astype(np.int32),
-            changes=r.changes,
-            extra=r.extra,
-        )
-        constrained = np.ones(count + r.extra.shape[1], dtype=bool)
+        count = layout.cells.size
+        merged = self.regressor.merged(parents, count)
+        constrained = np.ones(merged.shape[1], dtype=bool)
         constrained[parents[~self.constrained[: self.cells]]] = False
         constrained[count:] = self.constrained[self.cells :]
         # A Laplacian of twice the step is four times as great, on a quarter of the cells.
-        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, 0.25 * self.smoothing, absolute=True)
+        weights = 0.25 * self.smoothing, 4.0 * self.ridge
+        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, *weights, absolute=True)
         coarse.minimise()
         values = (coarse.x / coarse.norms)[:count]
         chosen = signed.copy()
@@ -648,9 +678,9 @@ class _ActiveSet:
     def result(self) -> Fit:
         passive = self.passive
         g = self.slope()
-        held = self.constrained.copy()
+        held = np.ones(self.x.size, dtype=bool)
         held[passive] = False
-        violation = np.where(held, np.maximum(g, 0.0), np.abs(g))
+        violation = np.where(held & self.constrained, np.maximum(g, 0.0), np.abs(g))
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
@@ -665,6 +695,8 @@ class _ActiveSet:
             kkt_residual=kkt,
             passive=passive.size,
             active=self.x.size - passive.size,
+            # A column that could enter without a gain depends on the passive ones, all of which can give way.
+            exchangeable=int(np.count_nonzero(held & self.usable & (np.abs(g) <= _LEVEL * self.size))),
             condition=self.factor.condition(self.products_of(passive, passive)),
             swept=self.swept,
             iterations=self.iterations,

@@ -5,8 +5,8 @@
 2. Finer ones are tried as long as they gain, on all folds, then the weights of the roughness penalty.
 3. What is near the best is evaluated with whole units of the excitation left out, too.
 4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
-   error is within one standard error of the best, from the differences fold by fold: always if it is within 2 % of it,
-   never if it is more than 5 % above.
+   error is within one standard error of the best, from the differences fold by fold: always one within 2 % of it, and
+   never one more than 5 % above.
 
 Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
 limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
@@ -221,7 +221,7 @@ class _Search:
             tasks = []
             for kind, candidate in names:
                 sized = replace(candidate, options=kind.options(step))
-                weights = [sized.smoothing]
+                weights: list[float | None] = [sized.smoothing]
                 # A fine plane without any smoothing may fail where the same plane with some does not.
                 if self._is_smoothed(kind) and step:
                     weights.append(1e-2)
@@ -259,7 +259,7 @@ class _Search:
             for each in self.done[kind]
             if each.candidate.options == best.candidate.options
         }  # fmt: skip
-        at = int(np.searchsorted(SMOOTHING, best.candidate.smoothing))
+        at = int(np.searchsorted(SMOOTHING, best.candidate.smoothing or 0.0))
         return [
             replace(best.candidate, smoothing=weight)
             for weight in SMOOTHING[max(at - 1, 0) : at + 2]
@@ -360,7 +360,9 @@ class _Search:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
-        weight = self.given.smoothing if self.given.smoothing and spec.constrained else 0.0
+        weight: float | None = 0.0
+        if self._has_plane[kind]:
+            weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing
         return [
             Candidate(kind.model, kind.options(0), orientation, initial, weight)
             for orientation, initial in product(orientations, memories)
@@ -388,7 +390,8 @@ def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
     """Return the try of the least error; of several within 2 % of it the smoothest."""
     least = min(each.rms for each in tries)
     return max(
-        (each for each in tries if each.rms <= _EQUAL * least), key=lambda each: (each.candidate.smoothing, -each.rms)
+        (each for each in tries if each.rms <= _EQUAL * least),
+        key=lambda each: (each.candidate.smoothing or 0.0, -each.rms),
     )
 
 

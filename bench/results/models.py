@@ -40,6 +40,8 @@ from bench.identification import (
 )
 from bench.identification.memory_tests import MemoryTest, check_congruency, check_return_points
 from bench.identification.options import check_options, model_options
+from bench.identification.regularization import Regularization
+from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
 from bench.results.joined_files import fitted_rows, read_files
@@ -71,6 +73,8 @@ class IdentifiedFile:
         Whether the measurements agree with what a Preisach-type model takes for granted.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
+    resolution : Resolution or None
+        What the data say of each coefficient; None for a model without a plane, or with one too fine for it.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
     assumptions : str
@@ -85,6 +89,7 @@ class IdentifiedFile:
     return_points: MemoryTest
     congruency: MemoryTest
     coverage: Coverage | None = None
+    resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
 
@@ -97,6 +102,7 @@ class IdentifiedFile:
         found = self.identification
         certificate = found.certificate
         operator = self.file.operator
+        penalties = found.regularization
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -106,10 +112,14 @@ class IdentifiedFile:
             "converged": certificate.converged,
             "passive": certificate.passive,
             "active": certificate.active,
+            "rank": self.resolution.rank if self.resolution else None,
+            "exchangeable": certificate.exchangeable,
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
-            "smoothing": self.trials.best.smoothing if self.trials else None,
+            "smoothing": self.trials.best.smoothing if self.trials else penalties and penalties.smoothing,
+            "ridge": penalties and penalties.ridge,
+            "cross_validated_rms": penalties and penalties.rms,
             "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
@@ -123,7 +133,7 @@ class IdentifiedFile:
 def option_names(model: str) -> tuple[str, ...]:
     """Return the names of the options that `identify_file` takes for a registered model."""
     own = [option.name for option in model_options(find_model(model))]
-    return (*own, "smoothing", "skip", "initial", "orientation", "cross_validated")
+    return (*own, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated")
 
 
 def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -157,7 +167,8 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
     weights_column: str | None = None,
@@ -176,8 +187,8 @@ def identify_file(
         Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float, optional
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
@@ -239,14 +250,25 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            penalties = SMOOTHING if cross_validated else (smoothing,)
+            penalties = SMOOTHING if cross_validated else (smoothing or 0.0,)
+            ridge = ridge or 0.0
             trials = cross_validate(
-                model, inputs, outputs, smoothing=penalties, levels=orders, weights=weights, skip=skip, **others
+                model,
+                inputs,
+                outputs,
+                smoothing=penalties,
+                ridge=ridge,
+                levels=orders,
+                weights=weights,
+                skip=skip,
+                **others,
             )
             smoothing = trials.best.smoothing
             if trials.best.levels is not None and levels_to_try:
                 options["levels"] = trials.best.levels
-        found = identify(model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, **options)
+        found = identify(
+            model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
+        )
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     if not fitted.all():
@@ -256,6 +278,12 @@ def identify_file(
     warnings += (*found.warnings, *(test.text for test in tests if test.holds is False))
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    resolution: Resolution | None = None
+    if coverage is not None and coverage.swept.size <= AFFORDABLE:
+        regressor = found.model.regressor(inputs, found.initial_state)
+        chosen = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        counting = np.ones(inputs.size) if weights is None else weights
+        resolution = resolve(regressor, counting, found.skip, chosen.smoothing, chosen.ridge)
     provenance = {
         "source": ", ".join(each.name for each in paths),
         "input": input_column,
@@ -270,7 +298,16 @@ def identify_file(
     }
     file = ModelFile(model, found.model, memory, provenance, found.initial_state)
     return IdentifiedFile(
-        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, *tests, coverage, trials, columns.assumptions
+        file,
+        found,
+        tuple(dict.fromkeys(warnings)),
+        inputs,
+        outputs,
+        *tests,
+        coverage,
+        resolution,
+        trials,
+        columns.assumptions,
     )
 
 
@@ -394,7 +431,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
-        ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *_uniqueness(found, identified.resolution),
+        *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
@@ -403,6 +441,28 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("return points", identified.return_points.text),
         ("loops", identified.congruency.text),
     )
+
+
+def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
+    """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
+    certificate = found.certificate
+    is_least_norm = not find_model(found.model_name).constrained and found.regularization is None
+    if is_least_norm:
+        text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
+    else:
+        text = f"{certificate.passive} free, {certificate.active} held at zero"
+    lines = [("coefficients", text)]
+    if resolution is not None and not is_least_norm:
+        lines.append(("determined by data", resolution.summary()))
+    if certificate.exchangeable:
+        lines.append(
+            (
+                "not unique",
+                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                "changing the fit; they are resolved by --smoothing",
+            )
+        )
+    return lines
 
 
 @dataclass(frozen=True)
