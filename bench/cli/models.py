@@ -143,7 +143,7 @@ def identify_(
         if cross_validate or weights_column:
             raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
         selected = choose_model(files, columns, model, options, settings, comparing, skip=skip, reading=reading)
-        model, settings = selected.model, selected.settings()
+        model, settings = selected.model, settings | selected.settings()
     elif comparing.table_out is not None:
         raise ConfigurationError("--table-out goes with --model all, or several models")
     else:
@@ -154,7 +154,6 @@ def identify_(
             input_column=input_column,
             output_column=output_column,
             model=model,
-            skip=skip,
             cross_validated=cross_validate,
             weights_column=weights_column,
             levels_to_try=options.levels_to_try,

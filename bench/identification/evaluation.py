@@ -19,6 +19,8 @@ from bench.identification.orientation import Orientation
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
 _LEAST_MOVE = 0.005
+# Moves from this part of the range on make cycles.
+_LEAST_CYCLE = 0.02
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,14 @@ class Measurements:
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
 
     def blocks(self) -> tuple[Fold, ...]:
-        """Return the folds of contiguous blocks; rows before `known` are in every fit."""
-        return self._with_first_rows(block_folds(self.tested, blocks=min(20, int(self.tested.sum())), gap=self.gap))
+        """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""
+        return self._with_first_rows(block_folds(self.tested, blocks=self.count_of_blocks, gap=self.gap))
+
+    @property
+    def count_of_blocks(self) -> int:
+        """Number of blocks, 5 to 20: of a part of a cycle the rest of it would tell too much."""
+        moves = turning_points(self.inputs, _LEAST_CYCLE * float(np.ptp(self.inputs))).size - 1
+        return min(max(moves // 2, 5), 20, max(int(self.tested.sum()), 5))
 
     def units(self) -> tuple[Fold, ...]:
         """Return the folds of whole excitation units; none if there is one kind only."""
@@ -237,11 +245,11 @@ class _Trial:
         self.measured, self.candidate = measured, candidate
         self.problem = self._set_up(measured.fitted)
         spec, template = self.problem.spec, self.problem.template
-        self.penalties = self.problem.regularization(
-            candidate.smoothing, None if candidate.smoothing is None else 0.0
-        )
         self.again = (
-            spec.refine is not None or candidate.initial == "estimate" or bool(template.shape_parameters().names)
+            spec.refine is not None
+            or candidate.initial == "estimate"
+            or candidate.smoothing is None
+            or bool(template.shape_parameters().names)
         )
         if self.problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {self.problem.skip}: too few rows are left")
@@ -253,7 +261,8 @@ class _Trial:
             self.measured.inputs,
             self.measured.outputs,
             trained.astype(np.float64),
-            0,
+            # A specimen need not be saturated where its plane ends: what came before is unknown to any model.
+            self.measured.known if each.initial == "skip" else 0,
             each.smoothing or 0.0,
             each.initial,
             dict(each.options),
@@ -262,7 +271,9 @@ class _Trial:
 
     def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:
         """Return the coefficients for the problem's weights or others, with the penalties of the candidate."""
-        return problem.fit(self.penalties.smoothing, weights, ridge=self.penalties.ridge)
+        smoothing = self.candidate.smoothing
+        penalties = problem.regularization(smoothing, None if smoothing is None else 0.0)
+        return problem.fit(penalties.smoothing, weights, ridge=penalties.ridge)
 
     def leave_out(self, fold: Fold) -> _LeftOut:
         """Fit without a fold; return the errors."""

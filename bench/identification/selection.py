@@ -46,6 +46,8 @@ _REMEMBERED = 2
 _NEAR = 2.0
 # A finer order has to lower the error to this part, or no finer one is tried.
 _GAIN = 0.98
+# Coefficients for each row up to which a finer order is tried.
+_MOST_COEFFICIENTS = 5
 # Errors this near are no difference: of smoothing weights the greatest is taken, of structures the simplest.
 _EQUAL = 1.02
 # What the simplest may err more than the best, however large the standard error.
@@ -232,8 +234,15 @@ class _Search:
                 before = min((each.rms for each in self.done[kind]), default=float("inf"))
                 self.done[kind] += found
                 now = min(each.rms for each in found)
-                if step >= kind.steps or not now < _GAIN * before:
+                if step >= kind.steps or not now < _GAIN * before or self._is_too_fine(kind, step):
                     del going[kind]
+
+    def _is_too_fine(self, kind: _Kind, step: int) -> bool:
+        """Return whether a kind has many more coefficients than there are rows."""
+        template = find_model(kind.model).template
+        assert template is not None
+        operator: Operator[Any] = template(self.measured.inputs, **kind.options(step))
+        return operator.coefficients.size > _MOST_COEFFICIENTS * int(self.measured.tested.sum())
 
     def smooth(self) -> None:
         """Try smaller and greater smoothing weights on the structures near the best, until the error rises."""
@@ -370,7 +379,7 @@ class _Search:
 
     def _gap(self, each: Evaluation) -> int:
         """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
-        block = int(self.measured.tested.sum()) // 20
+        block = int(self.measured.tested.sum()) // self.measured.count_of_blocks
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
 
 

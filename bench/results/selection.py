@@ -48,12 +48,15 @@ class SelectedModel:
         What was tried.
     unit : str
         Unit of the output.
+    known : int
+        First row that does not depend on what came before the record.
     warnings : tuple of str
         What the held-out errors say against the choice.
     """
 
     selection: Selection
     unit: str
+    known: int
     warnings: tuple[str, ...]
 
     @property
@@ -65,7 +68,8 @@ class SelectedModel:
         """Return the chosen settings as `identify_file` takes them."""
         chosen = self.selection.chosen.candidate
         orientation = {} if chosen.orientation == "auto" else {"orientation": chosen.orientation}
-        return {**chosen.options, **orientation, "initial": chosen.initial, "smoothing": chosen.smoothing}
+        skip = {"skip": self.known} if chosen.initial == "skip" else {}
+        return {**chosen.options, **orientation, **skip, "initial": chosen.initial, "smoothing": chosen.smoothing}
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the table: `COLUMNS` by name, errors in output units."""
@@ -188,14 +192,15 @@ def select_model(
             f"{files.columns.source}: {int(fitted.sum())} rows are left; at least {FEWEST_ROWS} are needed"
         )
     _check_options(models, given)
-    measured = Measurements.of(inputs, outputs, fitted).thinned(MOST_ROWS)
+    whole = Measurements.of(inputs, outputs, fitted)
+    measured = whole.thinned(MOST_ROWS)
     few = measured.inputs.size <= _FEW_ROWS
     try:
         with Workers(1 if few else None, console, "models") as workers:
             selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks))
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None
-    return SelectedModel(selection, files.columns.units[output_column], tuple(selection.warnings()))
+    return SelectedModel(selection, files.columns.units[output_column], whole.known, tuple(selection.warnings()))
 
 
 def _carry_out(workers: Workers, tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
