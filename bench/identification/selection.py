@@ -188,8 +188,8 @@ class _Search:
         self.refine(left, _HOPELESS * least)
         self.smooth()
         self.remember()
-        self.with_units()
-        return self.choose()
+        finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
+        return self.choose(self.with_units(finalists))
 
     def screen(self) -> dict[_Kind, Evaluation]:
         """Return each kind at its coarsest, with its best orientation and memory."""
@@ -289,23 +289,24 @@ class _Search:
         for kind, found in zip(chosen, self.carry(tasks), strict=True):
             self.done[kind] += found
 
-    def with_units(self) -> None:
-        """Leave whole units of the excitation out of the best of each structure that is near the best of all."""
+    def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists, those near the best with whole units of the excitation left out too."""
         if not self.measured.units():
-            return
-        finalists = {id(each): (kind, each) for kind in self.kinds for each in self._of_each_size(kind)}
-        least = min(each.rms for _, each in finalists.values())
-        near = [(kind, each) for kind, each in finalists.values() if each.rms <= _NEAR * least]
+            return finalists
+        least = min(each.rms for each in finalists)
+        near = [each for each in finalists if each.rms <= _NEAR * least]
         tasks = [
-            (kind.model, partial(evaluate, self.measured, [each.candidate], with_units=True)) for kind, each in near
+            (each.candidate.model, partial(evaluate, self.measured, [each.candidate], with_units=True))
+            for each in near
+        ]  # fmt: skip
+        found = [
+            replace(one, seconds=one.seconds + each.seconds)
+            for each, (one,) in zip(near, self.carry(tasks), strict=True)
         ]
-        for (kind, each), found in zip(near, self.carry(tasks), strict=True):
-            self.done[kind].remove(each)
-            self.done[kind] += [replace(one, seconds=one.seconds + each.seconds) for one in found]
+        return found + [each for each in finalists if each not in near]
 
-    def choose(self) -> Selection:
+    def choose(self, finalists: list[Evaluation]) -> Selection:
         """Return the table with what is chosen."""
-        finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
         judged = [each for each in finalists if each.units] or self._bounded(finalists)
         best = min(judged, key=lambda each: _score(each).mean())
         within = [each for each in judged if is_within_one_standard_error(each, best)]
