@@ -245,12 +245,11 @@ class _Trial:
         self.measured, self.candidate = measured, candidate
         self.problem = self._set_up(measured.fitted)
         spec, template = self.problem.spec, self.problem.template
-        self.again = (
-            spec.refine is not None
-            or candidate.initial == "estimate"
-            or candidate.smoothing is None
-            or bool(template.shape_parameters().names)
-        )
+        # Two penalties of all rows: to choose them anew in each fold would take longer than all the rest.
+        ridge = None if candidate.smoothing is None else 0.0
+        self.penalties = self.problem.regularization(candidate.smoothing, ridge)
+        refined = spec.refine is not None or bool(template.shape_parameters().names)
+        self.again = refined or candidate.initial == "estimate"
         if self.problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {self.problem.skip}: too few rows are left")
 
@@ -271,9 +270,7 @@ class _Trial:
 
     def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:
         """Return the coefficients for the problem's weights or others, with the penalties of the candidate."""
-        smoothing = self.candidate.smoothing
-        penalties = problem.regularization(smoothing, None if smoothing is None else 0.0)
-        return problem.fit(penalties.smoothing, weights, ridge=penalties.ridge)
+        return problem.fit(self.penalties.smoothing, weights, ridge=self.penalties.ridge)
 
     def leave_out(self, fold: Fold) -> _LeftOut:
         """Fit without a fold; return the errors."""

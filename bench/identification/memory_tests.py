@@ -44,7 +44,7 @@ class MemoryTest:
     holds : bool or None
         Whether the data agree with it; None if they do not tell.
     difference : float
-        RMS difference of what should be equal, output units; nan if nothing was compared.
+        RMS difference of two outputs that should be equal, output units; nan if nothing was compared.
     percent : float
         The same in percent of the range of the output.
     compared : int
@@ -97,8 +97,10 @@ def check_return_points(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
         return MemoryTest(
             name, None, float("nan"), float("nan"), 0, f"{name}: not tested, as no extremum is visited twice"
         )
-    steps = np.concatenate([np.diff(each.outputs) for each in visited])
-    rms, percent, is_small = _measure(steps, y)
+    deviations = np.concatenate([np.array(each.outputs) - np.mean(each.outputs) for each in visited])
+    # Of two visits the difference; of many that move on slowly the whole way counts.
+    spare = deviations.size - len(visited)
+    rms, percent, is_small = _measure(float(np.sqrt(2.0 * (deviations @ deviations) / spare)), y)
     ratchet = _ratchet(visited)
     counts = [len(each.outputs) for each in visited]
     visits = f"{min(counts)} times" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)} times"
@@ -134,7 +136,7 @@ def check_congruency(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
     differences = [difference for group in _branches(u) for difference in _compare(group, u, y)]
     if not differences:
         return _untested(name, "no two loops of one input range lie at different outputs")
-    rms, percent, is_small = _measure(np.concatenate(differences), y)
+    rms, percent, is_small = _measure(float(np.sqrt(np.mean(np.concatenate(differences) ** 2))), y)
     pairs = f"{len(differences)} pair{'' if len(differences) == 1 else 's'} of branches over the same inputs"
     if is_small:
         text = f"{name}: {pairs} agree within {percent:.2g} % of the range"
@@ -164,10 +166,9 @@ def _ratchet(visited: list[_Extremum]) -> float | None:
     return mean if abs(mean) > 0.5 * float(np.sqrt(np.mean(steps**2))) else None
 
 
-def _measure(differences: Floats, y: Floats) -> tuple[float, float, bool]:
-    """Return the RMS of differences, in percent of the range as well, and whether it is small."""
+def _measure(rms: float, y: Floats) -> tuple[float, float, bool]:
+    """Return a difference, in percent of the range as well, and whether it is small."""
     span = float(np.ptp(y)) or 1.0
-    rms = float(np.sqrt(np.mean(differences**2)))
     return rms, 100.0 * rms / span, bool(rms <= np.hypot(_LIMIT * span, _NOISE * _noise(y)))
 
 
@@ -254,7 +255,7 @@ class _Branch:
 def _branches(u: Floats) -> list[list[_Branch]]:
     """Return branches that begin at the same input and go in the same direction, by groups."""
     span = float(np.ptp(u))
-    groups: dict[tuple[int, int], list[_Branch]] = {}
+    found: dict[int, list[_Branch]] = {-1: [], 1: []}
     stack: list[float] = []
     for first, last in _moves(u):
         direction = 1 if u[last] > u[first] else -1
@@ -264,12 +265,19 @@ def _branches(u: Floats) -> list[list[_Branch]]:
         bound = stack[-2] if bounded else float(u[last])
         reach = direction * min(direction * float(u[last]), direction * bound)
         if bounded:
-            key = (direction, round(float(u[first]) / (_SAME * span)))
-            groups.setdefault(key, []).append(_Branch(first, last, reach))
+            found[direction].append(_Branch(first, last, reach))
         while len(stack) > 1 and direction * (u[last] - stack[-2]) >= 0.0:
             del stack[-2:]
         stack.append(float(u[last]))
-    return [group for group in groups.values() if len(group) > 1]
+    groups: list[list[_Branch]] = []
+    for branches in found.values():
+        begin = -np.inf
+        for each in sorted(branches, key=lambda one: float(u[one.first])):
+            if u[each.first] - begin > _SAME * span:
+                groups.append([])
+                begin = float(u[each.first])
+            groups[-1].append(each)
+    return [sorted(group, key=lambda one: one.first) for group in groups if len(group) > 1]
 
 
 def _compare(group: list[_Branch], u: Floats, y: Floats) -> Iterator[Floats]:

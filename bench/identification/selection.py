@@ -40,6 +40,8 @@ SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 # A candidate that errs so many times more than the best on the first folds is given up.
 _HOPELESS = 3.0
+# A kind of no more coefficients than these at its finest costs little: its coarsest says nothing against it.
+_FEW_COEFFICIENTS = 60
 # Structures for which all smoothing weights are tried, and within which factor of the best error.
 _SMOOTHED = 4
 _REMEMBERED = 2
@@ -181,7 +183,7 @@ class _Search:
         self.measured = replace(self.measured, gap=self._gap(min(screened.values(), key=lambda each: each.rms)))
         left = {}
         for kind, each in screened.items():
-            if each.rms > _HOPELESS * least:
+            if each.rms > _HOPELESS * least and self._count(kind, kind.steps - 1) > _FEW_COEFFICIENTS:
                 self.given_up.append(each)
             else:
                 left[kind] = each.candidate
@@ -239,10 +241,14 @@ class _Search:
 
     def _is_too_fine(self, kind: _Kind, step: int) -> bool:
         """Return whether a kind has many more coefficients than there are rows."""
+        return self._count(kind, step) > _MOST_COEFFICIENTS * int(self.measured.tested.sum())
+
+    def _count(self, kind: _Kind, step: int) -> int:
+        """Return the number of coefficients of a kind at a size."""
         template = find_model(kind.model).template
         assert template is not None
         operator: Operator[Any] = template(self.measured.inputs, **kind.options(step))
-        return operator.coefficients.size > _MOST_COEFFICIENTS * int(self.measured.tested.sum())
+        return operator.coefficients.size
 
     def smooth(self) -> None:
         """Try smaller and greater smoothing weights on the structures near the best, until the error rises."""
