@@ -137,6 +137,7 @@ def identify_(
         "ridge": ridge,
         "initial": initial,
         "orientation": orientation,
+        "skip": skip,
     }
     selected = None
     if is_comparison(model):

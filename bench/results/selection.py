@@ -49,7 +49,7 @@ class SelectedModel:
     unit : str
         Unit of the output.
     known : int
-        First row that does not depend on what came before the record.
+        First row that does not depend on what came before the record, after those that were to be left out.
     warnings : tuple of str
         What the held-out errors say against the choice.
     """
@@ -200,7 +200,9 @@ def select_model(
             selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks))
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None
-    return SelectedModel(selection, files.columns.units[output_column], whole.known, tuple(selection.warnings()))
+    return SelectedModel(
+        selection, files.columns.units[output_column], max(whole.known, skip), tuple(selection.warnings())
+    )
 
 
 def _carry_out(workers: Workers, tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
