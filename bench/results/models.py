@@ -39,7 +39,7 @@ from bench.identification import (
     identify,
 )
 from bench.model_file import ModelFile, load_model
-from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.reading.options import ReadingOptions
 from bench.results.starting_state import StartingState, digest, starting_state
 
@@ -198,6 +198,7 @@ def identify_file(
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
+    check_variation(columns, output_column)
     options = {name: value for name, value in options.items() if value is not None}
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
