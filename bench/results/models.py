@@ -43,7 +43,7 @@ from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
-from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.joined_files import fitted_rows, read_files
 from bench.results.reading.options import ReadingOptions
 from bench.results.starting_state import StartingState, digest, starting_state
@@ -237,6 +237,7 @@ def identify_file(
         raise DataError(f"{columns.source}: --skip {skip} leaves {left} of {inputs.size} rows; too few")
     fitted, odd = fitted_rows(files, inputs, train)
     warnings = (*check_excitation(columns, input_column), *odd)
+    check_variation(columns, output_column)
     weights = columns.values[weights_column] if weights_column else None
     if not fitted.all():
         weights = fitted.astype(np.float64) if weights is None else np.where(fitted, weights, 0.0)
