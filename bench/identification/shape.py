@@ -20,6 +20,8 @@ from bench.identification.least_squares import Fit, fit, fit_minimum_norm
 _TOLERANCE = 1e-10
 # Relative step of the differences: a constrained linear fit is exact to about 1e-12.
 _STEP = 1e-6
+# Searches are begun from so many starts: those that fit best as they are.
+_MOST_SEARCHES = 3
 
 
 def fit_operator(
@@ -79,10 +81,11 @@ def fit_shape(
         found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
         return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
 
+    starts = [np.clip(values, low, high) for values in template.shape_starts()]
+    if len(starts) > _MOST_SEARCHES:
+        costs = [float(np.sum(residuals(values) ** 2)) for values in starts]
+        starts = [starts[k] for k in np.argsort(costs, kind="stable")[:_MOST_SEARCHES]]
     options: dict[str, Any] = {"ftol": _TOLERANCE, "xtol": _TOLERANCE, "gtol": _TOLERANCE, "diff_step": _STEP}
-    ends = [
-        least_squares(residuals, np.clip(values, low, high), bounds=(low, high), x_scale="jac", **options)
-        for values in template.shape_starts()
-    ]
+    ends = [least_squares(residuals, values, bounds=(low, high), x_scale="jac", **options) for values in starts]
     # Of equal costs the first is taken, so that the result does not depend on rounding alone.
     return template.with_shape(min(ends, key=lambda end: end.cost).x.tolist())
