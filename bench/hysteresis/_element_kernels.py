@@ -87,7 +87,8 @@ def _exponential(z: float, path: float, loading: float, unloading: float) -> flo
 
 @njit(cache=True, forceinline=True)
 def _slope(z: float, loading: float, unloading: float, exponent: float) -> float:
-    return 1.0 - (loading if z > 0.0 else unloading) * abs(z) ** exponent
+    slope: float = 1.0 - (loading if z > 0.0 else unloading) * abs(z) ** exponent
+    return slope
 
 
 @njit(cache=True)

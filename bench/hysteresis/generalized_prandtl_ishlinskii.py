@@ -157,8 +157,14 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
 
     def with_shape(self, values: Sequence[float]) -> GeneralizedPrandtlIshlinskii:
         """Return the same operator with other envelopes."""
-        names = self.shape_parameters().names
-        return replace(self, **dict(zip(names, values, strict=True)))
+        rising_steepness, rising_centre, falling_steepness, falling_centre = values
+        return replace(
+            self,
+            rising_steepness=rising_steepness,
+            rising_centre=rising_centre,
+            falling_steepness=falling_steepness,
+            falling_centre=falling_centre,
+        )
 
     def shape_starts(self) -> Sequence[Sequence[float]]:
         """Return soft and steep envelopes, together and apart."""

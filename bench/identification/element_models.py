@@ -115,7 +115,7 @@ def _krasnoselskii_pokrovskii(
         raise ValueError(f"plane: expected two increasing inputs, got {low} and {high}")
     width = (high - low) / _count("levels", levels)
     return KrasnoselskiiPokrovskii(
-        low + width * np.arange(levels),
+        low + width * np.arange(levels, dtype=np.float64),
         np.zeros(levels * (levels + 1) // 2),
         width,
         input_range=(min(span[0], low), max(span[1], high)),
