@@ -63,6 +63,13 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
+        ),
+    ] = "auto",
     weights_column: Annotated[
         str | None,
         typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
@@ -96,6 +103,7 @@ def identify_(
             smoothing=smoothing,
             skip=skip,
             initial=initial,
+            orientation=orientation,
             cross_validated=cross_validate,
             weights_column=weights_column,
             levels_to_try=options.levels_to_try,

@@ -102,6 +102,7 @@ class IdentifiedFile:
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
             "smoothing": self.trials.best.smoothing if self.trials else None,
+            "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
@@ -112,7 +113,7 @@ class IdentifiedFile:
 def option_names(model: str) -> tuple[str, ...]:
     """Return the names of the options that `identify_file` takes for a registered model."""
     own = [option.name for option in model_options(find_model(model))]
-    return (*own, "smoothing", "skip", "initial", "cross_validated")
+    return (*own, "smoothing", "skip", "initial", "orientation", "cross_validated")
 
 
 def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -177,7 +178,7 @@ def identify_file(
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
-        `initial` and the options of the model, as in `identify`; None leaves the model's own default.
+        `initial`, `orientation` and the options of the model, as in `identify`; None leaves the default.
 
     Raises
     ------
@@ -197,7 +198,8 @@ def identify_file(
     if levels_to_try:
         options["levels"] = levels_to_try[0]
     try:
-        check_options(model, {name: value for name, value in options.items() if name != "initial"})
+        # These two every model takes.
+        check_options(model, {key: value for key, value in options.items() if key not in ("initial", "orientation")})
     except ValueError as error:
         raise ConfigurationError(str(error)) from None
     names = (input_column, output_column, *((weights_column,) if weights_column else ()))
@@ -238,6 +240,7 @@ def identify_file(
         "skipped": skip,
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "orientation": found.orientation,
     }
     file = ModelFile(model, found.model, memory, provenance)
     return IdentifiedFile(
@@ -360,6 +363,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
         ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
