@@ -92,7 +92,7 @@ class Duhem(ElementOperator):
 
     def shape_parameters(self) -> Shape:
         """Return the rate with its bounds."""
-        return Shape(("rate",), (self.rate,), (0.05,), (50.0,))
+        return Shape(("rate",), (self.rate,), (0.05,), (20.0,))
 
     def with_shape(self, values: Sequence[float]) -> Duhem:
         """Return the same operator with another rate."""
@@ -100,7 +100,7 @@ class Duhem(ElementOperator):
 
     def shape_starts(self) -> Sequence[Sequence[float]]:
         """Return slow to fast relaxation."""
-        return [(0.3,), (1.0,), (3.0,), (8.0,), (20.0,)]
+        return [(0.3,), (1.0,), (3.0,), (8.0,)]
 
     def at_rest(self) -> tuple[float, Floats]:
         """Return the origin, where y = f(x)."""

@@ -24,27 +24,27 @@ _SAMPLES = 401
 
 
 class Envelope(NamedTuple):
-    """A rising map of [-1, 1] onto itself: tanh(steepness (x - centre)), shifted and scaled.
+    """A rising map of [-1, 1] onto itself: tanh(steepness x - offset), shifted and scaled.
 
     Attributes
     ----------
     steepness : float
         > 0; small for a straight line.
-    centre : float
-        Where it is steepest.
+    offset : float
+        0 for a symmetrical map; > 0 for one that is steepest at the high end, < 0 at the low end.
     """
 
     steepness: float
-    centre: float
+    offset: float
 
     def _ends(self) -> tuple[float, float]:
-        low, high = np.tanh(self.steepness * (np.array([-1.0, 1.0]) - self.centre)).tolist()
+        low, high = np.tanh(self.steepness * np.array([-1.0, 1.0]) - self.offset).tolist()
         return low, high
 
     def __call__(self, x: Floats) -> Floats:
         """Return the map of each value."""
         low, high = self._ends()
-        values = np.tanh(self.steepness * (x - self.centre))
+        values = np.tanh(self.steepness * x - self.offset)
         return np.asarray((2.0 * values - low - high) / (high - low))
 
     def inverse(self, drive: float) -> float:
@@ -52,7 +52,7 @@ class Envelope(NamedTuple):
         low, high = self._ends()
         value = 0.5 * (drive * (high - low) + low + high)
         edge = 1.0 - 1e-16
-        return self.centre + float(np.arctanh(min(max(value, -edge), edge))) / self.steepness
+        return (float(np.arctanh(min(max(value, -edge), edge))) + self.offset) / self.steepness
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +71,9 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
         Increasing, from 0 on, as parts of half the envelopes' span.
     weights : array_like, shape (n,)
         Output per unit of the envelopes, output units.
-    rising_steepness, rising_centre : float
+    rising_steepness, rising_offset : float
         Of γ_r, in x: steepness > 0.
-    falling_steepness, falling_centre : float
+    falling_steepness, falling_offset : float
         Of γ_l.
     bias : float
         Constant, output units.
@@ -96,9 +96,9 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
     thresholds: Floats
     weights: Floats
     rising_steepness: float = 1.0
-    rising_centre: float = 0.0
+    rising_offset: float = 0.0
     falling_steepness: float = 1.0
-    falling_centre: float = 0.0
+    falling_offset: float = 0.0
     bias: float = 0.0
     origin: float = 0.0
     input_range: tuple[float, float] = (-1.0, 1.0)
@@ -117,19 +117,19 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
         object.__setattr__(self, "weights", _checks.frozen(weights))
         for name in ("rising_steepness", "falling_steepness"):
             object.__setattr__(self, name, _checks.positive(name, getattr(self, name)))
-        for name in ("rising_centre", "falling_centre", "bias", "origin"):
+        for name in ("rising_offset", "falling_offset", "bias", "origin"):
             object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
         object.__setattr__(self, "input_range", (low, high))
 
     @cached_property
     def rising(self) -> Envelope:
         """The envelope γ_r."""
-        return Envelope(self.rising_steepness, self.rising_centre)
+        return Envelope(self.rising_steepness, self.rising_offset)
 
     @cached_property
     def falling(self) -> Envelope:
         """The envelope γ_l."""
-        return Envelope(self.falling_steepness, self.falling_centre)
+        return Envelope(self.falling_steepness, self.falling_offset)
 
     @cached_property
     def ordered(self) -> bool:
@@ -149,26 +149,26 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
     def shape_parameters(self) -> Shape:
         """Return the four parameters of the envelopes."""
         return Shape(
-            ("rising_steepness", "rising_centre", "falling_steepness", "falling_centre"),
-            (self.rising_steepness, self.rising_centre, self.falling_steepness, self.falling_centre),
-            (0.01, -1.5, 0.01, -1.5),
-            (6.0, 1.5, 6.0, 1.5),
+            ("rising_steepness", "rising_offset", "falling_steepness", "falling_offset"),
+            (self.rising_steepness, self.rising_offset, self.falling_steepness, self.falling_offset),
+            (0.1, -3.0, 0.1, -3.0),
+            (6.0, 3.0, 6.0, 3.0),
         )
 
     def with_shape(self, values: Sequence[float]) -> GeneralizedPrandtlIshlinskii:
         """Return the same operator with other envelopes."""
-        rising_steepness, rising_centre, falling_steepness, falling_centre = values
+        rising_steepness, rising_offset, falling_steepness, falling_offset = values
         return replace(
             self,
             rising_steepness=rising_steepness,
-            rising_centre=rising_centre,
+            rising_offset=rising_offset,
             falling_steepness=falling_steepness,
-            falling_centre=falling_centre,
+            falling_offset=falling_offset,
         )
 
     def shape_starts(self) -> Sequence[Sequence[float]]:
         """Return soft and steep envelopes, together and apart."""
-        return [(0.5, 0.0, 0.5, 0.0), (2.0, 0.0, 2.0, 0.0), (2.0, 0.3, 2.0, -0.3)]
+        return [(0.5, 0.0, 0.5, 0.0), (2.0, 0.0, 2.0, 0.0), (2.0, 0.6, 2.0, -0.6)]
 
     def _x(self, inputs: Floats) -> Floats:
         low, high = self.input_range

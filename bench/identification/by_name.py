@@ -22,7 +22,7 @@ from bench.identification.orientation import (
     has_orientation,
     possible_signs,
 )
-from bench.identification.shape import fit_operator, fit_shape
+from bench.identification.shape import fit_operator, fit_shape, undetermined_shape
 
 M = TypeVar("M", bound=Operator[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
@@ -184,6 +184,7 @@ class FitProblem:
         coverage = self.template.coverage(self.inputs, self.state)
         if coverage is not None and coverage.never.size:
             found.append(coverage.summary())
+        found += undetermined_shape(self.template)
         return tuple(found)
 
 

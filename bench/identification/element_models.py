@@ -62,7 +62,7 @@ def _bouc_wen(
 def _duhem(
     inputs: Floats,
     *,
-    degree: Annotated[int, OptionHelp("of the curve that the output relaxes to")] = 5,
+    degree: Annotated[int, OptionHelp("of the curve that the output relaxes to")] = 3,
     origin: _Origin = None,
     input_range: InputRange = None,
     input_unit: str = "",

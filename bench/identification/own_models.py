@@ -80,8 +80,8 @@ def _preisach(
     inputs: Floats,
     *,
     levels: _Levels = 20,
-    spacing: _Spacing = "uniform",
     plane: _Plane = None,
+    spacing: _Spacing = "uniform",
     reversible: Annotated[ReversibleKind, OptionHelp("part without memory, beside the density")] = "none",
     degree: Annotated[int | None, OptionHelp("of the reversible part 'polynomial'", "5")] = None,
     input_range: InputRange = None,
@@ -119,8 +119,8 @@ def _nonmonotonic(
     inputs: Floats,
     *,
     levels: _Levels = 20,
-    spacing: _Spacing = "uniform",
     plane: _Plane = None,
+    spacing: _Spacing = "uniform",
     reference: Annotated[
         float | None, OptionHelp("input at which the thermal term is zero", "the low end of the operating range")
     ] = None,

@@ -37,14 +37,14 @@ def maxwell_slip(sign=1.0):
 
 
 def generalized(sign=1.0, ordered=True):
-    centres = (0.3, -0.2) if ordered else (-0.2, 0.3)
+    offsets = (0.45, -0.3) if ordered else (-0.3, 0.45)
     return GeneralizedPrandtlIshlinskii(
         [0.0, 0.2, 0.5],
         sign * np.array([0.6, 0.3, 0.4]),
         1.5,
-        centres[0],
+        offsets[0],
         1.5,
-        centres[1],
+        offsets[1],
         0.2,
         0.0,
         RANGE,

@@ -31,7 +31,7 @@ def plants():
         "bouc-wen": BoucWen(1.0, -0.6, 0.3, 3.0, 1.0, 1.0, 2.0, 0.0, RANGE),
         "duhem": Duhem([0.8, 0.1, -0.1], [0.3, 0.0, 0.1], 3.0, 0.3, 0.0, RANGE),
         "generalized-prandtl-ishlinskii": GeneralizedPrandtlIshlinskii(
-            np.arange(15) / 15, rng.uniform(0.0, 0.2, 15), 2.0, 0.3, 1.5, -0.3, 0.2, 0.0, RANGE
+            np.arange(15) / 15, rng.uniform(0.0, 0.2, 15), 2.0, 0.6, 1.5, -0.45, 0.2, 0.0, RANGE
         ),
         "krasnoselskii-pokrovskii": KrasnoselskiiPokrovskii(
             -2.0 + 4.0 / 15 * np.arange(15), rng.uniform(0.0, 0.02, 120), 4.0 / 15, 0.2, RANGE
@@ -103,3 +103,12 @@ def test_the_relaxed_state_of_a_heater_is_at_the_low_end(name):
 def test_a_wrong_option_is_refused(name, options, words):
     with pytest.raises(ValueError, match=words):
         identify(name, inputs_of(100), np.zeros(100), **options)
+
+
+def test_a_shape_that_the_data_do_not_determine_is_said():
+    inputs = inputs_of()
+    quick, slow = (Duhem([0.8], [2.0], rate, input_range=RANGE).evaluate(inputs) for rate in (100.0, 3.0))
+    found = identify("duhem", inputs, quick, degree=1)
+    assert any("rate = 20 is at the end of its range" in warning for warning in found.warnings)
+    found = identify("duhem", inputs, slow, degree=1)
+    assert not any("at the end of its range" in warning for warning in found.warnings)
