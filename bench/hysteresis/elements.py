@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -80,11 +81,10 @@ class ElementOperator(Operator[ElementState]):
         sequence = _checks.samples("inputs", inputs)
         present, elements = self._split(state)
         outputs = np.empty(sequence.size)
-        coefficients = self.coefficients
-        rows = max(1, _BLOCK // coefficients.size)
+        rows = max(1, _BLOCK // self._weights.size)
         for first in range(0, sequence.size, rows):
             block = sequence[first : first + rows]
-            outputs[first : first + rows] = self.respond(block, present, elements) @ coefficients
+            outputs[first : first + rows] = self.respond(block, present, elements) @ self._weights
             present = float(block[-1])
         return self.bias + outputs, (present, *elements.tolist())
 
@@ -95,8 +95,19 @@ class ElementOperator(Operator[ElementState]):
         """
         if not math.isfinite(value):
             raise ValueError(f"value: expected a finite number, got {value}")
-        outputs, after = self._run(np.array([value], dtype=np.float64), state)
-        return after, float(outputs[0])
+        if len(state) != self._size:
+            raise ValueError(f"state: expected {self._size} numbers, got {len(state)}")
+        elements = np.array(state[1:])
+        row = self.respond(np.array([value], dtype=np.float64), state[0], elements)[0]
+        return (float(value), *elements.tolist()), self.bias + float(row @ self._weights)
+
+    @cached_property
+    def _size(self) -> int:
+        return 1 + self.at_rest()[1].size
+
+    @cached_property
+    def _weights(self) -> Floats:
+        return self.coefficients
 
     def regressor(self, inputs: ArrayLike, state: ElementState | None = None) -> Regressor:
         """Return the dense columns of the elements; errors as `evaluate`."""

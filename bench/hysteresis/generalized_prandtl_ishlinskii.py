@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -38,8 +39,7 @@ class Envelope(NamedTuple):
     offset: float
 
     def _ends(self) -> tuple[float, float]:
-        low, high = np.tanh(self.steepness * np.array([-1.0, 1.0]) - self.offset).tolist()
-        return low, high
+        return math.tanh(-self.steepness - self.offset), math.tanh(self.steepness - self.offset)
 
     def __call__(self, x: Floats) -> Floats:
         """Return the map of each value."""
@@ -52,7 +52,7 @@ class Envelope(NamedTuple):
         low, high = self._ends()
         value = 0.5 * (drive * (high - low) + low + high)
         edge = 1.0 - 1e-16
-        return (float(np.arctanh(min(max(value, -edge), edge))) + self.offset) / self.steepness
+        return (math.atanh(min(max(value, -edge), edge)) + self.offset) / self.steepness
 
 
 @dataclass(frozen=True, eq=False)

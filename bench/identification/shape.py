@@ -89,8 +89,8 @@ def fit_shape(
         starts = [starts[k] for k in np.argsort(costs, kind="stable")[:_MOST_SEARCHES]]
 
     def search(values: Floats, tolerance: float, most: int) -> Any:  # noqa: ANN401 - scipy's result
-        ends: dict[str, Any] = {"ftol": tolerance, "xtol": tolerance, "gtol": tolerance, "max_nfev": most}
-        return least_squares(residuals, values, bounds=(low, high), x_scale="jac", diff_step=_STEP, **ends)
+        ends: dict[str, Any] = {"ftol": tolerance, "xtol": tolerance, "gtol": tolerance, "diff_step": _STEP}
+        return least_squares(residuals, values, bounds=(low, high), x_scale="jac", max_nfev=most, **ends)
 
     if len(starts) > 1:
         # Of equal costs the first is taken, so that the result does not depend on rounding alone.
