@@ -23,7 +23,7 @@ class MaxwellSlip(ElementOperator):
 
     Each element is a massless block on dry friction behind a spring: its deformation e_i follows the input u until
     its force stiffness_i e_i reaches ± the slip force, and there slips (Lampaert, Al-Bender and Swevers, 2003;
-    Goldfarb and Celanovic 1997 for piezo actuators). It is a Prandtl-Ishlinskii operator with stops in place of
+    Goldfarb and Celanovic 1997). It is a Prandtl-Ishlinskii operator with stops in place of
     plays: the output leads the input, and saturates where there is no spring.
 
     Parameters

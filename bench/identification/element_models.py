@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
@@ -31,8 +31,10 @@ def _ranges(inputs: Floats, input_range: tuple[float, float] | None) -> tuple[fl
     return input_span(inputs, "input_range") if input_range is None else input_range
 
 
-def _resting(span: tuple[float, float], origin: float | None) -> float:
-    return min(max(0.0, span[0]), span[1]) if origin is None else origin
+def _placed(span: tuple[float, float], origin: float | None, input_unit: str, output_unit: str) -> dict[str, Any]:
+    """Return what every operator of elements with an origin takes."""
+    rest = min(max(0.0, span[0]), span[1]) if origin is None else origin
+    return {"origin": rest, "input_range": span, "input_unit": input_unit, "output_unit": output_unit}
 
 
 def _count(name: str, value: int) -> int:
@@ -52,10 +54,7 @@ def _bouc_wen(
     span = _ranges(inputs, input_range)
     return BoucWen(
         scale=0.5 * (span[1] - span[0]),
-        origin=_resting(span, origin),
-        input_range=span,
-        input_unit=input_unit,
-        output_unit=output_unit,
+        **_placed(span, origin, input_unit, output_unit),
     )
 
 
@@ -73,10 +72,7 @@ def _duhem(
     return Duhem(
         zeros,
         zeros,
-        origin=_resting(span, origin),
-        input_range=span,
-        input_unit=input_unit,
-        output_unit=output_unit,
+        **_placed(span, origin, input_unit, output_unit),
     )
 
 
@@ -93,10 +89,7 @@ def _generalized_prandtl_ishlinskii(
     return GeneralizedPrandtlIshlinskii(
         np.arange(_count("plays", plays)) / plays,
         np.zeros(plays),
-        origin=_resting(span, origin),
-        input_range=span,
-        input_unit=input_unit,
-        output_unit=output_unit,
+        **_placed(span, origin, input_unit, output_unit),
     )
 
 
@@ -144,10 +137,7 @@ def _maxwell_slip(
     return MaxwellSlip(
         reach * np.arange(1, _count("elements", elements) + 1) / elements,
         np.zeros(elements),
-        origin=_resting(span, origin),
-        input_range=span,
-        input_unit=input_unit,
-        output_unit=output_unit,
+        **_placed(span, origin, input_unit, output_unit),
     )
 
 
