@@ -85,7 +85,7 @@ def _model_options(
     ] = None,
 ) -> ModelOptions:
     """Return what the command line says of a model; its signature is that of the options."""
-    named = {
+    named: dict[str, Any] = {
         "spacing": spacing, "plane": plane, "reversible": reversible, "degree": degree, "plays": plays,
         "maximum": maximum, "origin": origin, "dead_zones": dead_zones,
     }  # fmt: skip

@@ -23,7 +23,7 @@ from bench.identification.orientation import (
     possible_signs,
 )
 from bench.identification.regularization import Regularization, choose_regularization
-from bench.identification.shape import fit_operator, fit_shape
+from bench.identification.shape import fit_operator, fit_shape, undetermined_shape
 from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 
 M = TypeVar("M", bound=Operator[Any])
@@ -210,6 +210,7 @@ class FitProblem:
         coverage = self.template.coverage(self.inputs, self.state)
         if coverage is not None and coverage.never.size:
             found.append(coverage.summary())
+        found += undetermined_shape(self.template)
         return tuple(found)
 
 

@@ -22,7 +22,8 @@ def reversals(inputs: Floats) -> Floats:
     moved = np.concatenate([[True], np.diff(inputs) != 0.0])
     path = inputs[moved]
     turns = np.sign(np.diff(path[:-1])) != np.sign(np.diff(path[1:]))
-    return path[np.concatenate([[True], turns, [True]])] if path.size > 2 else path
+    kept = np.concatenate([[True], turns, [True]]) if path.size > 2 else np.ones(path.size, dtype=bool)
+    return np.asarray(path[kept], dtype=np.float64)
 
 
 def quantile_levels(inputs: Floats, plane: tuple[float, float], count: int) -> Floats:
@@ -55,4 +56,4 @@ def quantile_levels(inputs: Floats, plane: tuple[float, float], count: int) -> F
     steps = np.maximum(np.diff(levels), _LEAST * (high - low) / count)
     levels = low + np.concatenate([[0.0], np.cumsum(steps)]) * (high - low) / steps.sum()
     levels[-1] = high
-    return levels
+    return np.asarray(levels, dtype=np.float64)

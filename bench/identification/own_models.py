@@ -66,7 +66,11 @@ def _operating(inputs: Floats, plane: tuple[float, float], given: tuple[float, f
     return min(float(inputs.min()), plane[0]), max(float(inputs.max()), plane[1])
 
 
-def _input_span(inputs: Floats, name: str) -> tuple[float, float]:
+def input_span(inputs: Floats, name: str) -> tuple[float, float]:
+    """Return the least and the greatest input.
+
+    Raises ValueError if they are the same: names the option that would help.
+    """
     low, high = float(inputs.min()), float(inputs.max())
     if low == high:
         raise ValueError(f"inputs: constant at {low}; give {name} or inputs that vary")
@@ -77,8 +81,8 @@ def _preisach(
     inputs: Floats,
     *,
     levels: _Levels = 20,
-    spacing: _Spacing = "uniform",
     plane: _Plane = None,
+    spacing: _Spacing = "uniform",
     reversible: Annotated[ReversibleKind, OptionHelp("part without memory, beside the density")] = "none",
     degree: Annotated[int | None, OptionHelp("of the reversible part 'polynomial'", "5")] = None,
     input_range: InputRange = None,
@@ -86,7 +90,7 @@ def _preisach(
     output_unit: str = "",
 ) -> Preisach:
     if plane is None and isinstance(levels, int | np.integer):
-        plane = _input_span(inputs, "plane")
+        plane = input_span(inputs, "plane")
     lattice = _lattice(inputs, levels, plane or (0.0, 0.0), spacing)
     middle = 0.5 * float(lattice[0] + lattice[-1])
     span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
@@ -116,8 +120,8 @@ def _nonmonotonic(
     inputs: Floats,
     *,
     levels: _Levels = 20,
-    spacing: _Spacing = "uniform",
     plane: _Plane = None,
+    spacing: _Spacing = "uniform",
     reference: Annotated[
         float | None, OptionHelp("input at which the thermal term is zero", "the low end of the operating range")
     ] = None,
@@ -148,7 +152,7 @@ def _polynomial(
 ) -> Polynomial:
     if degree < 1:
         raise ValueError(f"degree: expected at least 1, got {degree}")
-    span = _input_span(inputs, "input_range") if input_range is None else input_range
+    span = input_span(inputs, "input_range") if input_range is None else input_range
     return Polynomial(np.zeros(degree), span, input_unit=input_unit, output_unit=output_unit)
 
 
@@ -188,7 +192,7 @@ def _prandtl_ishlinskii(
         raise ValueError(f"plays: expected at least 1, got {plays}")
     if dead_zones < 0:
         raise ValueError(f"dead_zones: expected an integer >= 0, got {dead_zones!r}")
-    low, high = _input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
+    low, high = input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
     if high <= low:
         raise ValueError(f"maximum: expected a positive number, got {maximum}")
     return PrandtlIshlinskii(

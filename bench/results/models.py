@@ -222,9 +222,8 @@ def identify_file(
     if levels_to_try:
         options["levels"] = levels_to_try[0]
     try:
-        check_options(
-            model, {name: value for name, value in options.items() if name not in ("initial", "orientation")}
-        )
+        # These two every model takes.
+        check_options(model, {key: value for key, value in options.items() if key not in ("initial", "orientation")})
     except ValueError as error:
         raise ConfigurationError(str(error)) from None
     names = (input_column, output_column, *((weights_column,) if weights_column else ()))

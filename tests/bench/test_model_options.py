@@ -46,6 +46,32 @@ def test_the_options_of_plays(bench, table):
     assert operator.after.thresholds.size == 3
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "model",
+    ["bouc-wen", "duhem", "generalized-prandtl-ishlinskii", "krasnoselskii-pokrovskii", "maxwell-slip"],
+)
+def test_a_model_of_elements_predicts_and_inverts_what_it_was_identified_from(bench, table, model, sign):
+    name = table.parent / "falling.csv"
+    header, *rows = table.read_text().splitlines()
+    values = [row.split(",") for row in rows]
+    name.write_text("\n".join([header, *(f"{u},{sign * float(y)},{w}" for u, y, w in values)]) + "\n")
+    _, found, _ = identify(bench, name, "--model", model)
+    assert found["rms_percent"] < 10.0
+    result, path = table.parent / "result.json", table.parent / "model.json"
+    code, _, err = bench("predict", path, name, *COLUMNS, "--out", table.parent / "o.csv", "--json", result)
+    assert code == 0, err
+    assert json.loads(result.read_text())["rms"] == pytest.approx(found["rms"], rel=1e-9)
+    code, _, err = bench(
+        "invert", path, table.parent / "o.csv", "--column", "predicted", "--out", table.parent / "i.csv",
+        "--json", result,
+    )  # fmt: skip
+    assert code == 0, err
+    inverted = json.loads(result.read_text())
+    assert inverted["met"] == inverted["targets"]
+    assert inverted["largest_residual"] < 1e-9
+
+
 def test_of_several_levels_cross_validation_chooses(bench, table):
     operator, found, out = identify(bench, table, "--model", "preisach", "--levels", "4,20")
     assert "cross-validation" in out
