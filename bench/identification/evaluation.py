@@ -244,12 +244,12 @@ class _Trial:
     def __init__(self, measured: Measurements, candidate: Candidate) -> None:
         self.measured, self.candidate = measured, candidate
         self.problem = self._set_up(measured.fitted)
-        spec, template = self.problem.spec, self.problem.template
+        spec = self.problem.spec
         # Two penalties of all rows: to choose them anew in each fold would take longer than all the rest.
         ridge = None if candidate.smoothing is None else 0.0
         self.penalties = self.problem.regularization(candidate.smoothing, ridge)
-        refined = spec.refine is not None or bool(template.shape_parameters().names)
-        self.again = refined or candidate.initial == "estimate"
+        # The few shape parameters are those of all rows too.
+        self.again = spec.refine is not None or candidate.initial == "estimate"
         if self.problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {self.problem.skip}: too few rows are left")
 

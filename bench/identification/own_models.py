@@ -168,7 +168,7 @@ def _polynomial_plays(
     for name, value in (("degree", degree), ("plays", plays)):
         if value < 1:
             raise ValueError(f"{name}: expected at least 1, got {value}")
-    low, high = _input_span(inputs, "input_range") if input_range is None else input_range
+    low, high = input_span(inputs, "input_range") if input_range is None else input_range
     thresholds = 0.5 * (high - low) * np.arange(1, plays + 1) / (plays + 1)
     return PolynomialPlays(
         np.zeros(degree), thresholds, np.zeros(plays), (low, high), input_unit=input_unit, output_unit=output_unit

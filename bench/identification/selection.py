@@ -376,6 +376,9 @@ class _Search:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
+        if template.shape_parameters().names and self.given.initial is None:
+            # Each set-up is a search for the shape; the others are tried on the best only.
+            memories = (None, "skip")
         weight: float | None = 0.0
         if self._has_plane[kind]:
             weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing

@@ -22,7 +22,7 @@ from bench.results.models import IdentifiedFile, errors_json
 from bench.results.reading.options import ReadingOptions
 from bench.workers import Workers
 
-MOST_ROWS = 5000
+MOST_ROWS = 4000
 """Rows by which models are compared: of more, evenly chosen ones; the chosen model is fitted to all."""
 
 # Fewer are compared in less time than worker processes take to start.
