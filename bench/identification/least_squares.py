@@ -323,6 +323,9 @@ class _Factor:
             block = block[np.ix_(good, good)]
         added = int(np.count_nonzero(good))
         self.size = old + added
+        if not old and added > self.upper.shape[0]:
+            self.upper = np.ascontiguousarray(block.T)
+            return good
         if self.size > self.upper.shape[0]:
             room = max(64, self.size + self.size // 2)
             grown = np.zeros((room, room))
@@ -658,7 +661,7 @@ class _ActiveSet:
         coarse.minimise()
         values = (coarse.x / coarse.norms)[:count]
         chosen = signed.copy()
-        chosen[: self.cells] &= self.layout.around(values[parents] > 0.0)
+        chosen[: self.cells] &= values[parents] > 0.0
         self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
         self.x *= self.norms
         return np.flatnonzero(chosen)
