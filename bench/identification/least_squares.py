@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
+from bench.identification.cholesky_factor import DEPENDENT, MANY, CholeskyFactor
+from bench.identification.collapse import LONG, collapse
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# A column whose squared distance from the span of the passive ones falls below this part of its squared norm
-# counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
-# all that is left to enter, the threshold is lowered step by step.
-_DEPENDENT = (1e-12, 1e-13, 1e-14)
 _TOLERANCE = 1e-12
 # A gradient that is zero but for rounding.
 _LEVEL = 1e-11
@@ -163,8 +161,11 @@ def fit_cells(
     y, w = _cost(regressor, outputs, weights, skip)
     constrained = np.broadcast_to(np.asarray(nonnegative, dtype=bool), (regressor.shape[1],))
     check_penalties(smoothing, ridge)
+    samples, left = int(np.count_nonzero(w)), 0.0
+    if y.size >= LONG and (short := collapse(regressor, y, w)) is not None:
+        regressor, y, w, left = short.regressor, short.outputs, short.weights, short.left
     with one_thread():
-        return _ActiveSet(regressor, y, w, constrained, layout, smoothing, ridge).solve()
+        return _ActiveSet(regressor, y, w, constrained, layout, smoothing, ridge).solve(samples, left)
 
 
 def fit_minimum_norm(
@@ -276,90 +277,6 @@ def one_thread() -> Any:  # noqa: ANN401
     return _blas().limit(limits=1, user_api="blas")
 
 
-class _Factor:
-    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go."""
-
-    def __init__(self) -> None:
-        self.upper = np.zeros((0, 0))
-        self.size = 0
-        self.threshold = _DEPENDENT[0]
-
-    @property
-    def compact(self) -> Floats:
-        """Lower factor, a copy as LAPACK wants it."""
-        return np.array(self.upper[: self.size, : self.size], order="C").T
-
-    def append(self, cross: Floats, square: Floats) -> int | None:
-        """Add columns, given their products with the present ones, shape (size, p), and with each other.
-
-        Return None, or the first that depends on those before it; the ones before that are added then.
-        """
-        from scipy.linalg.blas import dsyrk, dtrsm
-        from scipy.linalg.lapack import dpotrf
-
-        old, more = cross.shape
-        if not more:
-            return None
-        if old + more > self.upper.shape[0]:
-            room = max(64, old + more + (old + more) // 2)
-            grown = np.zeros((room, room))
-            grown[:old, :old] = self.upper[:old, :old]
-            self.upper = grown
-        rest = np.asfortranarray(square)
-        if old:
-            side = dtrsm(1.0, self.compact, np.asfortranarray(cross), lower=1, overwrite_b=1)
-            rest = dsyrk(-1.0, side, beta=1.0, c=rest, trans=1, lower=1)
-            self.upper[:old, old : old + more] = side
-        block, info = dpotrf(rest, lower=1, clean=1)
-        good = more if info == 0 else info - 1
-        # Pivots below the threshold would pass as rounding noise.
-        small = np.flatnonzero(np.diag(block)[:good] ** 2 < self.threshold * np.diag(square)[:good])
-        if small.size:
-            good = int(small[0])
-        self.upper[old : old + good, old : old + good] = block[:good, :good].T
-        self.size = old + good
-        return None if good == more else good
-
-    def truncate(self, size: int) -> None:
-        """Keep the first columns only."""
-        self.size = size
-
-    def delete(self, places: Indices) -> None:
-        """Remove the columns at increasing places."""
-        from bench.identification import _kernels
-
-        for place in places[::-1]:
-            _kernels.delete_column(self.upper, self.size, place)
-            self.size -= 1
-
-    def solve(self, right: Floats) -> Floats:
-        from bench.identification import _kernels
-
-        return np.asarray(_kernels.solve_factored(self.upper, self.size, right))
-
-    def lengths(self, first: Floats, second: Floats) -> tuple[float, float]:
-        """Return the norms of two steps in the outputs they cause."""
-        from bench.identification import _kernels
-
-        one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
-        return float(one), float(two)
-
-    def inverse(self) -> Floats:
-        """Return the lower half of the inverse of the Gram block."""
-        from scipy.linalg.lapack import dpotri
-
-        lower, _ = dpotri(self.compact, lower=1)
-        return np.asarray(lower)
-
-    def condition(self, gram: Floats) -> float:
-        from scipy.linalg.lapack import dpocon
-
-        if not gram.size:
-            return 1.0
-        reciprocal, _ = dpocon(self.compact, np.abs(gram).sum(axis=0).max(), uplo="L")
-        return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))
-
-
 class _ActiveSet:
     """The working state of one constrained fit, in centred and scaled columns.
 
@@ -431,7 +348,7 @@ class _ActiveSet:
         self.known = np.empty(0, dtype=np.int64)
         self.place = np.full(count, -1, dtype=np.int64)
         self.gram = np.zeros((0, 0))
-        self.factor = _Factor()
+        self.factor = CholeskyFactor()
         self.passive = np.empty(0, dtype=np.int64)
         self.iterations = 0
 
@@ -439,12 +356,7 @@ class _ActiveSet:
         """Return the scaled columns' products with the weighted residual."""
         from bench.identification import _kernels
 
-        v = self.w * residual
-        v -= self.w * (v.sum() / self.total)
-        result = np.empty(self.regressor.shape[1])
-        result[: self.cells] = _kernels.gradient(self.columns, v[::-1].cumsum()[::-1].copy())
-        result[: self.cells] /= self.norms[: self.cells]
-        result[self.cells :] = self.extra.T @ v
+        result = np.asarray(_kernels.products(self.columns, self.norms, self.extra, self.w, self.total, residual))
         result[~self.usable] = 0.0
         return result
 
@@ -475,45 +387,53 @@ class _ActiveSet:
         size = self.known.size
         self.place[new] = np.arange(old, size)
         if size > self.gram.shape[0]:
-            grown = np.zeros((2 * size, 2 * size))
+            room = size + size // 2
+            grown = np.zeros((room, room))
             grown[:old, :old] = self.gram[:old, :old]
             self.gram = grown
-        rows = np.empty((new.size, size))
-        _kernels.gram_rows(
-            self.columns,
-            self.regressor.base,
-            self.cell_means,
-            self.norms[: self.cells],
-            self.w,
-            self.extra,
-            new,
-            self.known,
-            rows,
-        )
-        if self.penalty is not None:
-            r, c = np.flatnonzero(new < self.cells), np.flatnonzero(self.known < self.cells)
-            rows[np.ix_(r, c)] += self.penalty[new[r]][:, self.known[c]].toarray()
-        self.gram[old:size, :size] = rows
-        self.gram[:size, old:size] = rows.T
+        for first in range(0, new.size, MANY):
+            block = new[first : first + MANY]
+            rows = np.empty((block.size, size))
+            _kernels.gram_rows(
+                self.columns,
+                self.regressor.base,
+                self.cell_means,
+                self.norms[: self.cells],
+                self.w,
+                self.extra,
+                block,
+                self.known,
+                rows,
+            )
+            if self.penalty is not None:
+                r, c = np.flatnonzero(block < self.cells), np.flatnonzero(self.known < self.cells)
+                rows[np.ix_(r, c)] += self.penalty[block[r]][:, self.known[c]].toarray()
+            place = slice(old + first, old + first + block.size)
+            self.gram[place, :size] = rows
+            self.gram[:size, place] = rows.T
 
     def products_of(self, first: Indices, second: Indices) -> Floats:
         """Return the Gram entries of two sets of known columns."""
         return np.asarray(self.gram[self.place[first][:, None], self.place[second]])
 
+    def largest_row(self, columns: Indices) -> float:
+        """Return the greatest sum of magnitudes of a row of the Gram block of known columns."""
+        blocks = (columns[k : k + MANY] for k in range(0, columns.size, MANY))
+        return max((float(np.abs(self.products_of(b, columns)).sum(axis=1).max()) for b in blocks), default=0.0)
+
     def enter(self, columns: Indices) -> Indices:
         """Add columns to the passive set; return those left out because they depend on it."""
-        dropped: list[int] = []
-        while columns.size:
-            self.iterations += 1
-            bad = self.factor.append(self.products_of(self.passive, columns), self.products_of(columns, columns))
-            good = columns.size if bad is None else bad
-            self.passive = np.concatenate([self.passive, columns[:good]])
-            if bad is None:
-                break
-            dropped.append(int(columns[bad]))
-            self.x[columns[bad]] = 0.0
-            columns = columns[bad + 1 :]
-        return np.array(dropped, dtype=np.int64)
+        if not columns.size:
+            return columns
+        self.iterations += 1
+        # Transposed, as LAPACK wants them.
+        good = self.factor.append(self.products_of(columns, self.passive).T, self.products_of(columns, columns).T)
+        if good is None:
+            half = columns.size // 2
+            return np.concatenate([self.enter(columns[:half]), self.enter(columns[half:])])
+        self.passive = np.concatenate([self.passive, columns[good]])
+        self.x[columns[~good]] = 0.0
+        return columns[~good]
 
     def leave(self, gone: Flags) -> Indices:
         """Take columns out of the passive set; return those that turn out dependent on the way."""
@@ -562,9 +482,10 @@ class _ActiveSet:
             self.x[passive] = moved
             barred.append(self.leave(leave))
 
-    def solve(self) -> Fit:
+    def solve(self, samples: int, left: float) -> Fit:
+        """Return the solution, of so many samples, with so much left of the outputs beside the residual sum."""
         self.minimise()
-        return self.result()
+        return self.result(samples, left)
 
     def minimise(self) -> None:
         """Find the passive set and the coefficients."""
@@ -579,7 +500,7 @@ class _ActiveSet:
             barred[self.enter(first)] = True
             barred[self.settle(bold=True)] = True
         bold, gain = True, self.gain()
-        stricter = iter(_DEPENDENT[1:])
+        stricter = iter(DEPENDENT[1:])
         for _ in range(100 + 3 * self.x.size):
             g = self.refine()
             g[self.passive] = 0.0
@@ -640,7 +561,7 @@ class _ActiveSet:
         coarse.minimise()
         values = (coarse.x / coarse.norms)[:count]
         chosen = signed.copy()
-        chosen[: self.cells] &= self.layout.around(values[parents] > 0.0)
+        chosen[: self.cells] &= values[parents] > 0.0
         self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
         self.x *= self.norms
         return np.flatnonzero(chosen)
@@ -675,7 +596,7 @@ class _ActiveSet:
         rows, columns = inside[block.row], inside[block.col]
         return float(self.passive.size - block.data @ inverse[np.maximum(rows, columns), np.minimum(rows, columns)])
 
-    def result(self) -> Fit:
+    def result(self, samples: int, left: float) -> Fit:
         passive = self.passive
         g = self.slope()
         held = np.ones(self.x.size, dtype=bool)
@@ -686,9 +607,9 @@ class _ActiveSet:
         uncertainties = np.full(self.x.size, np.nan)
         inverse = self.factor.inverse() if passive.size else np.zeros((0, 0))
         effective = self.effective(inverse)
-        spare = np.count_nonzero(self.w) - 1.0 - effective
+        spare = samples - 1.0 - effective
         if spare > 0.5:
-            variance = float(self.w @ self.residual() ** 2) / spare
+            variance = (float(self.w @ self.residual() ** 2) + left) / spare
             uncertainties[:] = 0.0
             uncertainties[passive] = np.sqrt(variance * np.diag(inverse)) / self.norms[passive]
         certificate = Certificate(
@@ -697,7 +618,7 @@ class _ActiveSet:
             active=self.x.size - passive.size,
             # A column that could enter without a gain depends on the passive ones, all of which can give way.
             exchangeable=int(np.count_nonzero(held & self.usable & (np.abs(g) <= _LEVEL * self.size))),
-            condition=self.factor.condition(self.products_of(passive, passive)),
+            condition=self.factor.condition(self.largest_row(passive)),
             swept=self.swept,
             iterations=self.iterations,
             converged=kkt <= 1e-10,

@@ -41,7 +41,7 @@ from bench.identification import (
 from bench.identification.memory_tests import MemoryTest, check_congruency, check_return_points
 from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
-from bench.identification.resolution import AFFORDABLE, Resolution, resolve
+from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.joined_files import fitted_rows, read_files
@@ -250,13 +250,13 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            penalties = SMOOTHING if cross_validated else (smoothing or 0.0,)
+            tried = SMOOTHING if cross_validated else (smoothing or 0.0,)
             ridge = ridge or 0.0
             trials = cross_validate(
                 model,
                 inputs,
                 outputs,
-                smoothing=penalties,
+                smoothing=tried,
                 ridge=ridge,
                 levels=orders,
                 weights=weights,
@@ -278,12 +278,12 @@ def identify_file(
     warnings += (*found.warnings, *(test.text for test in tests if test.holds is False))
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
     resolution: Resolution | None = None
-    if coverage is not None and coverage.swept.size <= AFFORDABLE:
+    if coverage is not None:
         regressor = found.model.regressor(inputs, found.initial_state)
-        chosen = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
         counting = np.ones(inputs.size) if weights is None else weights
-        resolution = resolve(regressor, counting, found.skip, chosen.smoothing, chosen.ridge)
+        resolution = resolve(regressor, counting, found.skip, penalties.smoothing, penalties.ridge)
     provenance = {
         "source": ", ".join(each.name for each in paths),
         "input": input_column,
@@ -294,6 +294,8 @@ def identify_file(
         "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "smoothing": penalties.smoothing,
+        "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
     file = ModelFile(model, found.model, memory, provenance, found.initial_state)
