@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
 from bench.errors import ConfigurationError
@@ -45,6 +46,9 @@ def compare_(
             min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
         ),
     ] = 0,
+    bands: BandsOption = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -59,30 +63,41 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or figures or reading != ReadingOptions():
+        of_models = (input_column, output_column, skip, bands, recalibrate, recalibrate_rows, figures)
+        if any(of_models) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --figures and how a file is read are for models, with --data FILE"
+                "--input, --output, --skip, --bands, --recalibrate, --figures and how a file is read are for models, "
+                "with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
         return
     from bench.results.models import compare_models
+    from bench.results.recalibrations import Session
 
+    session = Session.parse(recalibrate, recalibrate_rows)
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
-        result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
+        result = compare_models(
+            compared, data, input_column, output_column, skip=skip, session=session, reading=reading
+        )
     print_assumptions(data, result.assumptions)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
-    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
+    mended_heads = ("recalibrated max", "recalibrated RMS") if session else ()
+    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS", *mended_heads):
         table.add_column(column, justify="right")
     for name, entry in result.comparisons.items():
         raw, mended = entry.raw, entry.rezeroed
+        recalibrated = result.recalibrated(name)
+        more = (f"{recalibrated.maximum:.4g}", f"{recalibrated.rms:.4g}") if recalibrated else ()
         table.add_row(
             name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
-            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+            f"{mended.maximum:.4g}", f"{mended.rms:.4g}", *more,
         )  # fmt: skip
     console.print(table)
+    for name, examined in result.examined.items():
+        print_examined(examined, name, bands=bands)
     if figures is not None:
         from bench.results.report import draw_comparison
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.table import Table
 
+from bench.cli.band_options import BandOption, RecalibrateOption, RecalibrateRowsOption, print_band, print_examined
 from bench.cli.console import (
     JsonOption,
     check_outputs,
@@ -87,6 +88,7 @@ def identify_(
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
+    band: BandOption = False,
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
@@ -100,6 +102,7 @@ def identify_(
     printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings are
     taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`.
     """
+    from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file
 
     check_outputs(out=out, figures=figures, json_file=json_file)
@@ -118,6 +121,7 @@ def identify_(
             initial=initial,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
+            band=band,
             reading=reading,
         )
     print_assumptions(file, found.assumptions)
@@ -127,6 +131,8 @@ def identify_(
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
+    if (banded := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+        print_band(banded)
     if out is not None:
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
@@ -150,20 +156,25 @@ def predict_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
     continue_memory: ContinueMemory = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
     json_file: JsonOption = None,
     *,
     reading: ReadingOptions,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
-    Writes a CSV file with the input column and `predicted`.
+    Writes a CSV file with the input column and `predicted`; `predicted lower` and `predicted upper` if the model has
+    a prediction band. With `--recalibrate` the predictions are those for the session of the measured output.
     """
-    from bench.identification import measure_errors
     from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
-    from bench.results.models import check_unit, errors_json, outside_of_range, predict
+    from bench.results.examined import examine
+    from bench.results.models import check_unit, errors_json, outside_of_range
+    from bench.results.recalibrations import Session
 
     check_outputs(out=out, json_file=json_file)
+    session = Session.parse(recalibrate, recalibrate_rows)
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
@@ -172,11 +183,16 @@ def predict_(
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
-    predicted = predict(model, inputs, continue_memory=continue_memory)
-    write_csv(out, [input_column, "predicted"], [inputs, predicted])
-    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
-    if output_column:
-        errors = measure_errors(columns.values[output_column], predicted)
+    state = model.memory if continue_memory else None
+    measured = columns.values[output_column] if output_column else None
+    found = examine(model, inputs, measured, state=state, session=session)
+    bands = found.band.columns(found.predicted) if found.band else []
+    heads = [input_column, "predicted", *(head for head, _ in bands)]
+    write_csv(out, heads, [inputs, found.predicted, *(values for _, values in bands)])
+    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
+    print_examined(found)
+    if measured is not None:
+        errors = found.errors()
         result |= errors_json(errors)
         unit = model.operator.output_unit
         print_rows(
@@ -277,9 +293,11 @@ def invert(
 
     Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
-    `too low`; what cannot be met is clamped to the nearest reachable value).
+    `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
+    its ends for the set-point, by the local slope, and for the output there.
     """
     from bench.model_file import load_model
+    from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, invert_targets
     from bench.units import header_with_unit
@@ -292,6 +310,8 @@ def invert(
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
     found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
+    banded = invert_band(model, found.setpoints, found.passing, model.memory if continue_memory else None)
+    bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
     header = [
         header_with_unit(name, unit)
         for name, unit in (
@@ -299,7 +319,10 @@ def invert(
         )
     ]  # fmt: skip
     passing = ["" if value != value else value for value in found.passing.tolist()]
-    write_csv(out, header, [found.targets, passing, found.setpoints, found.predicted, list(found.flags)])
+    written = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
+    write_csv(out, [*header, *(head for head, _ in bands)], [*written, *(values for _, values in bands)])
+    if banded is not None:
+        print_band(banded.outputs)
     counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
     two = sum(value != "" for value in passing)
     console.print(
@@ -320,5 +343,6 @@ def invert(
             "through_saturation": two,
             "largest_residual": float(max(met)) if met else None,
             "out": str(out),
+            **({"band": banded.outputs.to_json()} if banded else {}),
         },
     )

@@ -26,6 +26,18 @@ _TRIALS = 41
 _WORST = 1e5
 
 
+def parse_kinds(text: str) -> tuple[Kind, ...]:
+    """Return the kinds of a text such as `offset,gain`.
+
+    Raises ValueError if one is unknown or given twice, or there is none.
+    """
+    named = [part.strip() for part in text.split(",") if part.strip()]
+    found = tuple(kind for kind in KINDS if kind in named)
+    if not found or len(found) != len(named):
+        raise ValueError(f"recalibrate {text!r}: expected some of {', '.join(KINDS)}, each once, with commas")
+    return found
+
+
 @dataclass(frozen=True)
 class Recalibration:
     """What moved between two sessions.
@@ -157,7 +169,7 @@ def recalibrate(
     def predicted(moved: float) -> Floats:
         return operator.evaluate(u + moved, state)[skip:]
 
-    linear = [kind for kind in wanted if kind != "input-offset"]
+    linear: list[Kind] = [kind for kind in wanted if kind != "input-offset"]
 
     def columns(model: Floats) -> Floats:
         by_kind = {"offset": np.ones_like(model), "gain": model, "drift": numbers}
@@ -168,7 +180,7 @@ def recalibrate(
         model = predicted(moved)
         matrix = columns(model)
         fixed = np.zeros_like(model) if "gain" in linear else model
-        found = np.linalg.lstsq(matrix, y - fixed, rcond=None)[0]
+        found: Floats = np.linalg.lstsq(matrix, y - fixed, rcond=None)[0].astype(np.float64)
         return found, y - fixed - matrix @ found, model
 
     moved = _best_shift(operator, solve) if "input-offset" in wanted else 0.0
@@ -179,10 +191,10 @@ def recalibrate(
         slope = (predicted(moved + step) - predicted(moved - step)) / (2.0 * step)
         gain = float(found[linear.index("gain")]) if "gain" in linear else 1.0
         jacobian = np.column_stack([jacobian, gain * slope])
-    values = dict(
-        zip([*linear, *(["input-offset"] if "input-offset" in wanted else [])], [*found, moved], strict=True)
-    )
-    errors = dict(zip(values, _uncertainties(jacobian, residuals, list(values)), strict=True))
+    # In the order of the Jacobian's columns.
+    names: list[Kind] = [*linear, *(kind for kind in wanted if kind == "input-offset")]
+    values: dict[Kind, float] = dict(zip(names, [*found.tolist(), moved], strict=False))
+    errors = dict(zip(names, _uncertainties(jacobian, residuals, names).tolist(), strict=True))
     return Recalibration(
         values={kind: values[kind] for kind in wanted},
         uncertainties={kind: errors[kind] for kind in wanted},

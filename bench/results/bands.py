@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.hysteresis import Operator
-from bench.identification.bands import Band
+from bench.identification.bands import Band, calibrate_band
+from bench.identification.by_name import set_up_problem
 from bench.model_file import ModelFile
 from bench.units import header_with_unit
 
@@ -58,7 +60,8 @@ class BandedPrediction:
         """Return the band in a line, with its coverage of measured outputs if their residuals are given."""
         width = f"± {np.median(self.half_widths):.4g} {self.unit}".rstrip()
         covered = "" if residuals is None else f"; covers {100 * self.coverage(residuals):.1f} % of the rows measured"
-        return f"{100 * self.band.level:g} % band: {width} (median); calibrated on {self.band.calibrated_on.kind}{covered}"
+        kind = self.band.calibrated_on.kind
+        return f"{100 * self.band.level:g} % band: {width} (median); calibrated on {kind}{covered}"
 
     def warning(self) -> str:
         """Return a warning if the inputs are not of the class of the band, else an empty text."""
@@ -120,7 +123,7 @@ class BandedTargets:
         The band of the output at each set-point.
     setpoints : ndarray, shape (N,)
         Half-width about each set-point within which the target is met: that of the output over the local slope, in
-        input units; nan where the output does not move with the input.
+        input units; nan where that is more than the operating range, as the output hardly moves with the input.
     """
 
     outputs: BandedPrediction
@@ -165,7 +168,9 @@ def invert_band(model: ModelFile, setpoints: Floats, passing: Floats, state: Any
     together = None if found.simultaneous is None else found.simultaneous[places]
     at = BandedPrediction(found.band, found.half_widths[places], together, found.departures, found.unit)
     with np.errstate(divide="ignore", invalid="ignore"):
-        widths = np.where(slopes == 0.0, np.nan, at.half_widths / np.abs(slopes))
+        widths = at.half_widths / np.abs(slopes)
+    low, high = model.operator.input_range
+    widths = np.where(widths <= high - low, widths, np.nan)
     return BandedTargets(at, widths)
 
 
@@ -189,3 +194,19 @@ def _arrival_slopes(operator: Operator[Any], path: Floats, state: Any) -> Floats
         memory, _ = operator.step(memory, value)
         before = value
     return np.array(slopes)
+
+
+def calibrate(
+    model_name: str, inputs: Floats, outputs: Floats, skip: int, smoothing: float, options: Mapping[str, Any]
+) -> Band:
+    """Return the band of the model that `identify` finds with the same arguments; errors as `calibrate_band`."""
+    options = dict(options)
+    initial = options.pop("initial", None)
+    problem = set_up_problem(model_name, inputs, outputs, None, skip, smoothing, initial, options)
+    return calibrate_band(problem, smoothing)
+
+
+def band_json(model: ModelFile, inputs: Floats, state: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return the entry `band` of a result for programs; empty without a band. Arguments as `predict_band`."""
+    found = predict_band(model, inputs, state)
+    return {} if found is None else {"band": {**found.to_json(), "held_out": found.band.held_out}}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,11 @@ from bench.identification import (
     identify,
 )
 from bench.model_file import ModelFile, load_model
+from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.examined import Examined, examine
 from bench.results.reading.options import ReadingOptions
+from bench.results.recalibrations import Session
 
 Floats = npt.NDArray[np.float64]
 
@@ -105,6 +108,7 @@ class IdentifiedFile:
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
+            **band_json(self.file, self.inputs, found.initial_state),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
@@ -153,6 +157,7 @@ def identify_file(
     smoothing: float = 0.0,
     skip: int = 0,
     cross_validated: bool = False,
+    band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
@@ -172,6 +177,8 @@ def identify_file(
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
+    band : bool
+        Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
@@ -208,6 +215,7 @@ def identify_file(
             trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
             smoothing = trials.best.smoothing
         found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
+        calibrated = calibrate(model, inputs, outputs, skip, smoothing, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
@@ -222,7 +230,7 @@ def identify_file(
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
     }
-    file = ModelFile(model, found.model, memory, provenance)
+    file = ModelFile(model, found.model, memory, provenance, calibrated)
     return IdentifiedFile(
         file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
     )
@@ -362,18 +370,32 @@ class ComparedModels:
         Unit of the output.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
+    examined : mapping of str to Examined
+        The session recalibrated and the band of each model, by the same names.
     """
 
     comparisons: Mapping[str, Comparison]
     unit: str
     assumptions: str = ""
+    examined: Mapping[str, Examined] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
         return {
-            name: {"raw": errors_json(entry.raw), "rezeroed": errors_json(entry.rezeroed), "offset": entry.offset}
+            name: {
+                "raw": errors_json(entry.raw),
+                "rezeroed": errors_json(entry.rezeroed),
+                "offset": entry.offset,
+                **(self.examined[name].to_json() if name in self.examined else {}),
+                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
+            }
             for name, entry in self.comparisons.items()
         }
+
+    def recalibrated(self, name: str) -> Errors | None:
+        """Return a model's errors after recalibration, over the same rows as the others; None without one."""
+        found = self.examined.get(name)
+        return None if found is None or found.recalibration is None else found.errors()
 
 
 def compare_models(
@@ -383,6 +405,7 @@ def compare_models(
     output_column: str | None,
     *,
     skip: int = 0,
+    session: Session | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -397,6 +420,8 @@ def compare_models(
         Columns; those that the first model was identified from if None.
     skip : int
         First rows that drive the memory but do not count.
+    session : Session, optional
+        What is estimated of the session for each model; the rows that it uses do not count either.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -417,13 +442,16 @@ def compare_models(
     if not 0 <= skip < inputs.size:
         raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
     operators: dict[str, Operator[Any]] = {}
+    examined: dict[str, Examined] = {}
     for path, file in zip(paths, files, strict=True):
         check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
         check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = file.operator
-    comparisons = compare(operators, inputs, outputs, skip=skip)
-    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions)
+        examined[name] = examine(file, inputs, outputs, session=session, skip=skip)
+    first = skip if session is None else session.first_unused(inputs.size, skip)
+    comparisons = compare(operators, inputs, outputs, skip=first)
+    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions, examined)
 
 
 def assess_designs(
