@@ -319,7 +319,7 @@ def invert(
         )
     ]  # fmt: skip
     passing = ["" if value != value else value for value in found.passing.tolist()]
-    written = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
+    written: list[Any] = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
     write_csv(out, [*header, *(head for head, _ in bands)], [*written, *(values for _, values in bands)])
     if banded is not None:
         print_band(banded.outputs)

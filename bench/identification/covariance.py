@@ -80,7 +80,9 @@ class PredictionVariance:
             raise ValueError(f"band: belongs to a model of more than {self.columns[-1]} coefficients, not {count}")
         variance = np.full(regressor.shape[0], self.constant)
         direction = np.zeros(count)
-        for vector in self.factor.T:
+        for column in self.factor.T:
+            # Contiguous, so that what was read from a file gives the same to the last bit.
+            vector = np.ascontiguousarray(column)
             direction[self.columns] = vector
             variance += (regressor.product(direction) - self.means @ vector) ** 2
         return variance
@@ -115,9 +117,9 @@ class PredictionVariance:
         columns = np.array(read("columns"), dtype=np.int64)
         means = np.array(read("means").split(), dtype=np.float64)
         directions = [np.array(text.split(), dtype=np.float64) for text in read("factor")]
+        if any(vector.shape != columns.shape or not np.isfinite(vector).all() for vector in (means, *directions)):
+            raise ValueError("band: variance: expected as many finite means and factors as columns")
         factor = np.reshape(directions, (len(directions), columns.size)).T
-        if means.shape != columns.shape or not (np.isfinite(means).all() and np.isfinite(factor).all()):
-            raise ValueError("band: variance: expected as many finite means as columns, and finite factors")
         if columns.size and (columns[0] < 0 or (np.diff(columns) <= 0).any()):
             raise ValueError("band: variance: expected columns that increase from 0 on")
         return cls(**numbers, columns=columns, means=means, factor=factor)
