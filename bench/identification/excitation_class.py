@@ -25,8 +25,8 @@ _MOST = 0.8
 # Fewer reversals than this say nothing of a class.
 _FEWEST = 4
 _DECILES = np.linspace(0.0, 1.0, 11)
-# Factor of the two-sample Kolmogorov-Smirnov statistic that equal distributions exceed in 1 % of the cases.
-_SMIRNOV = 1.63
+# Factor of the two-sample Kolmogorov-Smirnov statistic that equal distributions exceed in 5 % of the cases.
+_SMIRNOV = 1.36
 
 DAMPED = "damped oscillations"
 GROWING = "growing oscillations"
@@ -104,7 +104,7 @@ class ExcitationClass:
 
         They are of the class if they stay in its range (to 3 % of it), are of its kind, die out at the same place (to
         3 % of the range) if they are damped oscillations, and the distributions of the
-        swings and of the turning points differ by no more than two samples of one distribution do in 99 % of the
+        swings and of the turning points differ by no more than two samples of one distribution do in 95 % of the
         cases (two-sample Kolmogorov-Smirnov test on the deciles; the turning points of one sequence depend on each
         other, so the level is nominal).
 

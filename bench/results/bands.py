@@ -200,9 +200,11 @@ def calibrate(
     model_name: str, inputs: Floats, outputs: Floats, skip: int, smoothing: float, options: Mapping[str, Any]
 ) -> Band:
     """Return the band of the model that `identify` finds with the same arguments; errors as `calibrate_band`."""
-    options = dict(options)
-    initial = options.pop("initial", None)
-    problem = set_up_problem(model_name, inputs, outputs, None, skip, smoothing, initial, options)
+    own = dict(options)
+    initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
+    problem = set_up_problem(
+        model_name, inputs, outputs, None, skip, smoothing, initial, own, orientation=orientation
+    )
     return calibrate_band(problem, smoothing)
 
 

@@ -42,7 +42,7 @@ PLANTS = {"bouc-wen": bouc_wen, "duhem": duhem}
 
 
 def random_reversals(rng):
-    return ramps([-1.0, 1.0, *rng.uniform(-1.0, 1.0, 50).tolist()], STEP)
+    return ramps([-1.0, 1.0, *rng.uniform(-1.0, 1.0, 60).tolist()], STEP)
 
 
 def damped(rng, center=0.0):

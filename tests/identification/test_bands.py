@@ -84,6 +84,16 @@ def test_scale_and_offset_of_the_output_go_through():
         np.testing.assert_allclose(wider.half_widths(large, inputs), widths, rtol=1e-3)
 
 
+def test_a_falling_output_has_the_band_of_the_rising_one():
+    rng = np.random.default_rng(4)
+    inputs = random_reversals(rng)
+    outputs = measured("duhem", inputs, rng)
+    model, band = calibrated(PREISACH, inputs, outputs)
+    falling, other = calibrated(PREISACH, inputs, -outputs)
+    assert other.pointwise == pytest.approx(band.pointwise, rel=1e-3)
+    np.testing.assert_allclose(other.half_widths(falling, inputs), band.half_widths(model, inputs), rtol=1e-3)
+
+
 def test_the_record_is_not_cut_and_skipped_rows_do_not_count():
     rng = np.random.default_rng(5)
     inputs = random_reversals(rng)
