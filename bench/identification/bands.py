@@ -130,14 +130,26 @@ class Band:
             )
         return factor * self.spread(operator, inputs, state)
 
-    def departures(self, operator: Operator[Any], inputs: Floats, state: Any = None) -> tuple[str, ...]:  # noqa: ANN401
+    def departures(self, inputs: Floats, spread: Floats) -> tuple[str, ...]:
         """Return in which ways a sequence is not of the class of the calibration; none if the band holds for it.
 
         Beside those of `ExcitationClass.departures`: more than 10 % of the samples are worse determined by the data
-        of the fit than all samples of the calibration. Arguments and errors as `spread`.
+        of the fit than all samples of the calibration.
+
+        Parameters
+        ----------
+        inputs : ndarray, shape (N,)
+            Input units.
+        spread : ndarray, shape (N,)
+            What `spread` returns for them.
+
+        Raises
+        ------
+        ValueError
+            If the inputs are empty or not finite.
         """
         found = list(self.calibrated_on.departures(inputs))
-        worse = float((self.spread(operator, inputs, state) > 1.001 * self.greatest).mean())
+        worse = float((spread > 1.001 * self.greatest).mean())
         if worse > _OUTSIDE:
             found.append(f"{100 * worse:.0f} % of its rows rest on parts of the model that the data hardly determine")
         return tuple(found)
@@ -285,11 +297,10 @@ def _blocks(size: int, used: Indices, count: int, turns: Indices) -> Indices:
 
 def _correlation_lag(residuals: Floats, most: int) -> int:
     """Return the first lag at which the residuals' autocorrelation is below 2 / √N, at least 1 and at most `most`."""
-    total = float(residuals @ residuals)
-    lag = 1
-    while lag < most and abs(float(residuals[lag:] @ residuals[:-lag])) > 2.0 * total / np.sqrt(residuals.size):
-        lag += 1
-    return lag
+    spectrum = np.fft.rfft(residuals, 2 * residuals.size)
+    products = np.fft.irfft(np.abs(spectrum) ** 2)[: max(most, 1)]
+    small = np.flatnonzero(np.abs(products) <= 2.0 * products[0] / np.sqrt(residuals.size))
+    return max(int(small[0]) if small.size else most, 1)
 
 
 def _with_gap(left_out: Flags, lag: int, turns: Indices) -> Flags:
@@ -297,8 +308,10 @@ def _with_gap(left_out: Flags, lag: int, turns: Indices) -> Flags:
 
     A branch of which a part is left out is left out altogether: what was measured on the rest of it tells it.
     """
-    near = np.convolve(left_out, np.ones(2 * lag + 1), mode="same")[: left_out.size] > 0.5
-    branch = np.searchsorted(turns, np.arange(left_out.size), side="right")
+    counted = np.concatenate([[0], np.cumsum(left_out)])
+    rows = np.arange(left_out.size)
+    near = counted[np.minimum(rows + lag + 1, rows.size)] > counted[np.maximum(rows - lag, 0)]
+    branch = np.searchsorted(turns, rows, side="right")
     touched = np.zeros(turns.size + 1, dtype=bool)
     touched[branch[near]] = True
     whole = touched[branch]

@@ -126,14 +126,15 @@ class ExcitationClass:
         points = _reversals(values)
         upper, lower = _turning(points)
         swings = np.abs(np.diff(points)) / max(span, 1e-300)
-        for name, deciles, sample, tolerance, size in (
-            ("swings", self.swings, swings, _TOLERANCE, self.reversals + 1),
-            ("upper reversals", self.highs, upper, margin, self.reversals // 2),
-            ("lower reversals", self.lows, lower, margin, self.reversals // 2),
+        # A turning point belongs to two swings: half of them are independent, at most.
+        limit = _SMIRNOV * float(np.sqrt(2.0 / max(self.reversals, 1) + 2.0 / max(other.reversals, 1)))
+        for name, deciles, sample, tolerance in (
+            ("swings", self.swings, swings, _TOLERANCE),
+            ("upper reversals", self.highs, upper, margin),
+            ("lower reversals", self.lows, lower, margin),
         ):
             if not deciles or not sample.size:
                 continue
-            limit = _SMIRNOV * float(np.sqrt(1.0 / max(size, 1) + 1.0 / sample.size))
             distance = _distance(deciles, sample, tolerance)
             if distance > limit:
                 found.append(f"its {name} are distributed otherwise (distance {distance:.2f}, allowed {limit:.2f})")

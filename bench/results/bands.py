@@ -108,7 +108,7 @@ def predict_band(model: ModelFile, inputs: Floats, state: Any = None) -> BandedP
         band,
         band.pointwise * spread,
         None if band.simultaneous is None else band.simultaneous * spread,
-        band.departures(operator, inputs, state),
+        band.departures(inputs, spread),
         operator.output_unit,
     )
 

@@ -120,7 +120,7 @@ def model_options(model: str) -> tuple[str, ...]:
     own = inspect.signature(template).parameters if template is not None else {}
     # The first takes the inputs; the units are those of the columns.
     names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "skip", "initial", "orientation", "cross_validated")
+    return (*names, "smoothing", "skip", "initial", "orientation", "cross_validated", "band")
 
 
 def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
