@@ -15,6 +15,9 @@ from protocols.preparation import ControlledParameters, Part, reset, reset_unkno
 SESSION = "session"
 """Label of the steps that visit known set-points."""
 
+# Where the rig file has none for its drive, s: protocols that take no other readings need none.
+_DWELL = 8.0
+
 
 class SessionParameters(ControlledParameters):
     """What can be set where a session may be estimated before a controller by a model drives the specimen."""
@@ -29,7 +32,11 @@ class SessionParameters(ControlledParameters):
         120, unit="1", low=10, high=10000, help="readings for that, on one loop from `reset` to `hottest` and back"
     )
     recalibrate_dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold before each of these readings"
+        from_slot("drive", "dwell", fallback=_DWELL),
+        unit="s",
+        low=0.01,
+        high=3600,
+        help="hold before each of these readings",
     )
 
 
