@@ -12,6 +12,7 @@ from rich.text import Text
 from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.models import InitialOption
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -41,11 +42,15 @@ def compare_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
     skip: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the models' own data those "
+            "that their identifications left out.",
         ),
-    ] = 0,
+    ] = None,
+    initial: InitialOption = None,
     bands: BandsOption = False,
     recalibrate: RecalibrateOption = None,
     recalibrate_rows: RecalibrateRowsOption = None,
@@ -63,10 +68,11 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        of_models = (input_column, output_column, skip, bands, recalibrate, recalibrate_rows, figures)
+        of_models = (input_column, output_column, skip, initial, bands, recalibrate, recalibrate_rows, figures)
         if any(of_models) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --bands, --recalibrate, --figures and how a file is read are for models, "
+                "--input, --output, --skip, --initial, --bands, --recalibrate, --figures and how a file is read are "
+                "for models, "
                 "with --data FILE"
             )
         check_outputs(json_file=json_file)
@@ -79,9 +85,18 @@ def compare_(
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
         result = compare_models(
-            compared, data, input_column, output_column, skip=skip, session=session, reading=reading
+            compared,
+            data,
+            input_column,
+            output_column,
+            skip=skip,
+            initial=initial,
+            session=session,
+            reading=reading,
         )
     print_assumptions(data, result.assumptions)
+    if result.skip:
+        console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     mended_heads = ("recalibrated max", "recalibrated RMS") if session else ()

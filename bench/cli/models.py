@@ -37,7 +37,16 @@ ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A mod
 ContinueMemory = Annotated[
     bool,
     typer.Option(
-        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        "--continue-memory", help="Start from the memory at the end of the model's data, not at their start."
+    ),
+]
+InitialOption = Annotated[
+    str | None,
+    typer.Option(
+        "--initial",
+        metavar="KIND",
+        help="Memory at the first row: file (that at the start of the model's data; if not given), negative or "
+        "positive saturation, or unknown: skip the rows that it could reach.",
     ),
 ]
 
@@ -163,6 +172,16 @@ def predict_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
+    skip: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the model's own data those "
+            "that its identification left out.",
+        ),
+    ] = None,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     recalibrate: RecalibrateOption = None,
     recalibrate_rows: RecalibrateRowsOption = None,
@@ -173,13 +192,16 @@ def predict_(
     """Apply a model to a column of inputs, row by row.
 
     Writes a CSV file with the input column and `predicted`; `predicted lower` and `predicted upper` if the model has
-    a prediction band. With `--recalibrate` the predictions are those for the session of the measured output.
+    a prediction band. The model starts from the memory that it had at the start of its own data, so that on these
+    data the errors are those of `bench identify`. With `--recalibrate` the predictions are those for the session of
+    the measured output.
     """
     from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
     from bench.results.examined import examine
     from bench.results.models import check_unit, errors_json, outside_of_range
     from bench.results.recalibrations import Session
+    from bench.results.starting_state import starting_state
 
     check_outputs(out=out, json_file=json_file)
     session = Session.parse(recalibrate, recalibrate_rows)
@@ -191,9 +213,9 @@ def predict_(
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
-    state = model.memory if continue_memory else None
+    start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
     measured = columns.values[output_column] if output_column else None
-    found = examine(model, inputs, measured, state=state, session=session)
+    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip)
     bands = found.band.columns(found.predicted) if found.band else []
     heads = [input_column, "predicted", *(head for head, _ in bands)]
     write_csv(out, heads, [inputs, found.predicted, *(values for _, values in bands)])
@@ -201,11 +223,12 @@ def predict_(
     print_examined(found)
     if measured is not None:
         errors = found.errors()
-        result |= errors_json(errors)
+        result |= {**errors_json(errors), "skipped": found.first}
         unit = model.operator.output_unit
         print_rows(
             f"{model.name} on {file.name}",
             (
+                ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
                 ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
@@ -292,6 +315,7 @@ def invert(
         PolicyOption,
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
@@ -308,6 +332,7 @@ def invert(
     from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, invert_targets
+    from bench.results.starting_state import starting_state
     from bench.units import header_with_unit
 
     check_outputs(out=out, json_file=json_file)
@@ -317,8 +342,11 @@ def invert(
     print_assumptions(file, columns.assumptions)
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
-    found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
-    banded = invert_band(model, found.setpoints, found.passing, model.memory if continue_memory else None)
+    found = invert_targets(
+        model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
+    )
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    banded = invert_band(model, found.setpoints, found.passing, start.state)
     bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
     header = [
         header_with_unit(name, unit)

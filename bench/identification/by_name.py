@@ -22,6 +22,7 @@ from bench.identification.orientation import (
     possible_signs,
 )
 from bench.identification.shape import fit_operator, fit_shape
+from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 
 M = TypeVar("M", bound=Operator[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
@@ -51,7 +52,7 @@ class Identification(Generic[M]):
     initial_state : object
         State before the first sample from which the model was fitted.
     warnings : tuple of str
-        What is odd about the data or not covered by them.
+        What is odd about the data or not covered by them, and why the fit should not be trusted; see `judge_fit`.
     orientation : {"rising", "falling"} or None
         Whether the output rises or falls with the input; None for a model whose coefficients have either sign.
     """
@@ -139,18 +140,22 @@ def identify(
         model_name, inputs, outputs, weights, skip, smoothing, initial, options, orientation=orientation
     )
     solution = problem.fit(smoothing)
+    if initial == "skip":
+        check_interpolation(problem, solution)
     model = problem.template.with_coefficients(solution.coefficients, solution.bias)
     predicted = model.evaluate(problem.inputs, problem.state)
+    residuals = problem.outputs - predicted
+    doubts = judge_fit(problem, solution, residuals, initial=initial, smoothing=smoothing)
     return Identification(
         model_name=model_name,
         model=model,
-        residuals=problem.outputs - predicted,
+        residuals=residuals,
         errors=measure_errors(problem.outputs[problem.skip :], predicted[problem.skip :]),
         uncertainties=solution.uncertainties,
         certificate=solution.certificate,
         skip=problem.skip,
         initial_state=problem.state,
-        warnings=problem.warnings(),
+        warnings=(*problem.warnings(), *doubts),
         orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
     )
 
@@ -231,7 +236,9 @@ def set_up_problem(
         raise ValueError(f"options of {model_name}: {error}") from None
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
+        check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)
     counted = counted_weights(sequence.size, w, skip)
+    check_record(sequence, measured, skip)
     signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
     problems = {
         sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial) for sign in signs
