@@ -58,7 +58,10 @@ def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> No
 
     if found.recalibration is not None:
         rows = session_rows(found.recalibration, found.predicted.size, found.units)
-        print_rows(f"recalibration{f' of {name}' if name else ''}", rows)
+        errors = found.errors()
+        after = f"max {errors.maximum:.4g}, RMS {errors.rms:.4g} {found.units[1]}".rstrip()
+        title = f"recalibration of {name}" if name else "recalibration"
+        print_rows(title, [*rows, ("errors after it", after)])
     if bands and found.band is not None:
         print_band(found.band, found.residuals, name)
     elif bands and name:

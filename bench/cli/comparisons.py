@@ -99,16 +99,13 @@ def compare_(
         console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
-    mended_heads = ("recalibrated max", "recalibrated RMS") if session else ()
-    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS", *mended_heads):
+    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
         table.add_column(column, justify="right")
     for name, entry in result.comparisons.items():
         raw, mended = entry.raw, entry.rezeroed
-        recalibrated = result.recalibrated(name)
-        more = (f"{recalibrated.maximum:.4g}", f"{recalibrated.rms:.4g}") if recalibrated else ()
         table.add_row(
             name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
-            f"{mended.maximum:.4g}", f"{mended.rms:.4g}", *more,
+            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
         )  # fmt: skip
     console.print(table)
     for name, examined in result.examined.items():

@@ -195,6 +195,7 @@ def test_compare_recalibrates_each_model(bench, model, files, tmp_path):
     assert code == 0
     assert "recalibration of model" in out
     entry = json.loads(result.read_text())["model"]
+    assert f"max {entry['recalibrated']['max']:.4g}, RMS {entry['recalibrated']['rms']:.4g} mm" in out
     assert entry["recalibrated"]["rms"] < 0.5 * entry["raw"]["rms"]
     assert entry["recalibration"]["errors_from_row"] == 401
 
