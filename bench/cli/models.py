@@ -77,7 +77,18 @@ def identify_(
         str | None,
         typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
     ] = None,
-    smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None,
     skip: Annotated[
         int,
         typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
@@ -133,6 +144,7 @@ def identify_(
             plane=plane,
             reversible=reversible,
             smoothing=smoothing,
+            ridge=ridge,
             skip=skip,
             initial=initial,
             orientation=orientation,

@@ -203,7 +203,7 @@ _NUMBERS: Mapping[str, type[int] | type[float]] = {
 }
 
 
-def calibrate_band(problem: FitProblem, smoothing: float = 0.0, *, level: float = LEVEL) -> Band:
+def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0.0, *, level: float = LEVEL) -> Band:
     """Return the prediction band of the model that fits a problem.
 
     It costs ten fits of the coefficients; the shape parameters and the initial memory are those of all samples.
@@ -214,8 +214,8 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, *, level: float 
     ----------
     problem : FitProblem
         The problem, as `set_up_problem` makes it.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float
+        Weights of the penalties on roughness and size.
     level : float
         Nominal coverage, between 0 and 1.
 
@@ -228,9 +228,9 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, *, level: float 
         raise ValueError(f"level: expected a number between 0 and 1, got {level}")
     used = np.flatnonzero(problem.weights > 0.0)
     used = used[used >= problem.skip]
-    found = problem.fit(smoothing)
+    found = problem.fit(smoothing, ridge=ridge)
     residuals = _residuals(problem, found)
-    variance = prediction_variance(problem, found, smoothing)
+    variance = prediction_variance(problem, found, smoothing, ridge)
     spread = np.sqrt(variance.residual**2 + variance.of(problem.regressor))
     count = min(_BLOCKS, used.size // _FEWEST_ROWS)
     if count < 2:
@@ -246,7 +246,7 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, *, level: float 
         weights = np.where(_with_gap(left_out, lag, turns), 0.0, problem.weights)
         if np.count_nonzero(weights[problem.skip :]) < 2:
             raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
-        other = problem.fit(smoothing, weights)
+        other = problem.fit(smoothing, weights, ridge)
         apart = _residuals(problem, other)
         known = ~_extrapolated(problem, found, other, weights, variance.residual)
         errors[left_out & known] = apart[left_out & known]

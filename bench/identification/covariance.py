@@ -19,7 +19,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.by_name import FitProblem
 from bench.identification.cell_layout import CellLayout, Indices
 from bench.identification.excitation import ramps
-from bench.identification.least_squares import Fit, _ActiveSet, _cost, _one_thread
+from bench.identification.least_squares import Fit, _ActiveSet, _cost, one_thread
 
 MOST_COLUMNS = 1500
 """Beyond so many free coefficients their covariance is left out: the uncertainty of a prediction then is constant."""
@@ -125,7 +125,7 @@ class PredictionVariance:
         return cls(**numbers, columns=columns, means=means, factor=factor)
 
 
-def prediction_variance(problem: FitProblem, found: Fit, smoothing: float) -> PredictionVariance:
+def prediction_variance(problem: FitProblem, found: Fit, smoothing: float, ridge: float = 0.0) -> PredictionVariance:
     """Return the variance of a fitted problem's predictions.
 
     Parameters
@@ -133,9 +133,9 @@ def prediction_variance(problem: FitProblem, found: Fit, smoothing: float) -> Pr
     problem : FitProblem
         The problem.
     found : Fit
-        What `problem.fit(smoothing)` returned.
-    smoothing : float
-        Weight of the roughness penalty.
+        What `problem.fit(smoothing, ridge=ridge)` returned.
+    smoothing, ridge : float
+        Weights of the penalties on roughness and size.
 
     Raises
     ------
@@ -145,12 +145,13 @@ def prediction_variance(problem: FitProblem, found: Fit, smoothing: float) -> Pr
     y, w = _cost(problem.regressor, problem.outputs, problem.weights, problem.skip)
     used = w > 0.0
     residuals = (y - found.bias - problem.regressor.product(found.coefficients))[used]
-    constrained = problem.spec.constrained
-    chosen = np.flatnonzero(found.coefficients if constrained else found.certificate.swept)
+    # Without signs and penalties the coefficients are those of the least norm.
+    definite = problem.spec.constrained or smoothing > 0.0 or ridge > 0.0
+    chosen = np.flatnonzero(found.coefficients if definite else found.certificate.swept)
     root = means = np.empty(0)
-    with _one_thread():
+    with one_thread():
         if 0 < chosen.size <= MOST_COLUMNS:
-            chosen, means, root, freedom = _inverse_root(problem, y, w, chosen, smoothing if constrained else 0.0)
+            chosen, means, root, freedom = _inverse_root(problem, y, w, chosen, (smoothing, ridge), definite)
         else:
             freedom = float(min(found.certificate.passive, chosen.size))
             chosen = np.empty(0, dtype=np.int64)
@@ -177,7 +178,7 @@ def prediction_variance(problem: FitProblem, found: Fit, smoothing: float) -> Pr
 
 
 def _inverse_root(
-    problem: FitProblem, y: Floats, w: Floats, chosen: Indices, smoothing: float
+    problem: FitProblem, y: Floats, w: Floats, chosen: Indices, penalties: tuple[float, float], definite: bool
 ) -> tuple[Indices, Floats, Floats, float]:
     """Return columns, their means, B with B Bᵀ = (AᵀWA + λL)⁻¹ of them, and their degrees of freedom."""
     from scipy.linalg import eigh, solve_triangular
@@ -189,10 +190,10 @@ def _inverse_root(
         w,
         np.zeros(regressor.shape[1], dtype=bool),
         CellLayout.of(regressor.base.size),
-        smoothing,
+        *penalties,
     )
     state.learn(chosen)
-    if problem.spec.constrained:
+    if definite:
         state.enter(chosen)
         order = np.argsort(state.passive)
         upper = state.factor.upper[: state.factor.size, : state.factor.size]

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from bench.hysteresis import Operator
 from bench.identification.bands import Band, calibrate_band
 from bench.identification.by_name import set_up_problem
+from bench.identification.regularization import Regularization
 from bench.model_file import ModelFile
 from bench.units import header_with_unit
 
@@ -197,15 +198,20 @@ def _arrival_slopes(operator: Operator[Any], path: Floats, state: Any) -> Floats
 
 
 def calibrate(
-    model_name: str, inputs: Floats, outputs: Floats, skip: int, smoothing: float, options: Mapping[str, Any]
+    model_name: str,
+    inputs: Floats,
+    outputs: Floats,
+    skip: int,
+    penalties: Regularization,
+    options: Mapping[str, Any],
 ) -> Band:
     """Return the band of the model that `identify` finds with the same arguments; errors as `calibrate_band`."""
     own = dict(options)
     initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
     problem = set_up_problem(
-        model_name, inputs, outputs, None, skip, smoothing, initial, own, orientation=orientation
+        model_name, inputs, outputs, None, skip, penalties.smoothing, initial, own, orientation=orientation
     )
-    return calibrate_band(problem, smoothing)
+    return calibrate_band(problem, penalties.smoothing, penalties.ridge)
 
 
 def band_json(model: ModelFile, inputs: Floats, state: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -38,6 +38,8 @@ from bench.identification import (
     first_order_reversals,
     identify,
 )
+from bench.identification.regularization import Regularization
+from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
@@ -69,6 +71,8 @@ class IdentifiedFile:
         The measurements.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
+    resolution : Resolution or None
+        What the data say of each coefficient; None for a model without a plane, or with one too fine for it.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
     assumptions : str
@@ -81,6 +85,7 @@ class IdentifiedFile:
     inputs: Floats
     outputs: Floats
     coverage: Coverage | None = None
+    resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
 
@@ -93,6 +98,7 @@ class IdentifiedFile:
         found = self.identification
         certificate = found.certificate
         operator = self.file.operator
+        penalties = found.regularization
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -102,10 +108,14 @@ class IdentifiedFile:
             "converged": certificate.converged,
             "passive": certificate.passive,
             "active": certificate.active,
+            "rank": self.resolution.rank if self.resolution else None,
+            "exchangeable": certificate.exchangeable,
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
-            "smoothing": self.trials.best.smoothing if self.trials else None,
+            "smoothing": self.trials.best.smoothing if self.trials else penalties and penalties.smoothing,
+            "ridge": penalties and penalties.ridge,
+            "cross_validated_rms": penalties and penalties.rms,
             "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
@@ -121,7 +131,7 @@ def model_options(model: str) -> tuple[str, ...]:
     own = inspect.signature(template).parameters if template is not None else {}
     # The first takes the inputs; the units are those of the columns.
     names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "skip", "initial", "orientation", "cross_validated", "band")
+    return (*names, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
 
 
 def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -156,7 +166,8 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
     band: bool = False,
@@ -173,8 +184,8 @@ def identify_file(
         Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float, optional
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
@@ -214,15 +225,24 @@ def identify_file(
         if cross_validated:
             others = {name: value for name, value in options.items() if name != "levels"}
             orders = [options["levels"]] if "levels" in options else None
-            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
+            ridge = ridge or 0.0
+            trials = cross_validate(
+                model, inputs, outputs, smoothing=SMOOTHING, ridge=ridge, levels=orders, skip=skip, **others
+            )
             smoothing = trials.best.smoothing
-        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
-        calibrated = calibrate(model, inputs, outputs, skip, smoothing, options) if band else None
+        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, ridge=ridge, **options)
+        penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    resolution: Resolution | None = None
+    if coverage is not None and coverage.swept.size <= AFFORDABLE:
+        regressor = found.model.regressor(inputs, found.initial_state)
+        weights = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        resolution = resolve(regressor, np.ones(inputs.size), found.skip, weights.smoothing, weights.ridge)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -237,7 +257,15 @@ def identify_file(
     }
     file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)
     return IdentifiedFile(
-        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
+        file,
+        found,
+        tuple(dict.fromkeys(warnings)),
+        inputs,
+        outputs,
+        coverage,
+        resolution,
+        trials,
+        columns.assumptions,
     )
 
 
@@ -361,13 +389,36 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
-        ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *_uniqueness(found, identified.resolution),
+        *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
     )
+
+
+def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
+    """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
+    certificate = found.certificate
+    is_least_norm = not find_model(found.model_name).constrained and found.regularization is None
+    if is_least_norm:
+        text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
+    else:
+        text = f"{certificate.passive} free, {certificate.active} held at zero"
+    lines = [("coefficients", text)]
+    if resolution is not None and not is_least_norm:
+        lines.append(("determined by data", resolution.summary()))
+    if certificate.exchangeable:
+        lines.append(
+            (
+                "not unique",
+                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                "changing the fit; they are resolved by --smoothing",
+            )
+        )
+    return lines
 
 
 @dataclass(frozen=True)
