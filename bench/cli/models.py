@@ -20,6 +20,7 @@ from bench.cli.console import (
     write_json,
 )
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -102,7 +103,7 @@ def identify_(
     """
     from bench.results.models import certificate_lines, identify_file
 
-    check_outputs(out=out, figures=figures, json_file=json_file)
+    check_outputs(out=out, figures=figures, json_file=json_file, read=(file,))
     with show_patience(f"reading and fitting {file.name}"):
         found = identify_file(
             file,
@@ -133,8 +134,7 @@ def identify_(
     if figures is not None:
         from bench.results.report import draw_identification
 
-        for path in draw_identification(found, figures):
-            console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
+        print_figures(draw_identification(found, figures))
     write_json(json_file, found.summary())
 
 
@@ -150,35 +150,45 @@ def predict_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
     continue_memory: ContinueMemory = False,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
     reading: ReadingOptions,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
-    Writes a CSV file with the input column and `predicted`.
+    Writes a CSV file with the input column and `predicted`; with `--output` also `measured` and `residual` (measured
+    minus predicted). Heads have the units.
     """
     from bench.identification import measure_errors
     from bench.model_file import load_model
-    from bench.results.data import read_columns, write_csv
+    from bench.results.data import read_columns
     from bench.results.models import check_unit, errors_json, outside_of_range, predict
+    from bench.results.predictions import Predictions, Quantity
 
-    check_outputs(out=out, json_file=json_file)
+    check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
     print_assumptions(file, columns.assumptions)
     inputs = columns.values[input_column]
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
+    if output_column:
+        check_unit(model.operator.output_unit, columns.units[output_column], output_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
     predicted = predict(model, inputs, continue_memory=continue_memory)
-    write_csv(out, [input_column, "predicted"], [inputs, predicted])
+    unit = model.operator.output_unit
+    rows = Predictions(
+        Quantity(input_column, columns.units[input_column] or model.operator.input_unit, inputs),
+        unit,
+        {model.name: predicted},
+        Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
+    )
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
     if output_column:
         errors = measure_errors(columns.values[output_column], predicted)
         result |= errors_json(errors)
-        unit = model.operator.output_unit
         print_rows(
             f"{model.name} on {file.name}",
             (
@@ -186,7 +196,11 @@ def predict_(
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
         )
-    console.print(f"{inputs.size} rows: {out}", highlight=False, markup=False, soft_wrap=True)
+    write_rows(out, rows)
+    if figures is not None:
+        from bench.results.report import draw_predicted
+
+        print_figures(draw_predicted(rows, figures))
     write_json(json_file, result)
 
 
@@ -284,7 +298,7 @@ def invert(
     from bench.results.models import check_unit, invert_targets
     from bench.units import header_with_unit
 
-    check_outputs(out=out, json_file=json_file)
+    check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [column], options=reading)

@@ -40,6 +40,7 @@ from bench.identification import (
 )
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 
 Floats = npt.NDArray[np.float64]
@@ -83,6 +84,17 @@ class IdentifiedFile:
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
+
+    def predictions(self) -> Predictions:
+        """Return the outputs of the model beside the measurements, as the fit has them."""
+        operator, names = self.file.operator, self.file.provenance
+        return Predictions(
+            Quantity(names["input"], operator.input_unit, self.inputs),
+            operator.output_unit,
+            {self.file.name: self.outputs - self.identification.residuals},
+            Quantity(names["output"], operator.output_unit, self.outputs),
+            skip=self.identification.skip,
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
@@ -358,15 +370,20 @@ class ComparedModels:
     ----------
     comparisons : mapping of str to Comparison
         By the model file's name.
-    unit : str
-        Unit of the output.
+    predictions : Predictions
+        What each model gives, row by row.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
     """
 
     comparisons: Mapping[str, Comparison]
-    unit: str
+    predictions: Predictions
     assumptions: str = ""
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
@@ -423,7 +440,14 @@ def compare_models(
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = file.operator
     comparisons = compare(operators, inputs, outputs, skip=skip)
-    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions)
+    predictions = Predictions(
+        Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
+        files[0].operator.output_unit,
+        {name: outputs - entry.residuals for name, entry in comparisons.items()},
+        Quantity(names[1], columns.units[names[1]], outputs),
+        skip=skip,
+    )
+    return ComparedModels(comparisons, predictions, columns.assumptions)
 
 
 def assess_designs(

@@ -354,9 +354,9 @@ class TestIdentifyAndPredict:
         assert code == 0
         with (tmp_path / "out.csv").open() as file:
             rows = list(csv.DictReader(file))
-        assert list(rows[0]) == ["voltage", "predicted"]
-        predicted = np.array([float(row["predicted"]) for row in rows])
-        np.testing.assert_array_equal([float(row["voltage"]) for row in rows], inputs)
+        assert list(rows[0]) == ["voltage [V]", "measured [µm]", "predicted [µm]", "residual [µm]"]
+        predicted = np.array([float(row["predicted [µm]"]) for row in rows])
+        np.testing.assert_array_equal([float(row["voltage [V]"]) for row in rows], inputs)
         assert np.sqrt(np.mean((predicted - outputs)[70:] ** 2)) == pytest.approx(fit["rms"], rel=1e-9)
 
     def test_a_run_is_as_good_as_a_file(self, bench, tmp_path, finished_run):
