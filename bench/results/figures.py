@@ -256,8 +256,9 @@ def plot_densities(path: Path, densities: Sequence[Density], swept: npt.NDArray[
             )
             title = density.title
             if swept is not None and not swept.all():
-                unknown = np.ma.masked_all(density.values.shape)
-                unknown[np.tril_indices(len(unknown))] = np.ma.masked_array(np.ones(swept.size), mask=swept)
+                cells = np.full(density.values.shape, np.nan)
+                cells[np.tril_indices(len(cells))] = np.where(swept, np.nan, 1.0)
+                unknown = np.ma.masked_invalid(cells)
                 axes.pcolormesh(density.levels, density.levels, unknown, cmap="Greys", vmin=0.0, vmax=3.0, alpha=0.8)
                 title = f"{title} grey: never swept ({np.mean(~swept):.0%} of the cells)".lstrip()
             _frame_plane(axes, density)
