@@ -20,7 +20,7 @@ from bench.cli.console import (
     write_json,
 )
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
-from bench.cli.written import print_figures, write_rows
+from bench.cli.written import print_figures, write_fit, write_rows
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -46,6 +46,7 @@ ContinueMemory = Annotated[
 @layout_options
 @show_compilation()
 def identify_(
+    context: typer.Context,
     file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
@@ -89,6 +90,10 @@ def identify_(
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
+    card: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
+    ] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -103,7 +108,7 @@ def identify_(
     """
     from bench.results.models import certificate_lines, identify_file
 
-    check_outputs(out=out, figures=figures, json_file=json_file, read=(file,))
+    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=(file,))
     with show_patience(f"reading and fitting {file.name}"):
         found = identify_file(
             file,
@@ -131,10 +136,7 @@ def identify_(
     if out is not None:
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
-    if figures is not None:
-        from bench.results.report import draw_identification
-
-        print_figures(draw_identification(found, figures))
+    write_fit(found, file, context=context, out=out, card=card, figures=figures)
     write_json(json_file, found.summary())
 
 

@@ -1,14 +1,18 @@
 """What the commands about models write beside what they print: rows as CSV, figures, model cards."""
 
 import csv
+import hashlib
 import json
 import re
+import shlex
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from bench.errors import DataError
 from bench.results.data import read_columns
+from bench.results.model_card import sha256_of, write_card
 from bench.results.models import compare_models, identify_file
 from bench.results.prediction_figures import errors_text
 from bench.results.predictions import Predictions, Quantity
@@ -181,6 +185,8 @@ class TestPlaces:
             (["--out", "DIR/none/m.json"], ["--out", "no folder"]),
             (["--out", "DIR"], ["--out", "is a folder"]),
             (["--out", "DATA"], ["--out", "it is read"]),
+            (["--card", "DIR/none/card.md"], ["--card", "no folder"]),
+            (["--card", "DIR/x", "--out", "DIR/x"], ["--card", "that of --out"]),
             (["--figures", "DATA/figures"], ["--figures", "cannot be made"]),
             (["--json", "DATA"], ["--json", "it is read"]),
             (["--out", "DIR/x", "--json", "DIR/../DIRNAME/x"], ["--json", "that of --out"]),
@@ -206,3 +212,65 @@ class TestPlaces:
         )
         assert code == 0, err
         assert len(list((tmp_path / "new" / "figures").iterdir())) == 2
+
+
+def read_card(path):
+    """A card's sections by title: the rows of the table by their first cells, or the text."""
+    found = {}
+    for section in path.read_text(encoding="utf-8").split("\n## ")[1:]:
+        title, _, text = section.partition("\n")
+        lines = text.strip().splitlines()
+        if lines[0].startswith("|"):
+            rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in lines[2:]]
+            found[title] = {key.strip(): [cell.strip() for cell in cells] for key, *cells in rows}
+        else:
+            found[title] = text.strip()
+    return found
+
+
+class TestCard:
+    def test_a_card_has_what_the_fit_has(self, bench, tmp_path, loop):
+        result = tmp_path / "fit.json"
+        code, _, err = bench(
+            "identify", loop, *COLUMNS, "--model", "preisach", "--levels", 6, "--plane", -6, 6, "--skip", 60,
+            "--cross-validate", "--card", tmp_path / "card.md", "--figures", tmp_path / "figures", "--json", result,
+            "--out", tmp_path / "model.json",
+        )  # fmt: skip
+        assert code == 0, err
+        card, fit = read_card(tmp_path / "card.md"), json.loads(result.read_text())
+        assert card["Data"]["SHA-256"] == [hashlib.sha256(loop.read_bytes()).hexdigest()]
+        assert card["Data"]["rows"][0].startswith("300, of which the first 60 ")
+        assert card["Data"]["output"][0].endswith("µm")
+        assert card["Errors"]["RMS"] == [f"{fit['rms']:.4g}", f"{fit['rms_percent']:.2f}"]
+        assert card["Errors"]["largest"] == [f"{fit['max']:.4g}", f"{fit['max_percent']:.2f}"]
+        assert card["Certificate"]["coefficients"] == [f"{fit['passive']} free, {fit['active']} held at zero"]
+        assert card["Limits of validity"]["input"][0].startswith("-6 to 6 V")
+        assert "negative saturation" in card["Limits of validity"]["memory before the first row"][0]
+        assert "smoothing" in card["Selection"]
+        for warning in fit["warnings"]:
+            assert f"- {warning}" in card["Warnings"]
+        for link in re.findall(r"\]\(<(.+?)>\)", card["Figures"]):
+            assert (tmp_path / link).stat().st_size > 0
+
+    def test_its_command_identifies_the_same_model(self, bench, tmp_path, loop):
+        bench(
+            "identify", loop, *COLUMNS, "--model", "prandtl-ishlinskii", "--option", "plays=4", "--option",
+            "origin=0.5", "--initial", "skip", "--card", tmp_path / "card.md", "--out", tmp_path / "model.json",
+        )  # fmt: skip
+        program, *words = shlex.split(read_card(tmp_path / "card.md")["Reproduce"].splitlines()[1])
+        assert program == "bench"
+        model = (tmp_path / "model.json").read_text()
+        (tmp_path / "model.json").unlink()
+        code, _, err = bench(*words)
+        assert code == 0, err
+        assert (tmp_path / "model.json").read_text() == model
+
+    def test_a_model_without_memory_has_a_card(self, tmp_path, loop):
+        found = identify_file(loop, **NAMES, model="polynomial")
+        write_card(tmp_path / "a|b.md", found, loop, command="bench", model=None, figures=[])
+        card = read_card(tmp_path / "a|b.md")
+        assert "Figures" not in card
+        assert card["Limits of validity"]["memory before the first row"][0].startswith("none")
+        assert sha256_of(loop) == card["Data"]["SHA-256"][0]
+        with pytest.raises(DataError, match=r"model card .* cannot be written"):
+            write_card(tmp_path / "none" / "card.md", found, loop, command="bench", model=None, figures=[])
