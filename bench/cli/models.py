@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
 from bench.cli.console import (
     JsonOption,
@@ -21,7 +20,6 @@ from bench.cli.console import (
 )
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
 from bench.cli.written import print_figures, write_fit, write_rows
-from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
@@ -204,63 +202,6 @@ def predict_(
 
         print_figures(draw_predicted(rows, figures))
     write_json(json_file, result)
-
-
-@app.command()
-@show_compilation()
-def design(
-    rig: Annotated[
-        str | None, typer.Option("--rig", metavar="RIG", help="Rig whose range, plane and dwell are taken.")
-    ] = None,
-    plane: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Ends of the Preisach plane; the rig's if not given."),
-    ] = None,
-    operating: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            "--range", metavar="LOW HIGH", help="Operating range, which contains the plane; the rig's if not given."
-        ),
-    ] = None,
-    levels: Annotated[int, typer.Option(min=2, max=60, help="Discretization levels of the plane.")] = 20,
-    dwell: Annotated[
-        float | None, typer.Option(min=0.0, help="Settling time at each set-point, s; the rig's if not given.")
-    ] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
-
-    The damped oscillation of the papers, first-order reversal curves, the shortest sequence that covers every cell,
-    and the same twice as fine with two set-points a level, which averages noise. Each is a protocol:
-    damped-oscillation, first-order-reversals, covering.
-    """
-    from bench.results.models import assess_designs
-
-    if rig is not None:
-        from bench.rig_file import load_rig
-
-        file = load_rig(rig)
-        drive = file.roles.get("drive")
-        operating = operating or (drive.range if drive else None)
-        dwell = dwell if dwell is not None else (drive.dwell if drive else None)
-        plane = plane or (file.dashboard.plane if file.dashboard else None)
-    if plane is None or operating is None or dwell is None:
-        raise ConfigurationError("give --rig RIG, or --plane, --range and --dwell")
-    result = assess_designs(plane, operating, levels, dwell)
-    table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
-    for column in ("set-points", "cells covered", "rank / coefficients", "condition", "laboratory time"):
-        table.add_column(column, justify="right")
-    for name, entry in result.items():
-        table.add_row(
-            name,
-            str(entry.setpoints),
-            f"{entry.covered} of {entry.cells}",
-            f"{entry.rank} of {entry.coefficients}",
-            f"{entry.condition:.2g}",
-            f"{entry.time / 3600:.2f} h",
-        )
-    console.print(table)
-    write_json(json_file, {name: vars(entry) for name, entry in result.items()})
 
 
 class PolicyOption(Enum):

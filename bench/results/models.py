@@ -17,25 +17,17 @@ from bench.hysteresis import (
     Coverage,
     Operator,
     Policy,
-    Preisach,
     Reach,
-    ThermalExpansion,
     find_model,
     identifiable_models,
-    uniform_levels,
 )
 from bench.identification import (
-    Assessment,
     Comparison,
     CrossValidation,
     Errors,
     Identification,
-    assess,
     compare,
-    covering_sequence,
     cross_validate,
-    damped_oscillation,
-    first_order_reversals,
     identify,
 )
 from bench.model_file import ModelFile, load_model
@@ -448,33 +440,3 @@ def compare_models(
         skip=skip,
     )
     return ComparedModels(comparisons, predictions, columns.assumptions)
-
-
-def assess_designs(
-    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
-) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
-
-    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
-    ConfigurationError if the ranges do not fit.
-    """
-    low, high = operating
-    try:
-        grid = uniform_levels(*plane, levels)
-        # The term stands for any reversible part of two coefficients.
-        operator = Preisach(
-            grid,
-            np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
-            input_range=operating,
-        )
-        span = high - low
-        sequences = {
-            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
-            "first-order-reversals": first_order_reversals(grid, operating),
-            "covering, fewest": covering_sequence(grid, operating),
-            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
-        }
-        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
-    except ValueError as error:
-        raise ConfigurationError(f"design: {error}") from None

@@ -541,7 +541,10 @@ class TestTheCoreOnTheCommandLine:
         assert set(designs) == {"damped-oscillation", "first-order-reversals", "covering, fewest", "covering, fine"}
         for design in designs.values():
             assert design["covered"] == design["cells"] == 36
+            assert 0.0 < design["prediction_variance"] < 2.0
         assert designs["covering, fine"]["time"] < 0.5 * designs["damped-oscillation"]["time"]
+        per_hour = {name: design["log_determinant"] for name, design in designs.items()}
+        assert per_hour["covering, fewest"] == max(per_hour.values()) > per_hour["damped-oscillation"]
         code, _, err = bench("design", "--rig", "vo2", "--plane", "30", "90")
         assert code == 2
         assert "design" in err
