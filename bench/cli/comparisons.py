@@ -10,7 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
-from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions

@@ -9,7 +9,8 @@ import typer
 from rich.table import Table
 
 from bench.cli.console import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
-from bench.cli.data_options import layout_options, show_patience
+from bench.cli.data_options import layout_options
+from bench.cli.patience import show_patience
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 

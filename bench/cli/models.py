@@ -18,7 +18,8 @@ from bench.cli.console import (
     warn,
     write_json,
 )
-from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_fit, write_rows
 from bench.results.reading.options import ReadingOptions
 

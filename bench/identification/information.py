@@ -76,7 +76,8 @@ def log_determinant(rows: Floats, factor: float = 1.0) -> float:
     gram = rows.T @ rows if rows.shape[0] > count else rows @ rows.T
     gram *= factor
     gram[np.diag_indices_from(gram)] += 1.0
-    return float(np.linalg.slogdet(gram)[1]) / math.log(10.0) / count
+    logarithm = float(np.linalg.slogdet(gram)[1])
+    return logarithm / (math.log(10.0) * int(count))
 
 
 def covariance(rows: Floats) -> Floats:
