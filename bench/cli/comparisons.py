@@ -11,6 +11,7 @@ from rich.text import Text
 
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.models import InitialOption
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
@@ -42,11 +43,15 @@ def compare_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
     skip: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the models' own data those "
+            "that their identifications left out.",
         ),
-    ] = 0,
+    ] = None,
+    initial: InitialOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
@@ -66,9 +71,10 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or out or figures or reading != ReadingOptions():
+        if input_column or output_column or skip or initial or out or figures or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --out, --figures and how a file is read are for models, with --data FILE"
+                "--input, --output, --skip, --initial, --out, --figures and how a file is read are for models, "
+                "with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
@@ -77,8 +83,12 @@ def compare_(
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
     with show_patience(f"reading {data.name}"):
-        result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
+        result = compare_models(
+            compared, data, input_column, output_column, skip=skip, initial=initial, reading=reading
+        )
     print_assumptions(data, result.assumptions)
+    if result.skip:
+        console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):

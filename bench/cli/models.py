@@ -36,7 +36,16 @@ ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A mod
 ContinueMemory = Annotated[
     bool,
     typer.Option(
-        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        "--continue-memory", help="Start from the memory at the end of the model's data, not at their start."
+    ),
+]
+InitialOption = Annotated[
+    str | None,
+    typer.Option(
+        "--initial",
+        metavar="KIND",
+        help="Memory at the first row: file (that at the start of the model's data; if not given), negative or "
+        "positive saturation, or unknown: skip the rows that it could reach.",
     ),
 ]
 
@@ -158,6 +167,16 @@ def predict_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
+    skip: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the model's own data those "
+            "that its identification left out.",
+        ),
+    ] = None,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
@@ -167,13 +186,14 @@ def predict_(
     """Apply a model to a column of inputs, row by row.
 
     Writes a CSV file with the input column and `predicted`; with `--output` also `measured` and `residual` (measured
-    minus predicted). Heads have the units.
+    minus predicted). Heads have the units. The model starts from the memory that it had at the start of its own data,
+    so that on these data the errors are those of `bench identify`.
     """
-    from bench.identification import measure_errors
     from bench.model_file import load_model
     from bench.results.data import read_columns
-    from bench.results.models import check_unit, errors_json, outside_of_range, predict
+    from bench.results.models import check_unit, errors_json, outside_of_range
     from bench.results.predictions import Predictions, Quantity
+    from bench.results.starting_state import starting_state
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
@@ -186,21 +206,24 @@ def predict_(
         check_unit(model.operator.output_unit, columns.units[output_column], output_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
-    predicted = predict(model, inputs, continue_memory=continue_memory)
+    start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
+    predicted = model.operator.evaluate(inputs, start.state)
     unit = model.operator.output_unit
     rows = Predictions(
         Quantity(input_column, columns.units[input_column] or model.operator.input_unit, inputs),
         unit,
         {model.name: predicted},
         Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
+        skip=start.skip,
     )
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
     if output_column:
-        errors = measure_errors(columns.values[output_column], predicted)
-        result |= errors_json(errors)
+        errors = rows.errors()[model.name]
+        result |= {**errors_json(errors), "skipped": start.skip}
         print_rows(
             f"{model.name} on {file.name}",
             (
+                ("samples", f"{inputs.size - start.skip} (skipped: {start.skip})"),
                 ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
@@ -234,6 +257,7 @@ def invert(
         PolicyOption,
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
@@ -257,7 +281,9 @@ def invert(
     print_assumptions(file, columns.assumptions)
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
-    found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
+    found = invert_targets(
+        model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
+    )
     header = [
         header_with_unit(name, unit)
         for name, unit in (

@@ -118,7 +118,9 @@ def continue_file(
     rms = float(model.provenance.get("rms", 0.0))
     noise = rms / (high - low) if rms > 0.0 and high > low else NOISE
     try:
-        return continue_design(model.operator, columns.values[name], seconds=seconds, dwell=dwell, noise=noise)
+        return continue_design(
+            model.operator, columns.values[name], seconds=seconds, dwell=dwell, state=model.initial, noise=noise
+        )
     except ValueError as error:
         raise ConfigurationError(f"design: {error}") from None
 

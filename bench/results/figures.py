@@ -91,18 +91,17 @@ def plot_loops(
 def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, skip: int = 0) -> None:
     """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, by its title.
 
-    The first `skip` are drawn in grey, and count neither in the maximum nor in the RMS of the title.
+    The first `skip` samples are drawn in grey and do not count in the title.
     """
     with _figure(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
         for i, (title, error) in enumerate(errors.items()):
-            panels[i].plot(error[: skip + 1], color=_SKIPPED, linewidth=0.7)
-            counted = error[skip:]
-            places = np.arange(skip, error.size)
-            panels[i].plot(places, counted, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            panels[i].plot(np.arange(skip, error.size), error[skip:], color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            if skip:
+                panels[i].plot(error[: skip + 1], color=_SKIPPED, linewidth=0.7)
             panels[i].set_ylabel(error_label)
-            rms = float(np.sqrt(np.mean(counted**2)))
-            panels[i].set_title(f"{title}: max {np.max(np.abs(counted)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
+            most, rms = np.max(np.abs(error[skip:])), float(np.sqrt(np.mean(error[skip:] ** 2)))
+            panels[i].set_title(f"{title}: max {most:.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
 
 

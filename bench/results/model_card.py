@@ -164,7 +164,7 @@ def _limits(found: IdentifiedFile, inputs: Quantity, time: Quantity | None) -> l
         ("input", f"{_between(*operator.input_range, operator.input_unit)}; beyond it the model extrapolates"),
         ("excitation", excitation),
         ("rate", _rate(inputs, time)),
-        ("memory before the first row", _memory_text(operator, found.identification.initial_state)),
+        ("memory before the first row", _memory(found)),
     ]
 
 
@@ -173,6 +173,14 @@ def _rate(inputs: Quantity, time: Quantity | None) -> str:
         return "no time was read; the errors hold at the rate of these data"
     speed = np.abs(np.diff(inputs.values) / np.diff(time.values)).max()
     return f"at most {speed:.4g} {inputs.unit or 'input units'}/{time.unit or 's'} in these data"
+
+
+def _memory(found: IdentifiedFile) -> str:
+    text = _memory_text(found.file.operator, found.identification.initial_state)
+    how = found.file.provenance.get("initial")
+    if how == "skip":
+        return f"unknown; taken as {text}, and the rows that it reaches are left out"
+    return f"estimated: {text}" if how == "estimate" else text
 
 
 def _memory_text(operator: Operator[Any], state: Any) -> str:  # noqa: ANN401 - each operator has its own state

@@ -34,6 +34,7 @@ from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
 from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
+from bench.results.starting_state import StartingState, digest, starting_state
 
 Floats = npt.NDArray[np.float64]
 
@@ -223,12 +224,14 @@ def identify_file(
         "input": input_column,
         "output": output_column,
         "rows": int(inputs.size),
-        "skipped": skip,
+        "skipped": found.skip,
+        "initial": options.get("initial"),
+        "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state)
     return IdentifiedFile(
         file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
     )
@@ -245,7 +248,7 @@ def _largest(uncertainties: Floats) -> float | None:
     return float(known.max()) if known.size else None
 
 
-def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) -> Floats:
+def predict(model: ModelFile, inputs: Floats, *, initial: str | None = None, continue_memory: bool = False) -> Floats:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
     Parameters
@@ -254,11 +257,11 @@ def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) 
         The model.
     inputs : ndarray, shape (N,)
         Inputs in the unit of the model, finite.
-    continue_memory : bool
-        Start from the memory that the model file keeps, the end of its identification data, rather than from
-        the state from which identification started.
+    initial, continue_memory
+        The state before the first input, as for `starting_state`.
     """
-    return np.asarray(model.operator.evaluate(inputs, model.memory if continue_memory else None))
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    return np.asarray(model.operator.evaluate(inputs, start.state))
 
 
 @dataclass(frozen=True)
@@ -287,7 +290,12 @@ class InvertedTargets:
 
 
 def invert_targets(
-    model: ModelFile, targets: Floats, *, policy: Policy = "nearest", continue_memory: bool = False
+    model: ModelFile,
+    targets: Floats,
+    *,
+    policy: Policy = "nearest",
+    initial: str | None = None,
+    continue_memory: bool = False,
 ) -> InvertedTargets:
     """Invert a model for a sequence of targets.
 
@@ -300,15 +308,16 @@ def invert_targets(
         Output units, finite.
     policy : {"nearest", "paper"}
         Which answer is taken where there are several.
-    continue_memory : bool
-        Start from the memory that the model file keeps rather than from the model's initial state.
+    initial, continue_memory
+        The state before the first target, as for `starting_state`.
 
     Raises
     ------
     DataError
         If it is a model of several inputs.
     """
-    found = model.operator.inverse(policy).follow(targets, model.memory if continue_memory else None)
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    found = model.operator.inverse(policy).follow(targets, start.state)
     flags = tuple(
         (Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
         for met, target, output in zip(found.met.tolist(), targets.tolist(), found.outputs.tolist(), strict=True)
@@ -380,10 +389,20 @@ class ComparedModels:
         """The unit of the output."""
         return self.predictions.unit
 
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
+
     def to_json(self) -> dict[str, Any]:
-        """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
+        """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
         return {
-            name: {"raw": errors_json(entry.raw), "rezeroed": errors_json(entry.rezeroed), "offset": entry.offset}
+            name: {
+                "raw": errors_json(entry.raw),
+                "rezeroed": errors_json(entry.rezeroed),
+                "offset": entry.offset,
+                "skipped": self.skip,
+            }
             for name, entry in self.comparisons.items()
         }
 
@@ -394,7 +413,8 @@ def compare_models(
     input_column: str | None,
     output_column: str | None,
     *,
-    skip: int = 0,
+    skip: int | None = None,
+    initial: str | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -407,8 +427,9 @@ def compare_models(
         A file that `read_columns` reads, or a run.
     input_column, output_column : str or None
         Columns; those that the first model was identified from if None.
-    skip : int
-        First rows that drive the memory but do not count.
+    skip, initial
+        First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
+        the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -417,7 +438,7 @@ def compare_models(
     DataError
         If a file cannot be used, or units do not fit.
     ConfigurationError
-        If `skip` leaves nothing.
+        If `skip` leaves nothing, or there is no such initial state.
     """
     files = [load_model(path) for path in paths]
     names = [
@@ -426,20 +447,22 @@ def compare_models(
     ]
     columns = read_columns(data, names, options=reading)
     inputs, outputs = (columns.values[name] for name in names)
-    if not 0 <= skip < inputs.size:
-        raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
     operators: dict[str, Operator[Any]] = {}
+    starts: dict[str, StartingState] = {}
     for path, file in zip(paths, files, strict=True):
         check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
         check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = file.operator
-    comparisons = compare(operators, inputs, outputs, skip=skip)
+        starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
+    states = {name: start.state for name, start in starts.items()}
+    most = max(start.skip for start in starts.values())
+    comparisons = compare(operators, inputs, outputs, states=states, skip=most)
     predictions = Predictions(
         Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
         files[0].operator.output_unit,
         {name: outputs - entry.residuals for name, entry in comparisons.items()},
         Quantity(names[1], columns.units[names[1]], outputs),
-        skip=skip,
+        skip=most,
     )
     return ComparedModels(comparisons, predictions, columns.assumptions)

@@ -27,9 +27,10 @@ from bench.results.figures import (
     plot_loops,
     plot_signals,
 )
-from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json
 from bench.results.prediction_figures import draw_predictions
 from bench.results.predictions import Predictions
+from bench.results.starting_state import StartingState, starting_state
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
 from bench.units import format_numbers, header_with_unit, with_unit
@@ -139,7 +140,7 @@ def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
         path,
         result.predictions.residuals(),
         error_label=with_unit("error", result.unit),
-        skip=result.predictions.skip,
+        skip=result.skip,
     )
     return [path, *draw_predictions(result.predictions, folder, "models")]
 
@@ -245,6 +246,7 @@ def _compare(
 ) -> tuple[dict[str, dict[str, Any]], list[Path]]:
     comparison: dict[str, dict[str, Any]] = {}
     residuals: dict[str, Any] = {}
+    pairs: list[tuple[ModelFile, StartingState, list[str]]] = []
     for model in models:
         columns = [str(model.provenance.get(end, "")) for end in ("input", "output")]
         missing = [name for name in columns if name not in steps.columns]
@@ -252,17 +254,22 @@ def _compare(
             raise DataError(
                 f"model {model.name} was identified with {' and '.join(missing)}, which {record.path} lacks"
             )
-        measured, predicted = steps[columns[1]], predict(model, steps[columns[0]])
+        pairs.append((model, starting_state(model, steps[columns[0]]), columns))
+    # Errors of the same rows for all.
+    skip = max((start.skip for _, start, _ in pairs), default=0)
+    for model, start, (driven, response) in pairs:
+        measured, predicted = steps[response], model.operator.evaluate(steps[driven], start.state)
         comparison[model.name] = {
-            **errors_json(measure_errors(measured, predicted)),
-            "unit": model.operator.output_unit or record.unit(columns[1]),
+            **errors_json(measure_errors(measured[skip:], predicted[skip:])),
+            "unit": model.operator.output_unit or record.unit(response),
+            "skipped": skip,
         }
         residuals[model.name] = measured - predicted
     if not residuals:
         return comparison, []
     unit = next(iter(comparison.values()))["unit"]
     path = folder / "errors.png"
-    plot_errors(path, residuals, error_label=with_unit("error", unit))
+    plot_errors(path, residuals, error_label=with_unit("error", unit), skip=skip)
     return comparison, [path]
 
 
