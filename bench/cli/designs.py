@@ -74,9 +74,10 @@ def design(
 
     `cells` are those covered, `rank` how many of the coefficients are determined.
     `log det / h` is log10 of the determinant of the information that an hour of the sequence gives, in decades per
-    coefficient, and `variance` the mean variance of predictions over random reversals after the sequence once, in
-    variances of the noise. The error on other inputs follows these. It does not follow the condition number, which
-    only says how exactly the coefficients can be computed.
+    coefficient; it comes closest to the order of the errors on other inputs. `variance` is the mean variance of
+    predictions over random reversals after the sequence once, in variances of the noise, without constraints of sign,
+    which lower it. The condition number does not order the errors; it says how exactly the coefficients can be
+    computed.
 
     `bench design --model model.json --data FILE --continue HOURS` goes on from measurements: it adds damped tails,
     each where it tells most per second. Each tail visits its first maximum again: outputs that differ there by more

@@ -169,10 +169,11 @@ class Assessment:
         Laboratory time, s.
     log_determinant : float
         log10 det of the information that one hour of the sequence, repeated, gives, in decades per coefficient;
-        see `information`. It orders sequences by the error that is left on other inputs, which the condition number
-        does not; infinite if the sequence takes no time.
+        see `information`. It comes closest to the order of the errors that are left on other inputs, which the
+        condition number does not say; infinite if the sequence takes no time.
     prediction_variance : float
-        Mean variance of predictions over random reversals after the sequence, in variances of the noise.
+        Mean variance of predictions over random reversals after the sequence, in variances of the noise, if the signs
+        of the coefficients are not constrained.
     """
 
     setpoints: int

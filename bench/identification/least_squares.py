@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -576,7 +577,7 @@ class _ActiveSet:
         The greatest gradient falls from 1e-4 to 1e-8 of the outputs while nearly all the time passes, then at once
         to rounding.
         """
-        return max(min((-np.log10(max(steepest / self.size, 1e-99)) - 4.0) / 4.0, 0.97), 0.0)
+        return min(max((-math.log10(max(steepest / self.size, 1e-99)) - 4.0) / 4.0, 0.0), 0.97)
 
     def gain(self) -> float:
         """Return by how much the settled passive set lowers the cost, doubled."""
