@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.errors import DataError
 from bench.extras import needed_for
 from bench.hysteresis import Density, MemoryCurve
 from bench.hysteresis.density import density_unit
@@ -56,7 +57,7 @@ def check_matplotlib() -> None:
 
 @contextmanager
 def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and save it."""
+    """Give an empty figure of a size in inches, and save it; raise DataError if it cannot be written."""
     check_matplotlib()
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -64,7 +65,10 @@ def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iter
     with mpl.rc_context({**_STYLE, "axes.grid": grid}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
-        figure.savefig(path)
+        try:
+            figure.savefig(path)
+        except OSError as error:
+            raise DataError(f"figure {path} cannot be written: {error.strerror or error}") from None
 
 
 class Curve(NamedTuple):

@@ -177,6 +177,12 @@ class TestFigures:
             shown = float(re.search(r"max (\S+),", axes.get_title(loc="left")).group(1))
             assert shown == pytest.approx(compared.comparisons[name].raw.maximum, rel=6e-3)
 
+    def test_a_figure_that_cannot_be_written_is_named(self, tmp_path, loop):
+        found = identify_file(loop, **NAMES, model="polynomial")
+        (tmp_path / "polynomial-loops.png").mkdir()
+        with pytest.raises(DataError, match=r"polynomial-loops\.png cannot be written"):
+            draw_identification(found, tmp_path)
+
 
 class TestPlaces:
     @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ class TextFile:
         ):
             size = max(self.path.stat().st_size, 1)
             # The position in the file itself, which may be compressed.
-            place = file.fileobj if isinstance(file, gzip.GzipFile) else file
+            place: BinaryIO = getattr(file, "fileobj", file)
             rest = islice(wrapped, start, end)
             while lines := list(islice(rest, _LINES)):
                 yield from lines
