@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +61,8 @@ class Predictions:
         When each row was taken, where it is known.
     skip : int
         First rows, which drive the memory but count in no error.
+    further : sequence of (str, ndarray)
+        Heads and columns of shape (N,) that follow in the table, such as the ends of a prediction band.
     """
 
     input: Quantity
@@ -69,6 +71,7 @@ class Predictions:
     measured: Quantity | None = None
     time: Quantity | None = None
     skip: int = 0
+    further: Sequence[tuple[str, Floats]] = ()
 
     def residuals(self) -> dict[str, Floats]:
         """Return measured minus predicted output by model, shape (N,) each; none without measurements."""
@@ -84,7 +87,7 @@ class Predictions:
         return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
 
     def table(self) -> list[tuple[str, Floats]]:
-        """Return the columns of a file with their heads: time, input, measured; by model predicted and residual.
+        """Return the columns of a file with their heads: time, input, measured; by model predicted and residual; then `further`.
 
         The model is named in the heads if there are several.
         """
@@ -97,4 +100,4 @@ class Predictions:
             columns.append((header_with_unit(f"{prefix}predicted", self.unit), values))
             if name in residuals:
                 columns.append((header_with_unit(f"{prefix}residual", self.unit), residuals[name]))
-        return columns
+        return [*columns, *self.further]
