@@ -87,7 +87,7 @@ class Predictions:
         return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
 
     def table(self) -> list[tuple[str, Floats]]:
-        """Return the columns of a file with their heads: time, input, measured; by model predicted and residual; then `further`.
+        """Return the columns of a file with their heads: time, input, measured; predicted and residual; `further`.
 
         The model is named in the heads if there are several.
         """
