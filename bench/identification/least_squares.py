@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
-from bench.shares import say_share
+from bench.identification.fit_progress import say_fit_progress
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -548,7 +547,7 @@ class _ActiveSet:
             g[~self.constrained] = 0.0
             if g.max(initial=0.0) <= tolerance:
                 break
-            say_share("fitting", self.share(float(g.max())))
+            say_fit_progress(float(g.max()) / self.size)
             if g[~barred].max(initial=0.0) <= tolerance:
                 threshold = next(stricter, None)
                 if threshold is None:
@@ -570,14 +569,6 @@ class _ActiveSet:
             if self.passive.size < entered:
                 barred[:] = False
             barred[dependent] = True
-
-    def share(self, steepest: float) -> float:
-        """Return about which share of the work is done once the gradient has come down to `steepest`.
-
-        The greatest gradient falls from 1e-4 to 1e-8 of the outputs while nearly all the time passes, then at once
-        to rounding.
-        """
-        return min(max((-math.log10(max(steepest / self.size, 1e-99)) - 4.0) / 4.0, 0.0), 0.97)
 
     def gain(self) -> float:
         """Return by how much the settled passive set lowers the cost, doubled."""
