@@ -17,25 +17,17 @@ from bench.hysteresis import (
     Coverage,
     Operator,
     Policy,
-    Preisach,
     Reach,
-    ThermalExpansion,
     find_model,
     identifiable_models,
-    uniform_levels,
 )
 from bench.identification import (
-    Assessment,
     Comparison,
     CrossValidation,
     Errors,
     Identification,
-    assess,
     compare,
-    covering_sequence,
     cross_validate,
-    damped_oscillation,
-    first_order_reversals,
     identify,
 )
 from bench.identification.regularization import Regularization
@@ -43,7 +35,8 @@ from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
-from bench.results.examined import Examined, examine
+from bench.results.examined import Examined, band_columns, examine
+from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
@@ -92,6 +85,17 @@ class IdentifiedFile:
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
+
+    def predictions(self) -> Predictions:
+        """Return the outputs of the model beside the measurements, as the fit has them."""
+        operator, names = self.file.operator, self.file.provenance
+        return Predictions(
+            Quantity(names["input"], operator.input_unit, self.inputs),
+            operator.output_unit,
+            {self.file.name: self.outputs - self.identification.residuals},
+            Quantity(names["output"], operator.output_unit, self.outputs),
+            skip=self.identification.skip,
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
@@ -429,10 +433,8 @@ class ComparedModels:
     ----------
     comparisons : mapping of str to Comparison
         By the model file's name.
-    unit : str
-        Unit of the output.
-    skip : int
-        Number of first rows left out of the errors.
+    predictions : Predictions
+        What each model gives, row by row.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
     examined : mapping of str to Examined
@@ -440,10 +442,19 @@ class ComparedModels:
     """
 
     comparisons: Mapping[str, Comparison]
-    unit: str
-    skip: int = 0
+    predictions: Predictions
     assumptions: str = ""
     examined: Mapping[str, Examined] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
+
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
@@ -524,34 +535,12 @@ def compare_models(
     }
     first = most if session is None else session.first_unused(inputs.size, most)
     comparisons = compare(operators, inputs, outputs, states=states, skip=first)
-    return ComparedModels(comparisons, files[0].operator.output_unit, first, columns.assumptions, examined)
-
-
-def assess_designs(
-    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
-) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
-
-    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
-    ConfigurationError if the ranges do not fit.
-    """
-    low, high = operating
-    try:
-        grid = uniform_levels(*plane, levels)
-        # The term stands for any reversible part of two coefficients.
-        operator = Preisach(
-            grid,
-            np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
-            input_range=operating,
-        )
-        span = high - low
-        sequences = {
-            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
-            "first-order-reversals": first_order_reversals(grid, operating),
-            "covering, fewest": covering_sequence(grid, operating),
-            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
-        }
-        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
-    except ValueError as error:
-        raise ConfigurationError(f"design: {error}") from None
+    predictions = Predictions(
+        Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
+        files[0].operator.output_unit,
+        {name: entry.predicted for name, entry in examined.items()},
+        Quantity(names[1], columns.units[names[1]], outputs),
+        skip=first,
+        further=band_columns(examined),
+    )
+    return ComparedModels(comparisons, predictions, columns.assumptions, examined)
