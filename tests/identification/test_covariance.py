@@ -18,7 +18,7 @@ def problem_of(model, options, smoothing=0.0, weights=None, skip=0, seed=0):
     return set_up_problem(model, inputs, outputs, weights, skip, smoothing, None, dict(options))
 
 
-def dense_variance(problem, found, smoothing, inputs):
+def dense_variance(problem, found, smoothing, ridge, inputs):
     """Return s, ρ and the variance of predictions by the textbook, with the bias as a column like others."""
     kept = np.flatnonzero(found.coefficients)
     w = problem.weights.copy()
@@ -27,11 +27,12 @@ def dense_variance(problem, found, smoothing, inputs):
     a = np.column_stack([np.ones(rows.shape[0]), rows[:, kept]])
     penalty = np.zeros((rows.shape[1], rows.shape[1]))
     cells = problem.regressor.base.size
-    if smoothing:
+    if smoothing or ridge:
         means = w @ rows / w.sum()
         square = (w @ (rows - means) ** 2)[:cells]
         swept = found.certificate.swept[:cells]
-        penalty[:cells, :cells] = smoothing * square[swept].mean() * CellLayout.of(cells).roughness().toarray()
+        rough = smoothing * CellLayout.of(cells).roughness().toarray() + ridge * np.eye(cells)
+        penalty[:cells, :cells] = square[swept].mean() * rough
     penalty = np.pad(penalty[np.ix_(kept, kept)], (1, 0))
     information = a.T @ (w[:, None] * a)
     posterior = np.linalg.inv(information + penalty)
@@ -46,19 +47,20 @@ def dense_variance(problem, found, smoothing, inputs):
     return np.sqrt(variance), rho, freedom, variance * inflation * np.einsum("ij,jk,ik->i", b, posterior, b)
 
 
-@pytest.mark.parametrize(("model", "options", "smoothing"), [
-    ("preisach", {"levels": 8, "plane": (-1.0, 1.0), "reversible": "linear"}, 0.0),
-    ("preisach", {"levels": 8, "plane": (-1.0, 1.0)}, 0.1),
-    ("prandtl-ishlinskii", {"plays": 8}, 0.0),
+@pytest.mark.parametrize(("model", "options", "smoothing", "ridge"), [
+    ("preisach", {"levels": 8, "plane": (-1.0, 1.0), "reversible": "linear"}, 0.0, 0.0),
+    ("preisach", {"levels": 8, "plane": (-1.0, 1.0)}, 0.1, 0.0),
+    ("preisach-signed", {"levels": 8, "plane": (-1.0, 1.0)}, 0.01, 0.1),
+    ("prandtl-ishlinskii", {"plays": 8}, 0.0, 0.0),
 ])  # fmt: skip
 @pytest.mark.parametrize("skip", [0, 40])
-def test_it_is_the_dense_one(model, options, smoothing, skip):
+def test_it_is_the_dense_one(model, options, smoothing, ridge, skip):
     weights = np.random.default_rng(1).uniform(0.5, 2.0, problem_of(model, options).inputs.size)
     problem = problem_of(model, options, smoothing, weights, skip)
-    found = problem.fit(smoothing)
-    variance = prediction_variance(problem, found, smoothing)
+    found = problem.fit(smoothing, ridge=ridge)
+    variance = prediction_variance(problem, found, smoothing, ridge)
     inputs = damped(np.random.default_rng(2))
-    residual, rho, freedom, expected = dense_variance(problem, found, smoothing, inputs)
+    residual, rho, freedom, expected = dense_variance(problem, found, smoothing, ridge, inputs)
     assert variance.residual == pytest.approx(residual, rel=1e-4)
     assert variance.correlation == pytest.approx(rho, rel=1e-3, abs=1e-5)
     assert variance.freedom == pytest.approx(freedom, rel=1e-3)
