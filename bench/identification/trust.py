@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.hysteresis import Operator, Preisach, ThermalExpansion
+from bench.hysteresis import Operator, ThermalExpansion
 from bench.hysteresis._checks import Floats
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _plane(problem: FitProblem) -> list[str]:
 
 def _thermal(template: Operator[Any]) -> list[str]:
     unit = template.input_unit.strip().lower().removeprefix("deg").removeprefix("°").strip()
-    if not (isinstance(template, Preisach) and isinstance(template.reversible, ThermalExpansion)):
+    if not isinstance(getattr(template, "reversible", None), ThermalExpansion):
         return []
     if unit in ("", "c", "k", "f", "℃", "℉", "celsius", "kelvin", "fahrenheit"):
         return []

@@ -34,7 +34,7 @@ from bench.identification.regularization import Regularization
 from bench.identification.resolution import AFFORDABLE, Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.bands import band_json, calibrate
-from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.examined import Examined, band_columns, examine
 from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
@@ -220,6 +220,7 @@ def identify_file(
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
+    check_variation(columns, output_column)
     options = {name: value for name, value in options.items() if value is not None}
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
