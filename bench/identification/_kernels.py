@@ -48,18 +48,34 @@ def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, F
 
 
 @njit(cache=True)
-def gradient(sparse: Columns, tail: Floats) -> Floats:
-    """Return the product of each column with the vector whose reverse running sum is `tail`.
+def products(
+    sparse: Columns, norms: Floats, extra: Floats, weights: Floats, total: float, residual: Floats
+) -> Floats:
+    """Return the product of each scaled, centred column with the weighted residual.
 
-    That vector must add up to zero: the columns' starting values then drop out.
+    `total` is the sum of the weights. The residual is taken about its mean, so that the columns' starting values drop
+    out.
     """
     starts, rows, values = sparse
-    result = np.empty(starts.size - 1)
-    for c in range(result.size):
-        total = 0.0
+    samples, sparse_columns = weights.size, starts.size - 1
+    mean = 0.0
+    for n in range(samples):
+        mean += weights[n] * residual[n]
+    mean /= total
+    result = np.zeros(norms.size)
+    tail = np.empty(samples)
+    running = 0.0
+    for n in range(samples - 1, -1, -1):
+        value = weights[n] * (residual[n] - mean)
+        running += value
+        tail[n] = running
+        for q in range(extra.shape[1]):
+            result[sparse_columns + q] += value * extra[n, q]
+    for c in range(sparse_columns):
+        product = 0.0
         for e in range(starts[c], starts[c + 1]):
-            total += values[e] * tail[rows[e]]
-        result[c] = total
+            product += values[e] * tail[rows[e]]
+        result[c] = product / norms[c]
     return result
 
 

@@ -454,12 +454,7 @@ class _ActiveSet:
         """Return the scaled columns' products with the weighted residual."""
         from bench.identification import _kernels
 
-        v = self.w * residual
-        v -= self.w * (v.sum() / self.total)
-        result = np.empty(self.regressor.shape[1])
-        result[: self.cells] = _kernels.gradient(self.columns, v[::-1].cumsum()[::-1].copy())
-        result[: self.cells] /= self.norms[: self.cells]
-        result[self.cells :] = self.extra.T @ v
+        result = np.asarray(_kernels.products(self.columns, self.norms, self.extra, self.w, self.total, residual))
         result[~self.usable] = 0.0
         return result
 
