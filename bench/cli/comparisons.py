@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.models import InitialOption
@@ -52,6 +53,9 @@ def compare_(
         ),
     ] = None,
     initial: InitialOption = None,
+    bands: BandsOption = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
@@ -71,20 +75,30 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or initial or out or figures or reading != ReadingOptions():
+        of_models = (input_column, output_column, skip, initial, bands, recalibrate, recalibrate_rows, out, figures)
+        if any(of_models) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --initial, --out, --figures and how a file is read are for models, "
-                "with --data FILE"
+                "--input, --output, --skip, --initial, --bands, --recalibrate, --out, --figures and how a file is "
+                "read are for models, with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
         return
     from bench.results.models import compare_models
+    from bench.results.recalibrations import Session
 
+    session = Session.parse(recalibrate, recalibrate_rows)
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
     with show_patience(f"reading {data.name}"):
         result = compare_models(
-            compared, data, input_column, output_column, skip=skip, initial=initial, reading=reading
+            compared,
+            data,
+            input_column,
+            output_column,
+            skip=skip,
+            initial=initial,
+            session=session,
+            reading=reading,
         )
     print_assumptions(data, result.assumptions)
     if result.skip:
@@ -100,6 +114,8 @@ def compare_(
             f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
         )  # fmt: skip
     console.print(table)
+    for name, examined in result.examined.items():
+        print_examined(examined, name, bands=bands)
     if out is not None:
         write_rows(out, result.predictions)
     if figures is not None:

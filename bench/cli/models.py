@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from bench.cli.band_options import BandOption, RecalibrateOption, RecalibrateRowsOption, print_band, print_examined
 from bench.cli.console import (
     JsonOption,
     check_outputs,
@@ -77,7 +78,18 @@ def identify_(
         str | None,
         typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
     ] = None,
-    smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None,
     skip: Annotated[
         int,
         typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
@@ -104,6 +116,7 @@ def identify_(
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
+    band: BandOption = False,
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
     card: Annotated[
         Path | None,
@@ -121,6 +134,7 @@ def identify_(
     printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings are
     taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`.
     """
+    from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file
 
     check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=(file,))
@@ -135,11 +149,13 @@ def identify_(
             plane=plane,
             reversible=reversible,
             smoothing=smoothing,
+            ridge=ridge,
             skip=skip,
             initial=initial,
             orientation=orientation,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
+            band=band,
             reading=reading,
         )
     print_assumptions(file, found.assumptions)
@@ -149,6 +165,8 @@ def identify_(
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
+    if (banded := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+        print_band(banded)
     if out is not None:
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
@@ -178,6 +196,8 @@ def predict_(
     ] = None,
     initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -186,16 +206,21 @@ def predict_(
     """Apply a model to a column of inputs, row by row.
 
     Writes a CSV file with the input column and `predicted`; with `--output` also `measured` and `residual` (measured
-    minus predicted). Heads have the units. The model starts from the memory that it had at the start of its own data,
-    so that on these data the errors are those of `bench identify`.
+    minus predicted), and if the model has a prediction band `predicted lower` and `predicted upper`. Heads have the
+    units. The model starts from the memory that it had at the start of its own data, so that on these data the errors
+    are those of `bench identify`. With `--recalibrate` the predictions are those for the session of the measured
+    output.
     """
     from bench.model_file import load_model
     from bench.results.data import read_columns
+    from bench.results.examined import examine
     from bench.results.models import check_unit, errors_json, outside_of_range
     from bench.results.predictions import Predictions, Quantity
+    from bench.results.recalibrations import Session
     from bench.results.starting_state import starting_state
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
+    session = Session.parse(recalibrate, recalibrate_rows)
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
@@ -207,23 +232,26 @@ def predict_(
     if warning := outside_of_range(model, inputs):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
-    predicted = model.operator.evaluate(inputs, start.state)
+    measured = columns.values[output_column] if output_column else None
+    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip)
     unit = model.operator.output_unit
     rows = Predictions(
         Quantity(input_column, columns.units[input_column] or model.operator.input_unit, inputs),
         unit,
-        {model.name: predicted},
+        {model.name: found.predicted},
         Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
-        skip=start.skip,
+        skip=found.first,
+        further=found.band.columns(found.predicted) if found.band else (),
     )
-    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
+    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
+    print_examined(found)
     if output_column:
         errors = rows.errors()[model.name]
-        result |= {**errors_json(errors), "skipped": start.skip}
+        result |= {**errors_json(errors), "skipped": found.first}
         print_rows(
             f"{model.name} on {file.name}",
             (
-                ("samples", f"{inputs.size - start.skip} (skipped: {start.skip})"),
+                ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
                 ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
@@ -267,11 +295,14 @@ def invert(
 
     Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
-    `too low`; what cannot be met is clamped to the nearest reachable value).
+    `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
+    its ends for the set-point, by the local slope, and for the output there.
     """
     from bench.model_file import load_model
+    from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, invert_targets
+    from bench.results.starting_state import starting_state
     from bench.units import header_with_unit
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
@@ -284,6 +315,9 @@ def invert(
     found = invert_targets(
         model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
     )
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    banded = invert_band(model, found.setpoints, found.passing, start.state)
+    bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
     header = [
         header_with_unit(name, unit)
         for name, unit in (
@@ -291,7 +325,10 @@ def invert(
         )
     ]  # fmt: skip
     passing = ["" if value != value else value for value in found.passing.tolist()]
-    write_csv(out, header, [found.targets, passing, found.setpoints, found.predicted, list(found.flags)])
+    written: list[Any] = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
+    write_csv(out, [*header, *(head for head, _ in bands)], [*written, *(values for _, values in bands)])
+    if banded is not None:
+        print_band(banded.outputs)
     counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
     two = sum(value != "" for value in passing)
     console.print(
@@ -312,5 +349,6 @@ def invert(
             "through_saturation": two,
             "largest_residual": float(max(met)) if met else None,
             "out": str(out),
+            **({"band": banded.outputs.to_json()} if banded else {}),
         },
     )

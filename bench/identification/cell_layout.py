@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +38,7 @@ class CellLayout:
     layers: Indices
 
     @classmethod
+    @lru_cache(maxsize=8)
     def of(cls, columns: int) -> CellLayout:
         """Return the layout of one column a cell, if their number is that of a plane."""
         order = (round((8 * columns + 1) ** 0.5) - 1) // 2
@@ -61,13 +63,18 @@ class CellLayout:
         """
         if not self.order:
             return np.flatnonzero(g >= threshold)
-        plane = self.grid(g)
-        inner = plane[:, 1:-1, 1:-1]
-        crest = inner >= threshold
-        for neighbour in (plane[:, :-2, 1:-1], plane[:, 2:, 1:-1], plane[:, 1:-1, :-2], plane[:, 1:-1, 2:]):
-            crest &= inner >= neighbour
+        from bench.identification import _kernels
+
+        return np.flatnonzero(_kernels.crests(g, threshold, self.neighbours))
+
+    @cached_property
+    def neighbours(self) -> Indices:
+        """The columns of the four neighbouring cells of each column, of its layer, shape (columns, 4); -1: none."""
+        index = np.full((2, self.order + 2, self.order + 2), -1, dtype=np.int64)
         layer, row, column = self._places()
-        return np.flatnonzero(crest[layer, row - 1, column - 1])
+        index[layer, row, column] = np.arange(self.cells.size)
+        beside = ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))
+        return np.stack([index[layer, i, j] for i, j in beside], axis=1)
 
     def coarser(self) -> tuple[CellLayout, Indices]:
         """Return the layout of the plane with cells merged two by two, and the column of each column there."""

@@ -30,12 +30,17 @@ def fit_operator(
     weights: Floats,
     skip: int,
     smoothing: float,
+    ridge: float = 0.0,
 ) -> Fit:
-    """Return the coefficients of an operator: with its signs if constrained, else of the least norm."""
-    if not constrained:
+    """Return the coefficients of an operator: with its signs if constrained, else free.
+
+    Free coefficients without a penalty are those of the least norm.
+    """
+    if not constrained and not smoothing and not ridge:
         return fit_minimum_norm(regressor, outputs, weights=weights, skip=skip)
-    signs = operator.nonnegative()
-    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, smoothing=smoothing)
+    signs = operator.nonnegative() if constrained else False
+    penalties = {"smoothing": smoothing, "ridge": ridge}
+    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, **penalties)
 
 
 def fit_shape(

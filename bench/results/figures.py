@@ -269,21 +269,31 @@ def plot_densities(path: Path, densities: Sequence[Density], swept: npt.NDArray[
             axes.set_title(title, fontsize=9, loc="left")
 
 
-def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
+def plot_coverage(
+    path: Path,
+    density: Density,
+    swept: npt.NDArray[np.bool_],
+    memory: MemoryCurve,
+    resolution: Floats | None = None,
+) -> None:
     """Draw which cells of a plane were swept, shape (K,) as in `Preisach`, and the memory curve at the end over them.
 
-    Of the density only the levels and units count.
+    With the resolution, shape (K,), from 0 to 1, it is drawn instead. Of the density only the levels and units count.
     """
     cells = np.full(density.values.shape, np.nan)
-    cells[np.tril_indices(len(cells))] = swept
+    cells[np.tril_indices(len(cells))] = swept if resolution is None else resolution
     corners = memory.corners(float(density.levels[0]), float(density.levels[-1]))
     with _figure(path, (4.6, 4.2), grid=False) as figure:
         axes = figure.subplots()
         image = np.ma.masked_invalid(cells)
-        axes.pcolormesh(density.levels, density.levels, image, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
+        mesh = axes.pcolormesh(density.levels, density.levels, image, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
         axes.plot(corners[:, 0], corners[:, 1], color=_COLORS[0], linewidth=1.5, label="memory curve")
         _frame_plane(axes, density)
-        axes.set_title(f"green: swept ({np.mean(swept):.0%} of the cells)")
+        if resolution is None:
+            axes.set_title(f"green: swept ({np.mean(swept):.0%} of the cells)")
+        else:
+            figure.colorbar(mesh, ax=axes, label="resolution (1: determined by the data)")
+            axes.set_title(f"swept: {np.mean(swept):.0%} of the cells", fontsize=9, loc="left")
         axes.legend(loc="lower right")
 
 

@@ -177,7 +177,9 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
         plot_densities(paths[-1], [density], swept)
         if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
             paths.append(folder / f"{name}-coverage.png")
-            plot_coverage(paths[-1], density, found.coverage.swept, found.file.memory)
+            swept = found.coverage.swept
+            resolution = found.resolution.diagonal[: swept.size] if found.resolution else None
+            plot_coverage(paths[-1], density, swept, found.file.memory, resolution)
     return paths
 
 
