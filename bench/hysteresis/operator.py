@@ -201,6 +201,11 @@ class Operator(Model, ABC, Generic[S]):
         return NumericalInverse(self, policy)
 
     @property
+    def input_units(self) -> tuple[str, ...]:
+        """The units of the inputs that the model is for, the usual one first; none if it is for any."""
+        return ()
+
+    @property
     def plane(self) -> tuple[float, float] | None:
         """The range beyond which no part of the memory remains, input units; None if there is none."""
         return None

@@ -393,6 +393,11 @@ class Preisach(Operator[MemoryCurve]):
         return FallingInverse(self, policy) if falling else PreisachInverse(self, policy)
 
     @property
+    def input_units(self) -> tuple[str, ...]:
+        """Those of the reversible part."""
+        return () if self.reversible is None else self.reversible.input_units
+
+    @property
     def plane(self) -> tuple[float, float]:
         """The range of the levels."""
         return float(self.levels[0]), float(self.levels[-1])

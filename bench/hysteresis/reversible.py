@@ -27,6 +27,11 @@ class Reversible(Protocol):
         """Whether physics demands coefficients >= 0."""
         ...
 
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """The units of the inputs that the term is for, the usual one first; none if it is for any."""
+        ...
+
     def with_coefficients(self, coefficients: Sequence[float]) -> Reversible:
         """Return the same term with other coefficients."""
         ...
@@ -68,6 +73,7 @@ class QuadraticTerm(Document):
     """
 
     kind: ClassVar[str] = "quadratic"
+    input_units: ClassVar[tuple[str, ...]] = ()
     linear: float = 0.0
     quadratic: float | None = None
     origin: float = 0.0
@@ -135,6 +141,7 @@ class PolynomialTerm(Document):
     """
 
     kind: ClassVar[str] = "polynomial"
+    input_units: ClassVar[tuple[str, ...]] = ()
     series: tuple[float, ...]
     low: float
     high: float
@@ -223,6 +230,7 @@ class ThermalExpansion(Document):
     """
 
     kind: ClassVar[str] = "thermal-expansion"
+    input_units: ClassVar[tuple[str, ...]] = ("°C", "degC", "C", "℃", "K")
     k0: float
     k1: float
     low: float

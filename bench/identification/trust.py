@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.hysteresis import Operator, ThermalExpansion
+from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def judge_fit(problem: FitProblem, found: Fit, errors: Floats, *, initial: str |
     signed = not problem.spec.constrained or not problem.template.nonnegative().any()
     return [
         *_plane(problem),
-        *_thermal(problem.template),
+        *_unit(problem.template),
         *_free(found, signed),
         *_explained(explained, problem.template, signed),
         *([] if signed or explained >= _GOOD else _butterfly(problem, left)),
@@ -179,14 +179,12 @@ def _plane(problem: FitProblem) -> list[str]:
     ]
 
 
-def _thermal(template: Operator[Any]) -> list[str]:
-    unit = template.input_unit.strip().lower().removeprefix("deg").removeprefix("°").strip()
-    if not isinstance(getattr(template, "reversible", None), ThermalExpansion):
-        return []
-    if unit in ("", "c", "k", "f", "℃", "℉", "celsius", "kelvin", "fahrenheit"):
+def _unit(template: Operator[Any]) -> list[str]:
+    unit = template.input_unit.strip()
+    if not unit or not template.input_units or unit in template.input_units:
         return []
     return [
-        f"the thermal term of this model is that of an input in °C; this one is in {template.input_unit}: use "
+        f"the reversible part of this model is for an input in {template.input_units[0]}; this one is in {unit}: use "
         "--model preisach --reversible polynomial"
     ]
 

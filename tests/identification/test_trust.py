@@ -85,7 +85,7 @@ def noise():
             (INPUTS, measured(INPUTS)),
             "preisach-nonmonotonic",
             {"input_unit": "V"},
-            r"^the thermal term .* in V: use --model preisach --reversible polynomial$",
+            r"^the reversible part .* in °C; this one is in V: use --model preisach --reversible polynomial$",
         ),
     ],
 )
