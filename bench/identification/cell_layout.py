@@ -46,12 +46,6 @@ class CellLayout:
             order = 0
         return cls(order, np.arange(columns), np.zeros(columns, dtype=np.int64))
 
-    def grid(self, values: Floats) -> Floats:
-        """Return values by layer, row and column of the plane, with a border; -inf where there is no column."""
-        result = np.full((2, self.order + 2, self.order + 2), -np.inf)
-        result[self._places()] = values
-        return result
-
     def _places(self) -> tuple[Indices, Indices, Indices]:
         rows, columns = np.tril_indices(self.order)
         return self.layers, rows[self.cells] + 1, columns[self.cells] + 1
@@ -82,16 +76,6 @@ class CellLayout:
         i, j = rows[self.cells] // 2, columns[self.cells] // 2
         merged, parents = np.unique(np.column_stack([self.layers, i * (i + 1) // 2 + j]), axis=0, return_inverse=True)
         return CellLayout((self.order + 1) // 2, merged[:, 1], merged[:, 0]), parents.ravel()
-
-    def around(self, chosen: Flags) -> Flags:
-        """Return the chosen columns and their neighbours in the plane."""
-        plane = self.grid(chosen.astype(np.float64)) > 0.0
-        wide = plane.copy()
-        wide[:, 1:] |= plane[:, :-1]
-        wide[:, :-1] |= plane[:, 1:]
-        wide[:, :, 1:] |= plane[:, :, :-1]
-        wide[:, :, :-1] |= plane[:, :, 1:]
-        return wide[self._places()]
 
     def roughness(self) -> csr_array:
         """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""

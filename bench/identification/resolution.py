@@ -17,11 +17,12 @@ import numpy as np
 from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout
+from bench.identification.collapse import LONG, collapse
 from bench.identification.least_squares import one_thread
 from bench.identification.normal_equations import normal_equations
 
-AFFORDABLE = 1326
-"""Coefficients up to which the resolution takes at most a second."""
+# Coefficients, and samples times their square, up to which it takes about a second.
+_MOST, _WORK = 1330, 2e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,8 @@ class Resolution:
 
 def resolve(
     regressor: Regressor, weights: Floats, skip: int = 0, smoothing: float = 0.0, ridge: float = 0.0
-) -> Resolution:
-    """Return the resolution of all coefficients by a sequence: O(N K² + K³) operations, 24 K² bytes.
+) -> Resolution | None:
+    """Return the resolution of all coefficients by a sequence; None if it would take longer than about a second.
 
     Parameters
     ----------
@@ -62,6 +63,12 @@ def resolve(
         Weights of the penalties of `fit`.
     """
     count, cells = regressor.shape[1], regressor.base.size
+    if weights.size >= LONG:
+        w = np.where(np.arange(weights.size) < skip, 0.0, weights)
+        if (short := collapse(regressor, np.zeros(w.size), w)) is not None:
+            regressor, weights, skip = short.regressor, short.weights, 0
+    if count > _MOST or weights.size * count**2 > _WORK:
+        return None
     gram = normal_equations(regressor, np.zeros(weights.size), weights, skip)[0]
     sums, total = gram[:count, count], gram[count, count]
     gram = gram[:count, :count] - np.outer(sums, sums) / total

@@ -20,6 +20,8 @@ from bench.identification.least_squares import Fit, fit, fit_minimum_norm
 _TOLERANCE = 1e-10
 # Relative step of the differences: a constrained linear fit is exact to about 1e-12.
 _STEP = 1e-6
+# Cells of a dense normal matrix: 0.5 GB.
+_MOST_CELLS = 8001
 
 
 def fit_operator(
@@ -38,6 +40,11 @@ def fit_operator(
     """
     if not constrained and not smoothing and not ridge:
         return fit_minimum_norm(regressor, outputs, weights=weights, skip=skip)
+    if not constrained and regressor.base.size > _MOST_CELLS:
+        raise ValueError(
+            f"levels: penalties on a density of either sign take at most {_MOST_CELLS} cells (126 levels), got "
+            f"{regressor.base.size}; give fewer levels, or smoothing 0 and ridge 0"
+        )
     signs = operator.nonnegative() if constrained else False
     penalties = {"smoothing": smoothing, "ridge": ridge}
     return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, **penalties)

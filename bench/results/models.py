@@ -31,7 +31,7 @@ from bench.identification import (
     identify,
 )
 from bench.identification.regularization import Regularization
-from bench.identification.resolution import AFFORDABLE, Resolution, resolve
+from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
 from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
@@ -243,11 +243,11 @@ def identify_file(
     warnings += found.warnings
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
     resolution: Resolution | None = None
-    if coverage is not None and coverage.swept.size <= AFFORDABLE:
+    if coverage is not None:
         regressor = found.model.regressor(inputs, found.initial_state)
-        weights = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
-        resolution = resolve(regressor, np.ones(inputs.size), found.skip, weights.smoothing, weights.ridge)
+        resolution = resolve(regressor, np.ones(inputs.size), found.skip, penalties.smoothing, penalties.ridge)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -258,6 +258,8 @@ def identify_file(
         "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "smoothing": penalties.smoothing,
+        "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
     file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)

@@ -146,6 +146,12 @@ def test_a_given_weight_is_kept():
     assert identify("polynomial", inputs, outputs).regularization is None
 
 
+def test_a_plane_too_fine_for_a_dense_matrix_is_refused():
+    inputs = reversals(2, 3)
+    with pytest.raises(ValueError, match=r"levels: penalties .* at most 8001 cells .*, got 20100; give fewer levels"):
+        identify("preisach-signed", inputs, inputs**2, levels=200)
+
+
 def test_few_samples_and_a_constant_record_are_fitted():
     few = identify("preisach-signed", [0.0, 1.0, 0.5], [0.0, 1.0, 0.7], levels=4)
     assert np.isfinite(few.model.density).all()
