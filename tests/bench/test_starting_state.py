@@ -70,7 +70,7 @@ def test_a_model_has_the_errors_of_its_identification_on_its_data(tmp_path, data
 
 
 def printed_errors(out):
-    return [line.split(None, 2)[2] for line in out.splitlines() if "error" in line and "range" in line]
+    return [line.split(None, 2)[2].rstrip() for line in out.splitlines() if "error" in line and "range" in line]
 
 
 @pytest.mark.parametrize(
