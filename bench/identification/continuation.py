@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Operator, Preisach, _checks, uniform_levels
+from bench.hysteresis import MemoryCurve, Operator, Preisach, ThermalExpansion, _checks, uniform_levels
 from bench.hysteresis._checks import Floats
 from bench.identification.excitation import ramps
 from bench.identification.information import (
@@ -145,7 +145,10 @@ def _continue(
     noise: float,
 ) -> Continuation:
     """Return the tails for a number of set-points that are left."""
-    operator, step = _coarse(operator)
+    coarse, step = _coarse(operator)
+    if coarse is not operator and not isinstance(state, MemoryCurve):
+        state = None
+    operator = coarse
     scaling = Scaling.of(operator, noise)
     data = scaling.rows(operator, measured, state)
     spread = covariance(data)
@@ -192,15 +195,17 @@ def _coarse(operator: Operator[Any]) -> tuple[Operator[Any], float]:
     """Return an operator for which tails are chosen in little time, and their step."""
     low, high = operator.input_range
     intervals = 20
-    if isinstance(operator, Preisach):
-        intervals = min(operator.levels.size - 1, _FINEST)
-        if operator.levels.size - 1 > _FINEST:
-            levels = uniform_levels(float(operator.levels[0]), float(operator.levels[-1]), _FINEST)
+    if densities := operator.densities():
+        levels = densities[0].levels
+        intervals = min(levels.size - 1, _FINEST)
+        if levels.size - 1 > _FINEST:
+            ends = float(levels[0]), float(levels[-1])
             operator = Preisach(
-                levels,
+                uniform_levels(*ends, _FINEST),
                 np.zeros(_FINEST * (_FINEST + 1) // 2),
-                reversible=operator.reversible,
-                input_range=operator.input_range,
+                # It stands for any reversible part of two coefficients.
+                reversible=ThermalExpansion(0.0, 0.0, *ends, low),
+                input_range=(low, high),
             )
     count = operator.coefficients.size
     if count > _MOST_COEFFICIENTS:
