@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bench.hysteresis import _checks
 
@@ -39,6 +39,10 @@ class CoupledStream(Generic[S]):
     def state(self) -> S:
         """Present state, as a value."""
         return self._state
+
+    def __reduce__(self) -> tuple[type[Any], tuple[Any, Any]]:
+        # A copy has arrays of its own.
+        return type(self), (self.model, self.state)
 
 
 class TwoStageStream(CoupledStream["TwoStageState"]):

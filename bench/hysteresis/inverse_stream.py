@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bench.hysteresis import _checks
 from bench.hysteresis.inverse import Reach
@@ -83,6 +83,10 @@ class InverseStream(Generic[S]):
     def state(self) -> S:
         """Present state, as a value."""
         return self._forward.state
+
+    def __reduce__(self) -> tuple[type[Any], tuple[Any, Any]]:
+        # A copy has arrays of its own.
+        return type(self), (self.inverse, self.state)
 
 
 class PreisachInverseStream(InverseStream[MemoryCurve]):

@@ -64,6 +64,10 @@ class Stream(Generic[S]):
         """Present state, as a value."""
         return self._state
 
+    def __reduce__(self) -> tuple[type[Any], tuple[Any, Any]]:
+        # A copy has arrays of its own.
+        return type(self), (self.operator, self.state)
+
 
 class PreisachStream(Stream[MemoryCurve]):
     """A Preisach operator and its memory on arrays; equal to `Preisach.evaluate` to the last bit."""

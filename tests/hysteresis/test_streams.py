@@ -1,7 +1,9 @@
 """Streams are equal to whole sequences to the last bit, and to an oracle that keeps the whole past."""
 
+import copy
 import gc
 import math
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -330,3 +332,23 @@ def test_the_state_of_a_stream_is_a_value():
     stream.step(0.5)
     assert kept == MemoryCurve.from_positive_saturation(0.8).step(0.2)
     assert operator.state_from_json(operator.state_to_json(stream.state)) == stream.state
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda stream: pickle.loads(pickle.dumps(stream))])
+def test_a_copy_of_a_stream_has_a_memory_of_its_own(copied):
+    rng = np.random.default_rng(14)
+    operator, relaxed = preisach(rng, 6, term=None), plays(rng)
+    for stream in (operator.stream(), relaxed.stream(), Polynomial(np.array([0.6]), (0.0, 1.0), 0.2).stream()):
+        stream.step(0.6)
+        other = copied(stream)
+        assert other.step(0.3) == copied(stream).step(0.3)
+        assert stream.step(0.6) == copied(stream).step(0.6)
+    for stream in (operator.inverse().stream(), relaxed.inverse().stream()):
+        stream.move(0.6)
+        target = stream.value
+        other = copied(stream)
+        other.move(0.1)
+        assert stream.value == target
+    model = TwoStage(operator, preisach(rng, 5, -3.0, 2.0)).stream()
+    length = model.step(0.6, 0.2)
+    assert copied(model).step(0.6, 0.2) == length
