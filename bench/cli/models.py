@@ -80,6 +80,13 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
+        ),
+    ] = "auto",
     options: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE", help="Another numerical option of the model; repeatable."),
@@ -116,6 +123,7 @@ def identify_(
             smoothing=smoothing,
             skip=skip,
             initial=initial,
+            orientation=orientation,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
             reading=reading,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from sim_devices.plants.friction_muscle import contact_table
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.friction_muscle import contact_table
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
