@@ -93,10 +93,21 @@ def _pieces(words: Words) -> memory.Pieces:
 
 
 @njit(cache=True, forceinline=True)
+def _below(words: Words) -> Floats:
+    return carray(pointer(words[BELOW]), words[LEVEL_COUNT], np.float64)
+
+
+@njit(cache=True, forceinline=True)
 def _output(words: Words, numbers: Floats, plane: memory.Plane) -> float:
-    below = carray(pointer(words[BELOW]), words[LEVEL_COUNT], np.float64)
     return memory.output_at(
-        plane, below, numbers[OFFSET], _terms(words), numbers[INPUT], numbers[PRESENT], words[CELL], numbers[MASS]
+        plane,
+        _below(words),
+        numbers[OFFSET],
+        _terms(words),
+        numbers[INPUT],
+        numbers[PRESENT],
+        words[CELL],
+        numbers[MASS],
     )
 
 
@@ -173,12 +184,14 @@ def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> 
         words[NEAREST] != 0,
         words[MONOTONE] != 0,
     )
-    left, height, _, _, _ = _pieces(words)
     count, first, last, error, walked = inverse.invert(
         plane,
+        _below(words),
+        numbers[OFFSET],
         _terms(words),
         ends,
-        (left, height, words[PIECE_COUNT]),
+        _pieces(words),
+        (words[PIECE_COUNT], numbers[PRESENT], words[CELL], numbers[MASS]),
         numbers[INPUT],
         numbers[OUTPUT],
         target,
