@@ -14,6 +14,7 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.coverage import Coverage
 from bench.hysteresis.documents import Model
 from bench.hysteresis.regressor import Regressor
+from bench.hysteresis.stream import Stream
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse import Inverse, Policy
@@ -112,6 +113,10 @@ class Operator(Model, ABC, Generic[S]):
         """Return the output of a state."""
         return self.step(state, self.present_input(state))[1]
 
+    def stream(self, state: S | None = None) -> Stream[S]:
+        """Return the operator with a memory of its own, for one sample at a time, from a state (default: initial)."""
+        return Stream(self, self.initial_state() if state is None else state)
+
     def saturated_state(self, direction: int, value: float | None = None) -> S:
         """Return the state at an input that was reached from far beyond the other end of the operating range.
 
@@ -164,6 +169,13 @@ class Operator(Model, ABC, Generic[S]):
     def shape_starts(self) -> Sequence[Sequence[float]]:
         """Return the shapes from which their fit starts; the best end is taken. By default the present one."""
         return [self.shape_parameters().values]
+
+    def shifted(self, offset: float) -> Self:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite, or such an operator cannot be shifted.
+        """
+        raise ValueError(f"the input of a {self.kind} operator cannot be shifted (by {offset:g} {self.input_unit})")
 
     def output_range(self) -> tuple[float, float]:
         """Return least and greatest output over all reachable states; by default those of the major loop."""

@@ -20,6 +20,7 @@ from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import Reversible, reversible_from_json
+from bench.hysteresis.stream import PreisachStream
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse import Inverse, Policy
@@ -257,6 +258,10 @@ class Preisach(Operator[MemoryCurve]):
         after = state.step(value)
         return after, self.value(after)
 
+    def stream(self, state: MemoryCurve | None = None) -> PreisachStream:
+        """Return the operator with a memory of its own, compiled; see `Operator.stream`."""
+        return PreisachStream(self, self.initial_state() if state is None else state)
+
     def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
         """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).
 
@@ -408,6 +413,21 @@ class Preisach(Operator[MemoryCurve]):
         signs = np.ones(self.coefficients.size, dtype=bool)
         signs[self.density.size :] = self.reversible is not None and self.reversible.nonnegative
         return signs
+
+    def shifted(self, offset: float) -> Preisach:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite.
+        """
+        moved = _checks.number("offset", offset)
+        low, high = self.input_range
+        return replace(
+            self,
+            levels=self.levels - moved,
+            reversible=None if self.reversible is None else self.reversible.shifted(moved),
+            # Not less than the plane by rounding.
+            input_range=(min(low - moved, self.levels[0] - moved), max(high - moved, self.levels[-1] - moved)),
+        )
 
     def densities(self) -> tuple[Density, ...]:
         """Return the density on its plane."""

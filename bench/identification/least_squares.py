@@ -14,6 +14,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
 from bench.identification.cholesky_factor import DEPENDENT, MANY, CholeskyFactor
 from bench.identification.collapse import LONG, collapse
+from bench.identification.fit_progress import say_fit_progress
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -507,6 +508,7 @@ class _ActiveSet:
             g[~self.constrained] = 0.0
             if g.max(initial=0.0) <= tolerance:
                 break
+            say_fit_progress(float(g.max()) / self.size)
             if g[~barred].max(initial=0.0) <= tolerance:
                 threshold = next(stricter, None)
                 if threshold is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +16,17 @@ from bench.hysteresis import (
     Coverage,
     Operator,
     Policy,
-    Preisach,
     Reach,
-    ThermalExpansion,
     find_model,
     identifiable_models,
-    uniform_levels,
 )
 from bench.identification import (
-    Assessment,
     Comparison,
     CrossValidation,
     Errors,
     Identification,
-    assess,
     compare,
-    covering_sequence,
     cross_validate,
-    damped_oscillation,
-    first_order_reversals,
     identify,
     measure_errors,
 )
@@ -43,9 +35,13 @@ from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
+from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
+from bench.results.examined import Examined, band_columns, examine
 from bench.results.joined_files import fitted_rows, read_files
+from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
+from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
 
 Floats = npt.NDArray[np.float64]
@@ -97,6 +93,17 @@ class IdentifiedFile:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
 
+    def predictions(self) -> Predictions:
+        """Return the outputs of the model beside the measurements, as the fit has them."""
+        operator, names = self.file.operator, self.file.provenance
+        return Predictions(
+            Quantity(names["input"], operator.input_unit, self.inputs),
+            operator.output_unit,
+            {self.file.name: self.outputs - self.identification.residuals},
+            Quantity(names["output"], operator.output_unit, self.outputs),
+            skip=self.identification.skip,
+        )
+
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
         found = self.identification
@@ -126,6 +133,7 @@ class IdentifiedFile:
             "return_points": self.return_points.to_json(),
             "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
+            **band_json(self.file, self.inputs, found.initial_state),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
@@ -133,7 +141,7 @@ class IdentifiedFile:
 def option_names(model: str) -> tuple[str, ...]:
     """Return the names of the options that `identify_file` takes for a registered model."""
     own = [option.name for option in model_options(find_model(model))]
-    return (*own, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated")
+    return (*own, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
 
 
 def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -174,6 +182,7 @@ def identify_file(
     weights_column: str | None = None,
     levels_to_try: Sequence[int] = (),
     train: slice | None = None,
+    band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
@@ -199,6 +208,8 @@ def identify_file(
         Values of the option `levels` among which cross-validation chooses.
     train : slice, optional
         Rows that are fitted; all others still drive the memory. The errors are those of the rows fitted.
+    band : bool
+        Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
@@ -269,6 +280,8 @@ def identify_file(
         found = identify(
             model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
         )
+        penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     if not fitted.all():
@@ -298,7 +311,7 @@ def identify_file(
         "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance, found.initial_state)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)
     return IdentifiedFile(
         file,
         found,
@@ -475,18 +488,28 @@ class ComparedModels:
     ----------
     comparisons : mapping of str to Comparison
         By the model file's name.
-    unit : str
-        Unit of the output.
-    skip : int
-        Number of first rows left out of the errors.
+    predictions : Predictions
+        What each model gives, row by row.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
+    examined : mapping of str to Examined
+        The session recalibrated and the band of each model, by the same names.
     """
 
     comparisons: Mapping[str, Comparison]
-    unit: str
-    skip: int = 0
+    predictions: Predictions
     assumptions: str = ""
+    examined: Mapping[str, Examined] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
+
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
@@ -496,9 +519,16 @@ class ComparedModels:
                 "rezeroed": errors_json(entry.rezeroed),
                 "offset": entry.offset,
                 "skipped": self.skip,
+                **(self.examined[name].to_json() if name in self.examined else {}),
+                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
             }
             for name, entry in self.comparisons.items()
         }
+
+    def recalibrated(self, name: str) -> Errors | None:
+        """Return a model's errors after recalibration, over the same rows as the others; None without one."""
+        found = self.examined.get(name)
+        return None if found is None or found.recalibration is None else found.errors()
 
 
 def compare_models(
@@ -509,6 +539,7 @@ def compare_models(
     *,
     skip: int | None = None,
     initial: str | None = None,
+    session: Session | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -524,6 +555,8 @@ def compare_models(
     skip, initial
         First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
         the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
+    session : Session, optional
+        What is estimated of the session for each model; the rows that it uses do not count either.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -551,35 +584,18 @@ def compare_models(
         starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
     states = {name: start.state for name, start in starts.items()}
     most = max(start.skip for start in starts.values())
-    comparisons = compare(operators, inputs, outputs, states=states, skip=most)
-    return ComparedModels(comparisons, files[0].operator.output_unit, most, columns.assumptions)
-
-
-def assess_designs(
-    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
-) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
-
-    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
-    ConfigurationError if the ranges do not fit.
-    """
-    low, high = operating
-    try:
-        grid = uniform_levels(*plane, levels)
-        # The term stands for any reversible part of two coefficients.
-        operator = Preisach(
-            grid,
-            np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
-            input_range=operating,
-        )
-        span = high - low
-        sequences = {
-            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
-            "first-order-reversals": first_order_reversals(grid, operating),
-            "covering, fewest": covering_sequence(grid, operating),
-            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
-        }
-        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
-    except ValueError as error:
-        raise ConfigurationError(f"design: {error}") from None
+    examined = {
+        name: examine(file, inputs, outputs, state=states[name], session=session, skip=most)
+        for name, file in zip(operators, files, strict=True)
+    }
+    first = most if session is None else session.first_unused(inputs.size, most)
+    comparisons = compare(operators, inputs, outputs, states=states, skip=first)
+    predictions = Predictions(
+        Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
+        files[0].operator.output_unit,
+        {name: entry.predicted for name, entry in examined.items()},
+        Quantity(names[1], columns.units[names[1]], outputs),
+        skip=first,
+        further=band_columns(examined),
+    )
+    return ComparedModels(comparisons, predictions, columns.assumptions, examined)

@@ -10,3 +10,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 settings.register_profile("compiled", deadline=None)
 settings.load_profile("compiled")
+
+# Several of these tests share the plants of `other_plants`.
+sys.path.insert(0, str(Path(__file__).parent))
