@@ -413,6 +413,21 @@ class Preisach(Operator[MemoryCurve]):
         signs[self.density.size :] = self.reversible is not None and self.reversible.nonnegative
         return signs
 
+    def shifted(self, offset: float) -> Preisach:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite.
+        """
+        moved = _checks.number("offset", offset)
+        low, high = self.input_range
+        return replace(
+            self,
+            levels=self.levels - moved,
+            reversible=None if self.reversible is None else self.reversible.shifted(moved),
+            # Not less than the plane by rounding.
+            input_range=(min(low - moved, self.levels[0] - moved), max(high - moved, self.levels[-1] - moved)),
+        )
+
     def densities(self) -> tuple[Density, ...]:
         """Return the density on its plane."""
         return (Density("", self.levels, self.density_matrix(), self.input_unit, self.output_unit),)

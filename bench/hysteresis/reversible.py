@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -34,6 +34,10 @@ class Reversible(Protocol):
 
     def with_coefficients(self, coefficients: Sequence[float]) -> Reversible:
         """Return the same term with other coefficients."""
+        ...
+
+    def shifted(self, offset: float) -> Reversible:
+        """Return the term whose value at an input u is that of this one at u + offset."""
         ...
 
     def columns(self, inputs: ArrayLike) -> Floats:
@@ -96,6 +100,10 @@ class QuadraticTerm(Document):
         if values.size != self.coefficients.size:
             raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
         return QuadraticTerm(float(values[0]), None if self.quadratic is None else float(values[1]), self.origin)
+
+    def shifted(self, offset: float) -> QuadraticTerm:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        return replace(self, origin=self.origin - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return (u - origin) and, if present, (u - origin)², shape (N, 1) or (N, 2)."""
@@ -161,6 +169,10 @@ class PolynomialTerm(Document):
         if values.size != len(self.series):
             raise ValueError(f"coefficients: expected {len(self.series)} values, got {values.size}")
         return PolynomialTerm(tuple(values.tolist()), self.low, self.high, self.knots)
+
+    def shifted(self, offset: float) -> PolynomialTerm:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        return replace(self, low=self.low - offset, high=self.high - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return the interpolants of T_1, T_2, ... at the inputs, shape (N, n)."""
@@ -247,6 +259,11 @@ class ThermalExpansion(Document):
         if values.size != 2:
             raise ValueError(f"coefficients: expected k0 and k1, got {values.size} values")
         return ThermalExpansion(float(values[0]), float(values[1]), self.low, self.high, self.reference)
+
+    def shifted(self, offset: float) -> ThermalExpansion:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        low, high, reference = (value - offset for value in (self.low, self.high, self.reference))
+        return replace(self, low=low, high=high, reference=reference)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return -(1 - θ)(T - T0) and -θ (T - T0), shape (N, 2)."""
