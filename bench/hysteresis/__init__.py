@@ -3,13 +3,14 @@
 from bench.hysteresis.coverage import Coverage
 from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model
-from bench.hysteresis.inverse import Inverse, Inversion, Policy, Reach
+from bench.hysteresis.inverse import Inverse, Inversion, Policy
 from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.models import ModelSpec, find_model, identifiable_models, model_class, model_from_json
 from bench.hysteresis.operator import Operator, Shape, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
 from bench.hysteresis.prandtl_ishlinskii import DeadZones, PrandtlIshlinskii
 from bench.hysteresis.preisach import Preisach, Segment, uniform_levels
+from bench.hysteresis.reach import Reach
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import (
     PolynomialTerm,
@@ -18,7 +19,8 @@ from bench.hysteresis.reversible import (
     ThermalExpansion,
     reversible_from_json,
 )
-from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage, TwoStageState
+from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage
+from bench.hysteresis.two_stage_state import TwoStageState
 
 __all__ = [
     "Coupled",
