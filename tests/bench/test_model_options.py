@@ -1,6 +1,7 @@
 """The options of a model on the command line: all can be set, and a wrong one is one clear message."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,6 +88,8 @@ def test_levels_may_be_given_or_lie_where_the_input_turns(bench, table):
     assert operator.order == 10
     assert np.ptp(np.diff(operator.levels)) > 0.1
     assert found["rms_percent"] < 2.0
+    targets = operator.evaluate(np.sin(np.arange(50.0)))
+    np.testing.assert_allclose(operator.inverse().follow(targets).outputs, targets, atol=1e-12)
 
 
 def test_the_weight_of_a_row(bench, table):
@@ -134,6 +137,12 @@ def test_the_list_says_what_each_model_takes(bench, tmp_path):
         _, shown, _ = bench("list", name)
         assert all(option in shown for option in listed[name]["options"])
         assert "inverse: exact" in shown
+
+
+def test_every_model_is_described():
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "models.md").read_text(encoding="utf-8")
+    for name in identifiable_models():
+        assert f"| `{name}` |" in page
 
 
 def test_every_option_of_every_model_is_explained():
