@@ -14,6 +14,7 @@ from bench.hysteresis import (
     GeneralizedPrandtlIshlinskii,
     KrasnoselskiiPokrovskii,
     MaxwellSlip,
+    PrandtlIshlinskii,
     Preisach,
     uniform_levels,
 )
@@ -44,6 +45,11 @@ def operators() -> None:
     inverse = PreisachInverse(operator)
     inverse.invert(state, 0.1)
     inverse.follow([0.1, 0.2])
+    stream = inverse.stream(state)
+    stream.find(0.1)
+    stream.step(0.1)
+    stream.move(0.2)
+    PrandtlIshlinskii([0.0, 0.1], [1.0, 1.0]).stream().step(0.2)
     Adapter(operator).update(0.5, 0.1).update(0.8, 0.3)
     identify("preisach-nonmonotonic", inputs, outputs, input_range=(0.0, 1.0), plane=(0.0, 1.0), reference=0.0)
     identify("prandtl-ishlinskii", inputs, outputs, input_range=(0.0, 1.0))
