@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +16,30 @@ from bench.hysteresis import (
     Coverage,
     Operator,
     Policy,
-    Preisach,
     Reach,
-    ThermalExpansion,
     find_model,
     identifiable_models,
-    uniform_levels,
 )
 from bench.identification import (
-    Assessment,
     Comparison,
     CrossValidation,
     Errors,
     Identification,
-    assess,
     compare,
-    covering_sequence,
     cross_validate,
-    damped_oscillation,
-    first_order_reversals,
     identify,
 )
 from bench.identification.options import check_options, model_options
+from bench.identification.regularization import Regularization
+from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
-from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.bands import band_json, calibrate
+from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
+from bench.results.examined import Examined, band_columns, examine
+from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
+from bench.results.recalibrations import Session
+from bench.results.starting_state import StartingState, digest, starting_state
 
 Floats = npt.NDArray[np.float64]
 
@@ -65,6 +64,8 @@ class IdentifiedFile:
         The measurements.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
+    resolution : Resolution or None
+        What the data say of each coefficient; None for a model without a plane, or with one too fine for it.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
     assumptions : str
@@ -77,6 +78,7 @@ class IdentifiedFile:
     inputs: Floats
     outputs: Floats
     coverage: Coverage | None = None
+    resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
 
@@ -84,11 +86,23 @@ class IdentifiedFile:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
 
+    def predictions(self) -> Predictions:
+        """Return the outputs of the model beside the measurements, as the fit has them."""
+        operator, names = self.file.operator, self.file.provenance
+        return Predictions(
+            Quantity(names["input"], operator.input_unit, self.inputs),
+            operator.output_unit,
+            {self.file.name: self.outputs - self.identification.residuals},
+            Quantity(names["output"], operator.output_unit, self.outputs),
+            skip=self.identification.skip,
+        )
+
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
         found = self.identification
         certificate = found.certificate
         operator = self.file.operator
+        penalties = found.regularization
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -98,14 +112,19 @@ class IdentifiedFile:
             "converged": certificate.converged,
             "passive": certificate.passive,
             "active": certificate.active,
+            "rank": self.resolution.rank if self.resolution else None,
+            "exchangeable": certificate.exchangeable,
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
-            "smoothing": self.trials.best.smoothing if self.trials else None,
+            "smoothing": self.trials.best.smoothing if self.trials else penalties and penalties.smoothing,
+            "ridge": penalties and penalties.ridge,
+            "cross_validated_rms": penalties and penalties.rms,
             "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
+            **band_json(self.file, self.inputs, found.initial_state),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
@@ -113,7 +132,7 @@ class IdentifiedFile:
 def option_names(model: str) -> tuple[str, ...]:
     """Return the names of the options that `identify_file` takes for a registered model."""
     own = [option.name for option in model_options(find_model(model))]
-    return (*own, "smoothing", "skip", "initial", "orientation", "cross_validated")
+    return (*own, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
 
 
 def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -147,11 +166,13 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
     weights_column: str | None = None,
     levels_to_try: Sequence[int] = (),
+    band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
@@ -165,8 +186,8 @@ def identify_file(
         Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float, optional
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
@@ -175,6 +196,8 @@ def identify_file(
         Column of the weight of each row, >= 0 (inverse variance, say).
     levels_to_try : sequence of int
         Values of the option `levels` among which cross-validation chooses.
+    band : bool
+        Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
@@ -209,6 +232,7 @@ def identify_file(
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
     weights = columns.values[weights_column] if weights_column else None
+    check_variation(columns, output_column)
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
@@ -219,32 +243,63 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            penalties = SMOOTHING if cross_validated else (smoothing,)
+            ridge = ridge or 0.0
+            # A signed density is not fitted without a penalty.
+            tried = cross_validated or (smoothing is None and not find_model(model).constrained)
             trials = cross_validate(
-                model, inputs, outputs, smoothing=penalties, levels=orders, weights=weights, skip=skip, **others
+                model,
+                inputs,
+                outputs,
+                smoothing=SMOOTHING if tried else (smoothing or 0.0,),
+                ridge=ridge,
+                levels=orders,
+                weights=weights,
+                skip=skip,
+                **others,
             )
             smoothing = trials.best.smoothing
             if trials.best.levels is not None and levels_to_try:
                 options["levels"] = trials.best.levels
-        found = identify(model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, **options)
+        found = identify(
+            model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
+        )
+        penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
+    penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+    resolution: Resolution | None = None
+    if coverage is not None:
+        regressor = found.model.regressor(inputs, found.initial_state)
+        resolution = resolve(regressor, np.ones(inputs.size), found.skip, penalties.smoothing, penalties.ridge)
     provenance = {
         "source": path.name,
         "input": input_column,
         "output": output_column,
         "rows": int(inputs.size),
-        "skipped": skip,
+        "skipped": found.skip,
+        "initial": options.get("initial"),
+        "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "smoothing": penalties.smoothing,
+        "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)
     return IdentifiedFile(
-        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
+        file,
+        found,
+        tuple(dict.fromkeys(warnings)),
+        inputs,
+        outputs,
+        coverage,
+        resolution,
+        trials,
+        columns.assumptions,
     )
 
 
@@ -259,7 +314,7 @@ def _largest(uncertainties: Floats) -> float | None:
     return float(known.max()) if known.size else None
 
 
-def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) -> Floats:
+def predict(model: ModelFile, inputs: Floats, *, initial: str | None = None, continue_memory: bool = False) -> Floats:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
     Parameters
@@ -268,11 +323,11 @@ def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) 
         The model.
     inputs : ndarray, shape (N,)
         Inputs in the unit of the model, finite.
-    continue_memory : bool
-        Start from the memory that the model file keeps, the end of its identification data, rather than from
-        the state from which identification started.
+    initial, continue_memory
+        The state before the first input, as for `starting_state`.
     """
-    return np.asarray(model.operator.evaluate(inputs, model.memory if continue_memory else None))
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    return np.asarray(model.operator.evaluate(inputs, start.state))
 
 
 @dataclass(frozen=True)
@@ -301,7 +356,12 @@ class InvertedTargets:
 
 
 def invert_targets(
-    model: ModelFile, targets: Floats, *, policy: Policy = "nearest", continue_memory: bool = False
+    model: ModelFile,
+    targets: Floats,
+    *,
+    policy: Policy = "nearest",
+    initial: str | None = None,
+    continue_memory: bool = False,
 ) -> InvertedTargets:
     """Invert a model for a sequence of targets.
 
@@ -314,15 +374,16 @@ def invert_targets(
         Output units, finite.
     policy : {"nearest", "paper"}
         Which answer is taken where there are several.
-    continue_memory : bool
-        Start from the memory that the model file keeps rather than from the model's initial state.
+    initial, continue_memory
+        The state before the first target, as for `starting_state`.
 
     Raises
     ------
     DataError
         If it is a model of several inputs.
     """
-    found = model.operator.inverse(policy).follow(targets, model.memory if continue_memory else None)
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    found = model.operator.inverse(policy).follow(targets, start.state)
     flags = tuple(
         (Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
         for met, target, output in zip(found.met.tolist(), targets.tolist(), found.outputs.tolist(), strict=True)
@@ -362,13 +423,36 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
-        ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *_uniqueness(found, identified.resolution),
+        *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
     )
+
+
+def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
+    """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
+    certificate = found.certificate
+    is_least_norm = not find_model(found.model_name).constrained and found.regularization is None
+    if is_least_norm:
+        text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
+    else:
+        text = f"{certificate.passive} free, {certificate.active} held at zero"
+    lines = [("coefficients", text)]
+    if resolution is not None and not is_least_norm:
+        lines.append(("determined by data", resolution.summary()))
+    if certificate.exchangeable:
+        lines.append(
+            (
+                "not unique",
+                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                "changing the fit; they are resolved by --smoothing",
+            )
+        )
+    return lines
 
 
 @dataclass(frozen=True)
@@ -379,22 +463,47 @@ class ComparedModels:
     ----------
     comparisons : mapping of str to Comparison
         By the model file's name.
-    unit : str
-        Unit of the output.
+    predictions : Predictions
+        What each model gives, row by row.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
+    examined : mapping of str to Examined
+        The session recalibrated and the band of each model, by the same names.
     """
 
     comparisons: Mapping[str, Comparison]
-    unit: str
+    predictions: Predictions
     assumptions: str = ""
+    examined: Mapping[str, Examined] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
+
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
 
     def to_json(self) -> dict[str, Any]:
-        """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
+        """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
         return {
-            name: {"raw": errors_json(entry.raw), "rezeroed": errors_json(entry.rezeroed), "offset": entry.offset}
+            name: {
+                "raw": errors_json(entry.raw),
+                "rezeroed": errors_json(entry.rezeroed),
+                "offset": entry.offset,
+                "skipped": self.skip,
+                **(self.examined[name].to_json() if name in self.examined else {}),
+                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
+            }
             for name, entry in self.comparisons.items()
         }
+
+    def recalibrated(self, name: str) -> Errors | None:
+        """Return a model's errors after recalibration, over the same rows as the others; None without one."""
+        found = self.examined.get(name)
+        return None if found is None or found.recalibration is None else found.errors()
 
 
 def compare_models(
@@ -403,7 +512,9 @@ def compare_models(
     input_column: str | None,
     output_column: str | None,
     *,
-    skip: int = 0,
+    skip: int | None = None,
+    initial: str | None = None,
+    session: Session | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -416,8 +527,11 @@ def compare_models(
         A file that `read_columns` reads, or a run.
     input_column, output_column : str or None
         Columns; those that the first model was identified from if None.
-    skip : int
-        First rows that drive the memory but do not count.
+    skip, initial
+        First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
+        the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
+    session : Session, optional
+        What is estimated of the session for each model; the rows that it uses do not count either.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -426,7 +540,7 @@ def compare_models(
     DataError
         If a file cannot be used, or units do not fit.
     ConfigurationError
-        If `skip` leaves nothing.
+        If `skip` leaves nothing, or there is no such initial state.
     """
     files = [load_model(path) for path in paths]
     names = [
@@ -435,43 +549,28 @@ def compare_models(
     ]
     columns = read_columns(data, names, options=reading)
     inputs, outputs = (columns.values[name] for name in names)
-    if not 0 <= skip < inputs.size:
-        raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
     operators: dict[str, Operator[Any]] = {}
+    starts: dict[str, StartingState] = {}
     for path, file in zip(paths, files, strict=True):
         check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
         check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = file.operator
-    comparisons = compare(operators, inputs, outputs, skip=skip)
-    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions)
-
-
-def assess_designs(
-    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
-) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
-
-    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
-    ConfigurationError if the ranges do not fit.
-    """
-    low, high = operating
-    try:
-        grid = uniform_levels(*plane, levels)
-        # The term stands for any reversible part of two coefficients.
-        operator = Preisach(
-            grid,
-            np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
-            input_range=operating,
-        )
-        span = high - low
-        sequences = {
-            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
-            "first-order-reversals": first_order_reversals(grid, operating),
-            "covering, fewest": covering_sequence(grid, operating),
-            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
-        }
-        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
-    except ValueError as error:
-        raise ConfigurationError(f"design: {error}") from None
+        starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
+    states = {name: start.state for name, start in starts.items()}
+    most = max(start.skip for start in starts.values())
+    examined = {
+        name: examine(file, inputs, outputs, state=states[name], session=session, skip=most)
+        for name, file in zip(operators, files, strict=True)
+    }
+    first = most if session is None else session.first_unused(inputs.size, most)
+    comparisons = compare(operators, inputs, outputs, states=states, skip=first)
+    predictions = Predictions(
+        Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
+        files[0].operator.output_unit,
+        {name: entry.predicted for name, entry in examined.items()},
+        Quantity(names[1], columns.units[names[1]], outputs),
+        skip=first,
+        further=band_columns(examined),
+    )
+    return ComparedModels(comparisons, predictions, columns.assumptions, examined)

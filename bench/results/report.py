@@ -27,7 +27,10 @@ from bench.results.figures import (
     plot_loops,
     plot_signals,
 )
-from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json
+from bench.results.prediction_figures import draw_predictions
+from bench.results.predictions import Predictions
+from bench.results.starting_state import StartingState, starting_state
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
 from bench.units import format_numbers, header_with_unit, with_unit
@@ -129,12 +132,22 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
     return paths
 
 
-def draw_comparison(result: ComparedModels, out: Path) -> Path:
-    """Draw the residuals of compared models; return the file."""
-    path = _make_folder(out) / "residuals.png"
-    residuals = {name: entry.residuals for name, entry in result.comparisons.items()}
-    plot_errors(path, residuals, error_label=with_unit("error", result.unit))
-    return path
+def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
+    """Draw the residuals of compared models, their outputs and loops; return the files."""
+    folder = _make_folder(out)
+    path = folder / "residuals.png"
+    plot_errors(
+        path,
+        result.predictions.residuals(),
+        error_label=with_unit("error", result.unit),
+        skip=result.skip,
+    )
+    return [path, *draw_predictions(result.predictions, folder, "models")]
+
+
+def draw_predicted(found: Predictions, out: Path) -> list[Path]:
+    """Draw the outputs of one model; return the files."""
+    return draw_predictions(found, _make_folder(out), next(iter(found.predicted)))
 
 
 def _picture(record: Record, folder: Path) -> Path:
@@ -156,23 +169,17 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     folder = _make_folder(out)
     operator = found.file.operator
     name = found.file.name
-    loops, errors = folder / f"{name}-loops.png", folder / f"{name}-errors.png"
-    plot_loops(
-        loops,
-        found.inputs,
-        found.outputs,
-        found.outputs - found.identification.residuals,
-        input_label=with_unit(found.file.provenance["input"], operator.input_unit),
-        output_label=with_unit(found.file.provenance["output"], operator.output_unit),
-    )
-    plot_errors(errors, {name: found.identification.residuals}, error_label=with_unit("error", operator.output_unit))
-    paths = [loops, errors]
+    paths = draw_predictions(found.predictions(), folder, name)
     for density in operator.densities():
         paths.append(folder / f"{name}-density.png")
-        plot_densities(paths[-1], [density])
+        # What the samples of the fit swept; the coverage is that of all.
+        swept = found.identification.certificate.swept[: found.coverage.swept.size] if found.coverage else None
+        plot_densities(paths[-1], [density], swept)
         if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
             paths.append(folder / f"{name}-coverage.png")
-            plot_coverage(paths[-1], density, found.coverage.swept, found.file.memory)
+            swept = found.coverage.swept
+            resolution = found.resolution.diagonal[: swept.size] if found.resolution else None
+            plot_coverage(paths[-1], density, swept, found.file.memory, resolution)
     return paths
 
 
@@ -241,6 +248,7 @@ def _compare(
 ) -> tuple[dict[str, dict[str, Any]], list[Path]]:
     comparison: dict[str, dict[str, Any]] = {}
     residuals: dict[str, Any] = {}
+    pairs: list[tuple[ModelFile, StartingState, list[str]]] = []
     for model in models:
         columns = [str(model.provenance.get(end, "")) for end in ("input", "output")]
         missing = [name for name in columns if name not in steps.columns]
@@ -248,17 +256,22 @@ def _compare(
             raise DataError(
                 f"model {model.name} was identified with {' and '.join(missing)}, which {record.path} lacks"
             )
-        measured, predicted = steps[columns[1]], predict(model, steps[columns[0]])
+        pairs.append((model, starting_state(model, steps[columns[0]]), columns))
+    # Errors of the same rows for all.
+    skip = max((start.skip for _, start, _ in pairs), default=0)
+    for model, start, (driven, response) in pairs:
+        measured, predicted = steps[response], model.operator.evaluate(steps[driven], start.state)
         comparison[model.name] = {
-            **errors_json(measure_errors(measured, predicted)),
-            "unit": model.operator.output_unit or record.unit(columns[1]),
+            **errors_json(measure_errors(measured[skip:], predicted[skip:])),
+            "unit": model.operator.output_unit or record.unit(response),
+            "skipped": skip,
         }
         residuals[model.name] = measured - predicted
     if not residuals:
         return comparison, []
     unit = next(iter(comparison.values()))["unit"]
     path = folder / "errors.png"
-    plot_errors(path, residuals, error_label=with_unit("error", unit))
+    plot_errors(path, residuals, error_label=with_unit("error", unit), skip=skip)
     return comparison, [path]
 
 

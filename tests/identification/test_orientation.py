@@ -91,10 +91,6 @@ def test_cross_validation_is_the_same_for_the_opposite_output():
     assert wrong.best.rms > 5.0 * rising.best.rms
 
 
-def test_a_constant_output_is_taken_to_rise():
-    assert identify("preisach", INPUTS, np.full(INPUTS.size, 0.1)).orientation == "rising"
-
-
 def make_falling(kind, seed):
     rng = np.random.default_rng(seed)
     if kind == "plays":
