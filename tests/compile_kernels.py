@@ -8,7 +8,16 @@ import numpy as np
 
 import bench
 from bench.control.adaptation import Adapter
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
+from bench.hysteresis import (
+    BoucWen,
+    Duhem,
+    GeneralizedPrandtlIshlinskii,
+    KrasnoselskiiPokrovskii,
+    MaxwellSlip,
+    PrandtlIshlinskii,
+    Preisach,
+    uniform_levels,
+)
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
 from bench.identification.collapse import collapse
@@ -51,6 +60,21 @@ def operators() -> None:
     identify("prandtl-ishlinskii", inputs, outputs, input_range=(0.0, 1.0))
 
 
+def element_operators() -> None:
+    """Evaluate the operators of elements."""
+    span, inputs = (0.0, 1.0), np.array([0.2, 0.8, 0.4])
+    for each in (
+        BoucWen(1.0, 1.0, input_range=span),
+        BoucWen(1.0, 1.0, exponent=2.0, input_range=span),
+        Duhem([1.0], [1.0], input_range=span),
+        GeneralizedPrandtlIshlinskii([0.0], [1.0], input_range=span),
+        KrasnoselskiiPokrovskii([0.0], [1.0], 1.0),
+        MaxwellSlip([1.0], [1.0]),
+    ):
+        each.evaluate(inputs)
+        each.regressor(inputs)
+
+
 def hybrid_estimate() -> None:
     """Filter the readings of a hybrid cantilever."""
     rises = np.linspace(-20.0, 20.0, 9)
@@ -77,6 +101,7 @@ def laboratories() -> None:
 
 if __name__ == "__main__":
     operators()
+    element_operators()
     hybrid_estimate()
     twin()
     laboratories()

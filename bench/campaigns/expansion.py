@@ -21,7 +21,7 @@ from bench.engine import check_before_moving
 from bench.errors import BenchError, ConfigurationError
 from bench.hysteresis import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
-from bench.results.models import check_options, model_options
+from bench.results.models import check_template, option_names
 from bench.rig_file import RigFile
 from bench.studies import Study
 
@@ -155,7 +155,7 @@ class _Expander:
                 f"{where}: model = {table.model!r}: there is no such model; there are: "
                 f"{', '.join(identifiable_models())}"
             ) from None
-        allowed = model_options(table.model)
+        allowed = option_names(table.model)
         for key in table.options:
             if key not in allowed:
                 raise ConfigurationError(f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed)}")
@@ -334,7 +334,7 @@ class _Expander:
         if table.input or drive is None or drive.range is None:
             return
         try:
-            check_options(table.model, np.linspace(*drive.range, 100), identification_options(table.options))
+            check_template(table.model, np.linspace(*drive.range, 100), identification_options(table.options))
         except ValueError as error:
             raise ConfigurationError(f"{where}: {error} (rig {known.file.name})") from None
 

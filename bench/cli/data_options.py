@@ -33,19 +33,37 @@ def _layout(
     return ReadingOptions(delimiter, decimal, encoding, skip_lines, table)
 
 
-def layout_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Offer a command's users the options of the layout of a file, in place of its parameter `reading`."""
-    own, added = inspect.signature(command, eval_str=True), inspect.signature(_layout, eval_str=True).parameters
-    kept = [parameter for name, parameter in own.parameters.items() if name != "reading"]
+def offer_options(source: Callable[..., Any], name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that offers a command's users the parameters of a function in place of a parameter.
 
-    @functools.wraps(command)
-    def offered(**arguments: Any) -> None:  # noqa: ANN401 - the command's own
-        reading = _layout(**{name: arguments.pop(name) for name in added})
-        command(**arguments, reading=reading)
+    The command gets what the function returns for them.
 
-    keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in (*kept, *added.values())]
-    offered.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
-    return offered
+    Parameters
+    ----------
+    source : callable
+        Its signature is that of the options.
+    name : str
+        The parameter of the command that they replace.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own, added = inspect.signature(command, eval_str=True), inspect.signature(source, eval_str=True).parameters
+        kept = [parameter for key, parameter in own.parameters.items() if key != name]
+
+        @functools.wraps(command)
+        def offered(**arguments: Any) -> None:  # noqa: ANN401 - the command's own
+            made = source(**{key: arguments.pop(key) for key in added})
+            command(**arguments, **{name: made})
+
+        keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in (*kept, *added.values())]
+        offered.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
+        return offered
+
+    return decorate
+
+
+layout_options = offer_options(_layout, "reading")
+"""Offer a command's users the options of the layout of a file, in place of its parameter `reading`."""
 
 
 def print_assumptions(file: Path, assumptions: str) -> None:

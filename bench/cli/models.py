@@ -13,13 +13,13 @@ from bench.cli.console import (
     JsonOption,
     check_outputs,
     console,
-    parse_numbers,
     print_rows,
     show_compilation,
     warn,
     write_json,
 )
 from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.model_options import ModelOptions, offer_model_options
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_fit, write_rows
 from bench.results.reading.options import ReadingOptions
@@ -52,6 +52,7 @@ InitialOption = Annotated[
 
 
 @app.command("identify")
+@offer_model_options
 @layout_options
 @show_compilation()
 def identify_(
@@ -60,24 +61,6 @@ def identify_(
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
     model: Annotated[str, typer.Option(metavar="NAME", help="Model to fit; `bench list` shows the names.")],
-    levels: Annotated[
-        int | None,
-        typer.Option(min=2, max=1000, help="Discretization levels of the Preisach plane; 20 if not given."),
-    ] = None,
-    degree: Annotated[
-        int | None,
-        typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
-    ] = None,
-    plane: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            metavar="LOW HIGH", help="Ends of the Preisach plane, in input units; the model's own if not given."
-        ),
-    ] = None,
-    reversible: Annotated[
-        str | None,
-        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
-    ] = None,
     smoothing: Annotated[
         float | None,
         typer.Option(
@@ -109,9 +92,9 @@ def identify_(
             help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
         ),
     ] = "auto",
-    options: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="KEY=VALUE", help="Another numerical option of the model; repeatable."),
+    weights_column: Annotated[
+        str | None,
+        typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
     ] = None,
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
@@ -126,6 +109,7 @@ def identify_(
     json_file: JsonOption = None,
     *,
     reading: ReadingOptions,
+    options: ModelOptions,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
@@ -144,17 +128,15 @@ def identify_(
             input_column=input_column,
             output_column=output_column,
             model=model,
-            levels=levels,
-            degree=degree,
-            plane=plane,
-            reversible=reversible,
             smoothing=smoothing,
             ridge=ridge,
             skip=skip,
             initial=initial,
             orientation=orientation,
-            **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
+            weights_column=weights_column,
+            levels_to_try=options.levels_to_try,
+            **options.values,
             band=band,
             reading=reading,
         )

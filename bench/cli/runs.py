@@ -24,6 +24,7 @@ from bench.cli.console import (
     warn,
     write_json,
 )
+from bench.cli.model_options import inverse_of, options_json, print_model, print_models
 from bench.cli.rehearse import show_rehearsal
 from bench.errors import BenchError, ConfigurationError
 
@@ -39,7 +40,9 @@ UNSAFE_EXIT_CODE = 7
 def list_(
     name: Annotated[
         str | None,
-        typer.Argument(help="A rig, a protocol or a model to show in full; without it, all names."),
+        typer.Argument(
+            help="A rig, a protocol or a model to show in full, or `models` for all their options; without it, names."
+        ),
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -49,6 +52,7 @@ def list_(
     fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
     """
     from bench.catalogue import Catalogue
+    from bench.hysteresis import identifiable_models
 
     catalogue = Catalogue.of_installed()
     if name is None:
@@ -62,14 +66,25 @@ def list_(
         definition = catalogue.protocols[name]
         print_protocol(definition)
         write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
-    elif name in (others := {**catalogue.models, **catalogue.studies, **catalogue.controllers}):
+    elif name == "models":
+        specs = identifiable_models()
+        print_models(specs)
+        write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
+    elif name in (specs := identifiable_models()):
+        print_model(specs[name])
+        write_json(json_file, {"name": name, **_model_json(specs[name])})
+    elif name in (others := {**catalogue.studies, **catalogue.controllers}):
         console.print(others[name], highlight=False)
         write_json(json_file, {"name": name, "summary": others[name]})
     else:
-        known = ", ".join([*catalogue.rigs, *catalogue.protocols, *others])
+        known = ", ".join([*catalogue.rigs, *catalogue.protocols, *specs, *others])
         raise ConfigurationError(
             f"there is no rig, protocol, model, controller or study {name!r}; there are: {known}"
         )
+
+
+def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not imported at start
+    return {"summary": spec.summary, "inverse": inverse_of(spec), "options": options_json(spec)}
 
 
 def _print_catalogue(catalogue: Any) -> None:  # noqa: ANN401 - a Catalogue, not imported at start

@@ -1,9 +1,14 @@
 """Hysteresis operators: immutable models, explicit memory, numbers only."""
 
+from bench.hysteresis.bouc_wen import BoucWen
 from bench.hysteresis.coverage import Coverage
 from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model
+from bench.hysteresis.duhem import Duhem
+from bench.hysteresis.generalized_prandtl_ishlinskii import Envelope, GeneralizedPrandtlIshlinskii
 from bench.hysteresis.inverse import Inverse, Inversion, Policy
+from bench.hysteresis.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
+from bench.hysteresis.maxwell_slip import MaxwellSlip
 from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.models import ModelSpec, find_model, identifiable_models, model_class, model_from_json
 from bench.hysteresis.operator import Operator, Shape, operator_from_json
@@ -23,13 +28,19 @@ from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage
 from bench.hysteresis.two_stage_state import TwoStageState
 
 __all__ = [
+    "BoucWen",
     "Coupled",
     "Coverage",
     "DeadZones",
     "Density",
+    "Duhem",
+    "Envelope",
+    "GeneralizedPrandtlIshlinskii",
     "Inverse",
     "Inversion",
+    "KrasnoselskiiPokrovskii",
     "Linear",
+    "MaxwellSlip",
     "MemoryCurve",
     "Model",
     "ModelSpec",

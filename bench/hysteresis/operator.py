@@ -53,6 +53,8 @@ class Operator(Model, ABC, Generic[S]):
         Units, for labels.
     memoryless : bool
         Whether the output depends on the present input alone; the state then is None.
+    inverse_method : str
+        How `inverse` finds set-points: numerical, exact, or a table.
     """
 
     bias: float
@@ -60,6 +62,7 @@ class Operator(Model, ABC, Generic[S]):
     input_unit: str
     output_unit: str
     memoryless: ClassVar[bool] = False
+    inverse_method: ClassVar[str] = "numerical"
 
     @property
     @abstractmethod

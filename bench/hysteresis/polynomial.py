@@ -38,6 +38,7 @@ class Polynomial(Operator[None]):
     """
 
     kind: ClassVar[str] = "polynomial"
+    inverse_method: ClassVar[str] = "table"
     memoryless: ClassVar[bool] = True
     series: Floats
     input_range: tuple[float, float]

@@ -165,6 +165,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     """
 
     kind: ClassVar[str] = "prandtl-ishlinskii"
+    inverse_method: ClassVar[str] = "exact"
     parts: ClassVar[Parts] = {
         "before": DeadZones.from_json,
         "after": DeadZones.from_json,

@@ -100,6 +100,7 @@ class Preisach(Operator[MemoryCurve]):
     """
 
     kind: ClassVar[str] = "preisach"
+    inverse_method: ClassVar[str] = "exact"
     parts: ClassVar[Parts] = {"reversible": reversible_from_json}
     levels: Floats
     density: Floats

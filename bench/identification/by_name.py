@@ -13,6 +13,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, counted_weights
 from bench.identification.measures import Errors, measure_errors
+from bench.identification.options import check_options
 from bench.identification.orientation import (
     NAMES,
     Orientation,
@@ -22,7 +23,7 @@ from bench.identification.orientation import (
     possible_signs,
 )
 from bench.identification.regularization import Regularization, choose_regularization
-from bench.identification.shape import fit_operator, fit_shape
+from bench.identification.shape import fit_operator, fit_shape, undetermined_shape
 from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 
 M = TypeVar("M", bound=Operator[Any])
@@ -88,23 +89,10 @@ def identify(
 ) -> Identification[Any]:
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
 
-    ==========================  ==============================================================================
-    `preisach`                  nonnegative density; options `levels` (20), `plane` (range of the inputs),
-                                `reversible` ("none", "linear", "quadratic", or "polynomial" of `degree` 5 unless
-                                given), `input_range`
-    `preisach-signed`           density of either sign; options as `preisach`
-    `preisach-nonmonotonic`     nonnegative density and thermal term (Zhang et al. 2013, eq. 12); options
-                                `levels` (20), `plane` (range of the inputs), `reference` (low end of the
-                                operating range: where the term is zero), `input_range`
-    `prandtl-ishlinskii`        nonnegative weights of plays; options `plays` (15), `maximum` (half the range of
-                                the inputs: thresholds are i maximum / plays), `origin` (0), `dead_zones` (0:
-                                number of thresholds of a map after the plays), `input_range`
-    `polynomial`                without memory; options `degree` (12), `input_range`
-    ==========================  ==============================================================================
-
-    `input_unit` and `output_unit` are options of each. Packages may register further models in `bench.models`; see
-    `ModelSpec`. The shape parameters of an operator (`Operator.shape_parameters`), on which its output does not
-    depend linearly, are fitted together with its coefficients by variable projection.
+    The models are the entries of the group `bench.models`, to which packages may add; see `ModelSpec`. The command
+    `bench list NAME` shows the options of one, and docs/reference/models.md explains them. The shape parameters of an
+    operator (`Operator.shape_parameters`), on which its output does not depend linearly, are fitted together with its
+    coefficients by variable projection.
 
     A model whose coefficients must not be negative has an output that rises with the input. With the `orientation`
     "falling" the coefficients must not be positive instead; with "auto" the one that fits better is taken.
@@ -136,7 +124,7 @@ def identify(
     orientation : {"auto", "rising", "falling"}
         Whether the output rises or falls with the input; only "auto" for a model of free signs.
     **options
-        As listed above; `levels` is the number of intervals or the increasing levels themselves.
+        The model's own; see `bench.identification.options.model_options`.
 
     Raises
     ------
@@ -222,6 +210,7 @@ class FitProblem:
         coverage = self.template.coverage(self.inputs, self.state)
         if coverage is not None and coverage.never.size:
             found.append(coverage.summary())
+        found += undetermined_shape(self.template)
         return tuple(found)
 
 
@@ -249,10 +238,8 @@ def set_up_problem(
         raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
     if initial == "estimate" and spec.estimate_state is None:
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
-    try:
-        template: Operator[Any] = spec.template(sequence, **options)
-    except TypeError as error:
-        raise ValueError(f"options of {model_name}: {error}") from None
+    check_options(model_name, options)
+    template: Operator[Any] = spec.template(sequence, **options)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
         check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,17 +28,34 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.prandtl_ishlinskii import PlayState
 from bench.identification.initial_memory import estimate_memory
 from bench.identification.least_squares import fit
+from bench.identification.levels import Spacing, quantile_levels
+from bench.identification.options import OptionHelp
 
 ReversibleKind: TypeAlias = Literal["none", "linear", "quadratic", "polynomial"]
+
+InputRange: TypeAlias = Annotated[
+    tuple[float, float] | None, OptionHelp("operating range, input units", "the range of the inputs")
+]
+_Levels: TypeAlias = Annotated[
+    int | tuple[float, ...], OptionHelp("number of intervals of the plane, or the increasing levels, input units")
+]
+_Spacing: TypeAlias = Annotated[Spacing, OptionHelp("of the levels: uniform, or quantiles of the reversals")]
+_Plane: TypeAlias = Annotated[
+    tuple[float, float] | None, OptionHelp("ends of the plane, input units", "the range of the inputs")
+]
 
 # Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
 _LEAST_SLOPE = 0.02
 
 
-def _lattice(levels: int | ArrayLike, plane: tuple[float, float]) -> Floats:
-    if isinstance(levels, int | np.integer):
-        return uniform_levels(*plane, int(levels))
-    return _checks.increasing("levels", levels)
+def _lattice(inputs: Floats, levels: int | ArrayLike, plane: tuple[float, float], spacing: Spacing) -> Floats:
+    if not isinstance(levels, int | np.integer):
+        if spacing != "uniform":
+            raise ValueError(f"spacing: {spacing!r} needs a number of levels, not the levels themselves")
+        return _checks.increasing("levels", levels)
+    if spacing == "quantiles":
+        return quantile_levels(inputs, plane, int(levels))
+    return uniform_levels(*plane, int(levels))
 
 
 def _operating(inputs: Floats, plane: tuple[float, float], given: tuple[float, float] | None) -> tuple[float, float]:
@@ -48,7 +65,11 @@ def _operating(inputs: Floats, plane: tuple[float, float], given: tuple[float, f
     return min(float(inputs.min()), plane[0]), max(float(inputs.max()), plane[1])
 
 
-def _input_span(inputs: Floats, name: str) -> tuple[float, float]:
+def input_span(inputs: Floats, name: str) -> tuple[float, float]:
+    """Return the least and the greatest input.
+
+    Raises ValueError if they are the same: names the option that would help.
+    """
     low, high = float(inputs.min()), float(inputs.max())
     if low == high:
         raise ValueError(f"inputs: constant at {low}; give {name} or inputs that vary")
@@ -58,17 +79,18 @@ def _input_span(inputs: Floats, name: str) -> tuple[float, float]:
 def _preisach(
     inputs: Floats,
     *,
-    levels: int | ArrayLike = 20,
-    plane: tuple[float, float] | None = None,
-    reversible: ReversibleKind = "none",
-    degree: int | None = None,
-    input_range: tuple[float, float] | None = None,
+    levels: _Levels = 20,
+    plane: _Plane = None,
+    spacing: _Spacing = "uniform",
+    reversible: Annotated[ReversibleKind, OptionHelp("part without memory, beside the density")] = "none",
+    degree: Annotated[int | None, OptionHelp("of the reversible part 'polynomial'", "5")] = None,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Preisach:
     if plane is None and isinstance(levels, int | np.integer):
-        plane = _input_span(inputs, "plane")
-    lattice = _lattice(levels, plane or (0.0, 0.0))
+        plane = input_span(inputs, "plane")
+    lattice = _lattice(inputs, levels, plane or (0.0, 0.0), spacing)
     middle = 0.5 * float(lattice[0] + lattice[-1])
     span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
     if degree is not None and reversible != "polynomial":
@@ -96,15 +118,24 @@ def _preisach(
 def _nonmonotonic(
     inputs: Floats,
     *,
-    levels: int | ArrayLike = 20,
-    plane: tuple[float, float] | None = None,
-    reference: float | None = None,
-    input_range: tuple[float, float] | None = None,
+    levels: _Levels = 20,
+    plane: _Plane = None,
+    spacing: _Spacing = "uniform",
+    reference: Annotated[
+        float | None, OptionHelp("input at which the thermal term is zero", "the low end of the operating range")
+    ] = None,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Preisach:
     plain = _preisach(
-        inputs, levels=levels, plane=plane, input_range=input_range, input_unit=input_unit, output_unit=output_unit
+        inputs,
+        levels=levels,
+        spacing=spacing,
+        plane=plane,
+        input_range=input_range,
+        input_unit=input_unit,
+        output_unit=output_unit,
     )
     zero = plain.input_range[0] if reference is None else reference
     return replace(plain, reversible=ThermalExpansion(0.0, 0.0, *plain.plane, zero))
@@ -113,33 +144,35 @@ def _nonmonotonic(
 def _polynomial(
     inputs: Floats,
     *,
-    degree: int = 12,
-    input_range: tuple[float, float] | None = None,
+    degree: Annotated[int, OptionHelp("of the polynomial")] = 12,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> Polynomial:
     if degree < 1:
         raise ValueError(f"degree: expected at least 1, got {degree}")
-    span = _input_span(inputs, "input_range") if input_range is None else input_range
+    span = input_span(inputs, "input_range") if input_range is None else input_range
     return Polynomial(np.zeros(degree), span, input_unit=input_unit, output_unit=output_unit)
 
 
 def _prandtl_ishlinskii(
     inputs: Floats,
     *,
-    plays: int = 15,
-    maximum: float | None = None,
-    origin: float = 0.0,
-    dead_zones: int = 0,
-    input_range: tuple[float, float] | None = None,
+    plays: Annotated[int, OptionHelp("number of plays; their thresholds are i maximum / plays, i from 0")] = 15,
+    maximum: Annotated[
+        float | None, OptionHelp("end of the thresholds, input units", "half the range of the inputs")
+    ] = None,
+    origin: Annotated[float, OptionHelp("input of the relaxed state, input units")] = 0.0,
+    dead_zones: Annotated[int, OptionHelp("thresholds of a rising map after the plays (Kuhnen 2003)")] = 0,
+    input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> PrandtlIshlinskii:
     if plays < 1:
         raise ValueError(f"plays: expected at least 1, got {plays}")
-    if isinstance(dead_zones, bool) or not isinstance(dead_zones, int) or dead_zones < 0:
+    if dead_zones < 0:
         raise ValueError(f"dead_zones: expected an integer >= 0, got {dead_zones!r}")
-    low, high = _input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
+    low, high = input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
     if high <= low:
         raise ValueError(f"maximum: expected a positive number, got {maximum}")
     return PrandtlIshlinskii(

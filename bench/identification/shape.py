@@ -16,10 +16,14 @@ from bench.hysteresis import Operator, Regressor
 from bench.hysteresis._checks import Floats
 from bench.identification.least_squares import Fit, fit, fit_minimum_norm
 
-# Relative change of parameters, cost and gradient at which the search ends.
-_TOLERANCE = 1e-10
+# Relative change of parameters, cost and gradient at which a search ends, and its greatest number of steps: of the
+# searches from several starts, and of the one that goes on from the best of them.
+_COARSE = (1e-5, 30)
+_FINE = (1e-10, 100)
 # Relative step of the differences: a constrained linear fit is exact to about 1e-12.
 _STEP = 1e-6
+# Searches are begun from so many starts: those that fit best as they are.
+_MOST_SEARCHES = 3
 # Cells of a dense normal matrix: 0.5 GB.
 _MOST_CELLS = 8001
 
@@ -92,10 +96,27 @@ def fit_shape(
         found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
         return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
 
-    options: dict[str, Any] = {"ftol": _TOLERANCE, "xtol": _TOLERANCE, "gtol": _TOLERANCE, "diff_step": _STEP}
-    ends = [
-        least_squares(residuals, np.clip(values, low, high), bounds=(low, high), x_scale="jac", **options)
-        for values in template.shape_starts()
+    starts = [np.clip(values, low, high) for values in template.shape_starts()]
+    if len(starts) > _MOST_SEARCHES:
+        costs = [float(np.sum(residuals(values) ** 2)) for values in starts]
+        starts = [starts[k] for k in np.argsort(costs, kind="stable")[:_MOST_SEARCHES]]
+
+    def search(values: Floats, tolerance: float, most: int) -> Any:  # noqa: ANN401 - scipy's result
+        ends: dict[str, Any] = {"ftol": tolerance, "xtol": tolerance, "gtol": tolerance, "diff_step": _STEP}
+        return least_squares(residuals, values, bounds=(low, high), x_scale="jac", max_nfev=most, **ends)
+
+    if len(starts) > 1:
+        # Of equal costs the first is taken, so that the result does not depend on rounding alone.
+        starts = [min((search(values, *_COARSE) for values in starts), key=lambda end: end.cost).x]
+    return template.with_shape(search(starts[0], *_FINE).x.tolist())
+
+
+def undetermined_shape(operator: Operator[Any]) -> list[str]:
+    """Return a warning for each fitted shape parameter that has run to the upper end of its range."""
+    shape = operator.shape_parameters()
+    return [
+        f"{name} = {value:.4g} is at the end of its range: the data do not determine it; measure loops of several "
+        "amplitudes, or take another model"
+        for name, value, high in zip(shape.names, shape.values, shape.high, strict=True)
+        if value >= high - 1e-6 * abs(high)
     ]
-    # Of equal costs the first is taken, so that the result does not depend on rounding alone.
-    return template.with_shape(min(ends, key=lambda end: end.cost).x.tolist())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +29,7 @@ from bench.identification import (
     cross_validate,
     identify,
 )
+from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
@@ -129,27 +129,23 @@ class IdentifiedFile:
         }
 
 
-def model_options(model: str) -> tuple[str, ...]:
+def option_names(model: str) -> tuple[str, ...]:
     """Return the names of the options that `identify_file` takes for a registered model."""
-    template = find_model(model).template
-    own = inspect.signature(template).parameters if template is not None else {}
-    # The first takes the inputs; the units are those of the columns.
-    names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
+    own = [option.name for option in model_options(find_model(model))]
+    return (*own, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
 
 
-def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
+def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
     """Check the values of a model's own options for inputs, shape (N,), without a fit.
 
     Raises ValueError if the model does not take them.
     """
     spec = find_model(model)
     assert spec.template is not None
-    own = {name: value for name, value in options.items() if name in inspect.signature(spec.template).parameters}
-    try:
-        spec.template(inputs, **own)
-    except TypeError as error:
-        raise ValueError(f"options of {model}: {error}") from None
+    known = [option.name for option in model_options(spec)]
+    own = {name: value for name, value in options.items() if name in known}
+    check_options(model, own)
+    spec.template(inputs, **own)
 
 
 def errors_json(errors: Errors) -> dict[str, float]:
@@ -174,6 +170,8 @@ def identify_file(
     ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
+    weights_column: str | None = None,
+    levels_to_try: Sequence[int] = (),
     band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
@@ -194,6 +192,10 @@ def identify_file(
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
+    weights_column : str, optional
+        Column of the weight of each row, >= 0 (inverse variance, say).
+    levels_to_try : sequence of int
+        Values of the option `levels` among which cross-validation chooses.
     band : bool
         Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
@@ -215,27 +217,52 @@ def identify_file(
         raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
     if skip < 0:
         raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
-    columns = read_columns(path, (input_column, output_column), at_least=FEWEST_ROWS, options=reading)
+    options = {name: value for name, value in options.items() if value is not None}
+    if levels_to_try:
+        options["levels"] = levels_to_try[0]
+    try:
+        # These two every model takes.
+        check_options(model, {key: value for key, value in options.items() if key not in ("initial", "orientation")})
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from None
+    names = (input_column, output_column, *((weights_column,) if weights_column else ()))
+    columns = read_columns(path, names, at_least=FEWEST_ROWS, options=reading)
     inputs, outputs = columns.values[input_column], columns.values[output_column]
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
+    weights = columns.values[weights_column] if weights_column else None
     check_variation(columns, output_column)
-    options = {name: value for name, value in options.items() if value is not None}
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
     trials: CrossValidation | None = None
     try:
-        if cross_validated:
-            others = {name: value for name, value in options.items() if name != "levels"}
-            orders = [options["levels"]] if "levels" in options else None
+        if cross_validated or levels_to_try:
+            others, orders = dict(options), levels_to_try or None
+            if isinstance(options.get("levels"), int):
+                orders = orders or [others["levels"]]
+                del others["levels"]
             ridge = ridge or 0.0
+            # A signed density is not fitted without a penalty.
+            tried = cross_validated or (smoothing is None and not find_model(model).constrained)
             trials = cross_validate(
-                model, inputs, outputs, smoothing=SMOOTHING, ridge=ridge, levels=orders, skip=skip, **others
+                model,
+                inputs,
+                outputs,
+                smoothing=SMOOTHING if tried else (smoothing or 0.0,),
+                ridge=ridge,
+                levels=orders,
+                weights=weights,
+                skip=skip,
+                **others,
             )
             smoothing = trials.best.smoothing
-        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, ridge=ridge, **options)
+            if trials.best.levels is not None and levels_to_try:
+                options["levels"] = trials.best.levels
+        found = identify(
+            model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
+        )
         penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
         calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:

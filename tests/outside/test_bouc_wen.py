@@ -39,7 +39,7 @@ def installed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
         registry.entries.cache_clear()
-        yield registry.load("models", "bouc-wen").model
+        yield registry.load("models", "normalised-bouc-wen").model
     sys.modules.pop("bouc_wen")
     registry.entries.cache_clear()
 
@@ -52,7 +52,7 @@ def true(installed):
 @pytest.fixture(scope="module")
 def found(true):
     outputs = true.evaluate(INPUTS) + 0.02 * np.random.default_rng(0).normal(size=INPUTS.size)
-    return identify("bouc-wen", INPUTS, outputs, input_unit="V", output_unit="µm")
+    return identify("normalised-bouc-wen", INPUTS, outputs, input_unit="V", output_unit="µm")
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ class TestOperator:
 
     def test_identification_is_deterministic(self, found):
         outputs = found.residuals + found.model.evaluate(INPUTS)
-        assert identify("bouc-wen", INPUTS, outputs).model.coefficients == pytest.approx(
+        assert identify("normalised-bouc-wen", INPUTS, outputs).model.coefficients == pytest.approx(
             found.model.coefficients, abs=0
         )
 
@@ -95,7 +95,7 @@ class TestOperator:
         density = np.exp(-0.5 * ((middle[i] - middle[j] - 2.0) / 1.0) ** 2)
         plant = Preisach(uniform_levels(-5.0, 5.0, order), density, 1.0, QuadraticTerm(0.2))
         outputs = plant.evaluate(INPUTS)
-        bouc_wen = identify("bouc-wen", INPUTS, outputs, initial="negative")
+        bouc_wen = identify("normalised-bouc-wen", INPUTS, outputs, initial="negative")
         polynomial = identify("polynomial", INPUTS, outputs, degree=5)
         assert bouc_wen.errors.rms_percent < 5.0
         assert bouc_wen.errors.rms < 0.5 * polynomial.errors.rms
@@ -137,7 +137,7 @@ class TestOperator:
         assert inverse.nearest_input(state, state.input, true.value(state)) == state.input
 
     def test_controllers_work_with_it(self, true):
-        setup = ControllerSetup(model=ModelFile("bouc-wen", true), limits=(-5.0, 5.0))
+        setup = ControllerSetup(model=ModelFile("normalised-bouc-wen", true), limits=(-5.0, 5.0))
         actuator = true.step(true.initial_state(), 0.0)
         for name in ("open-loop-inverse", "closed-loop-inverse"):
             controller = make_controller("target", name, setup)
@@ -158,31 +158,42 @@ class TestCommands:
     def test_identify_predict_compare_invert(self, bench, true, tmp_path):
         data = write(tmp_path / "loop.csv", ["voltage [V]", "position [µm]"], INPUTS, true.evaluate(INPUTS))
         columns = ["--input", "voltage", "--output", "position"]
-        assert "bouc-wen" in bench("list")
-        for model in ("bouc-wen", "polynomial"):
+        assert "normalised-bouc-wen" in bench("list")
+        for model in ("normalised-bouc-wen", "polynomial"):
             path = tmp_path / f"{model}.json"
             fitted = tmp_path / f"{model}-fit.json"
             bench(
                 "identify", data, *columns, "--model", model, "--out", path, "--figures", tmp_path / "figures",
                 "--json", fitted,
             )  # fmt: skip
-        assert json.loads((tmp_path / "bouc-wen-fit.json").read_text())["shape"] == pytest.approx(TRUE, rel=1e-3)
+        assert json.loads((tmp_path / "normalised-bouc-wen-fit.json").read_text())["shape"] == pytest.approx(
+            TRUE, rel=1e-3
+        )
         assert "shape" not in json.loads((tmp_path / "polynomial-fit.json").read_text())
         drawn = {path.name for path in (tmp_path / "figures").iterdir()}
-        assert {"bouc-wen-loops.png", "bouc-wen-errors.png"} <= drawn
+        assert {"normalised-bouc-wen-loops.png", "normalised-bouc-wen-errors.png"} <= drawn
 
-        file = load_model(tmp_path / "bouc-wen.json", "bouc-wen")
+        file = load_model(tmp_path / "normalised-bouc-wen.json", "normalised-bouc-wen")
         assert file.memory == pytest.approx(file.operator.advance(file.operator.initial_state(), INPUTS))
         assert (file.operator.input_unit, file.operator.output_unit) == ("V", "µm")
 
         result = tmp_path / "result.json"
-        bench("predict", tmp_path / "bouc-wen.json", data, *columns, "--out", tmp_path / "o.csv", "--json", result)
+        bench(
+            "predict",
+            tmp_path / "normalised-bouc-wen.json",
+            data,
+            *columns,
+            "--out",
+            tmp_path / "o.csv",
+            "--json",
+            result,
+        )
         assert json.loads(result.read_text())["rms"] < 1e-5
 
-        models = [tmp_path / "bouc-wen.json", tmp_path / "polynomial.json"]
+        models = [tmp_path / "normalised-bouc-wen.json", tmp_path / "polynomial.json"]
         bench("compare", *models, "--data", data, "--json", result)
         compared = json.loads(result.read_text())
-        assert compared["bouc-wen"]["raw"]["rms"] < 1e-3 * compared["polynomial"]["raw"]["rms"]
+        assert compared["normalised-bouc-wen"]["raw"]["rms"] < 1e-3 * compared["polynomial"]["raw"]["rms"]
 
         targets = write(tmp_path / "targets.csv", ["target [µm]"], [1.0, -2.0, 3.0, 0.5, 50.0])
         bench("invert", models[0], targets, "--column", "target", "--out", tmp_path / "s.csv", "--json", result)
@@ -197,12 +208,12 @@ class TestCommands:
             "--set", "increment=1.5", "--out", tmp_path, "--json", tmp_path / "run.json",
         )  # fmt: skip
         folder = json.loads((tmp_path / "run.json").read_text())["folder"]
-        model = tmp_path / "bouc-wen.json"
+        model = tmp_path / "normalised-bouc-wen.json"
         columns = ["--input", "tec_temperature", "--output", "curvature"]
-        bench("identify", folder, *columns, "--model", "bouc-wen", "--out", model)
+        bench("identify", folder, *columns, "--model", "normalised-bouc-wen", "--out", model)
         bench("report", folder, "--model", model, "--out", tmp_path / "report", "--json", tmp_path / "report.json")
         report = json.loads((tmp_path / "report.json").read_text())
-        assert report["models"]["bouc-wen"]["rms"] > 0
+        assert report["models"]["normalised-bouc-wen"]["rms"] > 0
         assert all(Path(path).stat().st_size > 0 for path in report["figures"])
 
     def test_what_is_not_registered_is_not_saved(self, installed, tmp_path):

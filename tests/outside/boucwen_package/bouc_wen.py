@@ -49,7 +49,7 @@ class BoucWen(Operator[State]):
         Operating range, input units.
     """
 
-    kind: ClassVar[str] = "bouc-wen"
+    kind: ClassVar[str] = "normalised-bouc-wen"
     stiffness: float = 0.0
     amplitude: float = 0.0
     bias: float = 0.0

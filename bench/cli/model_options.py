@@ -1,0 +1,170 @@
+"""The options of a model on the command line, and the table of models with their options."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from bench.cli.console import console, parse_assignments, print_rows
+from bench.cli.data_options import offer_options
+from bench.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from bench.hysteresis import ModelSpec
+
+# Of the Preisach plane.
+_FEWEST_LEVELS, _MOST_LEVELS = 2, 1000
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What the command line says of a model.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+        Options of the model's template by name, as far as they are given.
+    levels_to_try : tuple of int
+        Numbers of levels for cross-validation, if several are given.
+    """
+
+    values: dict[str, Any]
+    levels_to_try: tuple[int, ...] = ()
+
+
+def _model_options(
+    levels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER[,NUMBER...]",
+            help="Levels of the Preisach plane; 20 if not given. Of several numbers cross-validation chooses.",
+        ),
+    ] = None,
+    level_values: Annotated[
+        str | None,
+        typer.Option(metavar="VALUE,VALUE...", help="The levels themselves, in input units, instead of --levels."),
+    ] = None,
+    spacing: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", help="Of the levels: uniform, or quantiles of the inputs at the reversals."),
+    ] = None,
+    plane: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH", help="Ends of the Preisach plane, in input units; the model's own if not given."
+        ),
+    ] = None,
+    reversible: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
+    ] = None,
+    degree: Annotated[
+        int | None,
+        typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
+    ] = None,
+    plays: Annotated[int | None, typer.Option(min=1, max=1000, help="Number of plays.")] = None,
+    maximum: Annotated[
+        float | None, typer.Option(help="Greatest threshold of the plays or elements, in input units.")
+    ] = None,
+    origin: Annotated[float | None, typer.Option(help="Input of the relaxed state, in input units.")] = None,
+    dead_zones: Annotated[
+        int | None, typer.Option(min=0, max=1000, help="Number of dead zones after the plays.")
+    ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option",
+            metavar="NAME=VALUE",
+            help="Another option of the model, as `bench list MODEL` names it: a number, numbers with commas, or a "
+            "word; repeatable.",
+        ),
+    ] = None,
+) -> ModelOptions:
+    """Return what the command line says of a model; its signature is that of the options."""
+    named: dict[str, Any] = {
+        "spacing": spacing, "plane": plane, "reversible": reversible, "degree": degree, "plays": plays,
+        "maximum": maximum, "origin": origin, "dead_zones": dead_zones,
+    }  # fmt: skip
+    values = {name: value for name, value in named.items() if value is not None}
+    for name, text in parse_assignments("--option", options or ()).items():
+        if name in values:
+            raise ConfigurationError(f"--option {name}={text}: {name} is given twice")
+        values[name] = _value(text)
+    if level_values is not None:
+        if levels is not None:
+            raise ConfigurationError("--levels and --level-values: give one of them")
+        values["levels"] = tuple(_numbers("--level-values", level_values))
+    counts = _level_counts(levels)
+    if len(counts) == 1:
+        values["levels"] = counts[0]
+    return ModelOptions(values, counts if len(counts) > 1 else ())
+
+
+offer_model_options = offer_options(_model_options, "options")
+"""Offer a command's users the options of a model, in place of its parameter `options`."""
+
+
+def _level_counts(text: str | None) -> tuple[int, ...]:
+    if text is None:
+        return ()
+    counts = []
+    for number in _numbers("--levels", text):
+        if number != int(number) or not _FEWEST_LEVELS <= number <= _MOST_LEVELS:
+            raise ConfigurationError(
+                f"--levels {text}: expected whole numbers from {_FEWEST_LEVELS} to {_MOST_LEVELS}, such as 20 or "
+                "10,20,40; --level-values takes the levels themselves"
+            )
+        counts.append(int(number))
+    return tuple(counts)
+
+
+def _numbers(option: str, text: str) -> Sequence[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigurationError(f"{option} {text}: expected numbers with commas between them") from None
+
+
+def _value(text: str) -> Any:  # noqa: ANN401 - a number, numbers or a word
+    """Return the value of `NAME=VALUE`: a number, several numbers, else the text."""
+    try:
+        if "," in text:
+            return tuple(float(part) for part in text.split(","))
+        return int(text) if text.lstrip("+-").isdigit() else float(text)
+    except ValueError:
+        return text
+
+
+def inverse_of(spec: ModelSpec) -> str:
+    """Return how the operators of a model are inverted: exact, by a table, or numerical."""
+    return str(getattr(spec.model, "inverse_method", ""))
+
+
+def options_json(spec: ModelSpec) -> dict[str, dict[str, str]]:
+    """Return default and meaning of each option of a model, for programs."""
+    from bench.identification.options import model_options
+
+    return {option.name: {"default": option.default, "text": option.text} for option in model_options(spec)}
+
+
+def print_model(spec: ModelSpec) -> None:
+    """Print the summary of a model, its inverse and its options."""
+    console.print(spec.summary, highlight=False)
+    console.print(f"inverse: {inverse_of(spec)}", highlight=False)
+    options = options_json(spec)
+    if options:
+        rows = [(name, f"{each['text']} (default: {each['default']})") for name, each in options.items()]
+        print_rows("options", rows)
+
+
+def print_models(specs: dict[str, ModelSpec]) -> None:
+    """Print a table of models with their options and their inverse."""
+    table = Table("model", "options with their defaults", "inverse", title="models", title_justify="left")
+    for name, spec in specs.items():
+        options = ", ".join(f"{option} ({each['default']})" for option, each in options_json(spec).items())
+        table.add_row(name, options, inverse_of(spec))
+    console.print(table)

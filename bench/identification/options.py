@@ -1,0 +1,136 @@
+"""The options of a model: what its template takes besides the inputs, with defaults, kinds and what each means."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from bench.hysteresis import ModelSpec, find_model
+
+
+@dataclass(frozen=True)
+class OptionHelp:
+    """What an option of a template means: metadata of its annotation, `Annotated[float, OptionHelp("…")]`.
+
+    Parameters
+    ----------
+    text : str
+        Meaning and unit, in a line.
+    default : str
+        The default in words, where its value is None.
+    """
+
+    text: str
+    default: str = ""
+
+
+@dataclass(frozen=True)
+class ModelOption:
+    """An option that identification of a model takes.
+
+    Parameters
+    ----------
+    name : str
+        Keyword of the template.
+    default : str
+        The default as text; empty if there is none.
+    text : str
+        Meaning and unit; empty if the template does not say.
+    kinds : tuple
+        The types that its annotation allows; empty if any.
+    """
+
+    name: str
+    default: str
+    text: str
+    kinds: tuple[Any, ...]
+
+
+def model_options(spec: ModelSpec) -> tuple[ModelOption, ...]:
+    """Return the options of a model, as its template takes them; the units, which the columns give, are left out."""
+    return tuple(option for option in _all_options(spec.template) if not option.name.endswith("_unit"))
+
+
+def check_options(model_name: str, options: Mapping[str, Any]) -> None:
+    """Check that a model takes options of these names, and values of these kinds.
+
+    Raises ValueError if it does not: names the options that there are, with their defaults.
+    """
+    known = {option.name: option for option in _all_options(find_model(model_name).template)}
+    for name, value in options.items():
+        if name not in known:
+            raise ValueError(f"options of {model_name}: {_unknown(name, tuple(known.values()))}")
+        kinds = known[name].kinds
+        if kinds and not any(_fits(value, kind) for kind in kinds):
+            expected = " or ".join(text for kind in kinds if (text := _kind_text(kind)))
+            raise ValueError(f"{name}: expected {expected}, got {value!r}")
+
+
+def _unknown(name: str, known: tuple[ModelOption, ...]) -> str:
+    own = [option for option in known if not option.name.endswith("_unit")]
+    close = difflib.get_close_matches(name, [option.name for option in own], n=1)
+    listed = ", ".join(f"{option.name} ({option.default})" if option.default else option.name for option in own)
+    question = f"; did you mean {close[0]}?" if close else ";"
+    return f"there is no {name}{question} there are: {listed or 'none'}"
+
+
+def _all_options(template: Callable[..., Any] | None) -> tuple[ModelOption, ...]:
+    if template is None:
+        return ()
+    parameters = list(inspect.signature(template).parameters.values())[1:]
+    try:
+        hints = get_type_hints(template, include_extras=True)
+    # Annotations of another package may name what is imported for a type checker only.
+    except NameError:
+        hints = {}
+    return tuple(_option(parameter, hints.get(parameter.name, Any)) for parameter in parameters)
+
+
+def _option(parameter: inspect.Parameter, hint: Any) -> ModelOption:  # noqa: ANN401 - any annotation
+    notes = [note for note in getattr(hint, "__metadata__", ()) if isinstance(note, OptionHelp)]
+    plain = hint.__origin__ if hasattr(hint, "__metadata__") else hint
+    default = parameter.default
+    text = "" if default is inspect.Parameter.empty else "none" if default is None else str(default)
+    return ModelOption(
+        name=parameter.name,
+        default=notes[0].default if notes and notes[0].default else text,
+        text=notes[0].text if notes else "",
+        kinds=_kinds(plain),
+    )
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return the parts of a union that can be checked; none at all if one cannot."""
+    parts = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    checkable = (bool, int, float, str, type(None), tuple[float, float], tuple[float, ...])
+    return parts if all(part in checkable or get_origin(part) is Literal for part in parts) else ()
+
+
+def _fits(value: Any, kind: Any) -> bool:  # noqa: ANN401
+    if kind is type(None):
+        return value is None
+    if get_origin(kind) is Literal:
+        return isinstance(value, str) and value in get_args(kind)
+    if kind is str or kind is bool:
+        return isinstance(value, kind)
+    if get_origin(kind) is tuple:
+        if isinstance(value, str) or np.ndim(value) != 1:
+            return False
+        wanted = 2 if get_args(kind)[-1] is not Ellipsis else len(value)
+        return len(value) == wanted and all(_fits(each, float) for each in value)
+    allowed = (int, np.integer) if kind is int else (int, float, np.integer, np.floating)
+    return isinstance(value, allowed) and not isinstance(value, bool)
+
+
+def _kind_text(kind: Any) -> str:  # noqa: ANN401
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(get_args(kind))
+    if get_origin(kind) is tuple:
+        return "two numbers" if get_args(kind)[-1] is not Ellipsis else "numbers"
+    return {int: "an integer", float: "a number", str: "a text", bool: "true or false"}.get(kind, "")
