@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from bench.hysteresis import Inverse, Reach, _checks
-from bench.hysteresis.two_stage import Stage, TwoStage, TwoStageState
+from bench.hysteresis.two_stage import Stage, TwoStage
+from bench.hysteresis.two_stage_state import TwoStageState
 
 # Part of an output range within which a target counts as met.
 _TOLERANCE = 1e-10

@@ -6,7 +6,7 @@ from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model
 from bench.hysteresis.duhem import Duhem
 from bench.hysteresis.generalized_prandtl_ishlinskii import Envelope, GeneralizedPrandtlIshlinskii
-from bench.hysteresis.inverse import Inverse, Inversion, Policy, Reach
+from bench.hysteresis.inverse import Inverse, Inversion, Policy
 from bench.hysteresis.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bench.hysteresis.maxwell_slip import MaxwellSlip
 from bench.hysteresis.memory import MemoryCurve
@@ -16,6 +16,7 @@ from bench.hysteresis.polynomial import Polynomial
 from bench.hysteresis.polynomial_plays import PolynomialPlays
 from bench.hysteresis.prandtl_ishlinskii import DeadZones, PrandtlIshlinskii
 from bench.hysteresis.preisach import Preisach, Segment, uniform_levels
+from bench.hysteresis.reach import Reach
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import (
     PolynomialTerm,
@@ -24,7 +25,8 @@ from bench.hysteresis.reversible import (
     ThermalExpansion,
     reversible_from_json,
 )
-from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage, TwoStageState
+from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage
+from bench.hysteresis.two_stage_state import TwoStageState
 
 __all__ = [
     "BoucWen",

@@ -9,7 +9,8 @@ import numpy as np
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.elements import ElementState
-from bench.hysteresis.inverse import Inversion, NumericalInverse, Reach
+from bench.hysteresis.inverse import Inversion, NumericalInverse
+from bench.hysteresis.reach import Reach
 
 # Part of the output scale within which a target counts as met.
 _TOLERANCE = 2e-13

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bench.hysteresis import _checks
+from bench.hysteresis.two_stage_state import TwoStageState
 
 if TYPE_CHECKING:
-    from bench.hysteresis.two_stage import Coupled, TwoStage, TwoStageState
+    from bench.hysteresis.two_stage import Coupled, TwoStage
 
 S = TypeVar("S")
 
@@ -45,7 +46,7 @@ class CoupledStream(Generic[S]):
         return type(self), (self.model, self.state)
 
 
-class TwoStageStream(CoupledStream["TwoStageState"]):
+class TwoStageStream(CoupledStream[TwoStageState]):
     """The two-stage model and its memories, each a stream; equal to `TwoStage.evaluate` to the last bit."""
 
     model: TwoStage
@@ -79,8 +80,6 @@ class TwoStageStream(CoupledStream["TwoStageState"]):
     @property
     def state(self) -> TwoStageState:
         """Present state, as a value."""
-        from bench.hysteresis.two_stage import TwoStageState
-
         return TwoStageState(
             self._voltage,
             self._force,

@@ -8,7 +8,8 @@ from functools import cached_property
 from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
-from bench.hysteresis.inverse import Following, Inverse, Inversion, Reach, S
+from bench.hysteresis.inverse import Following, Inverse, Inversion, S
+from bench.hysteresis.reach import Reach
 
 OPPOSITE = {Reach.MET: Reach.MET, Reach.TOO_HIGH: Reach.TOO_LOW, Reach.TOO_LOW: Reach.TOO_HIGH}
 """What is said of the target of the opposite output."""

@@ -10,7 +10,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
 
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.reach import Reach
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse_stream import InverseStream, PlayInverseStream, PreisachInverseStream
@@ -42,14 +42,6 @@ _TOLERANCE = 2e-13
 _ROUNDING = 1e-14
 # Pieces into which a numerical inverse divides the way to an end of the range, in search of a crossing.
 _PIECES = 256
-
-
-class Reach(Enum):
-    """Whether a target could be met."""
-
-    MET = "met"
-    TOO_HIGH = "too high"
-    TOO_LOW = "too low"
 
 
 @dataclass(frozen=True)

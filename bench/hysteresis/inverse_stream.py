@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bench.hysteresis import _checks
-from bench.hysteresis.inverse import Reach
 from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.reach import Reach
 from bench.hysteresis.stream import PreisachStream, compiled_step
 
 if TYPE_CHECKING:

@@ -25,6 +25,7 @@ from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model, Parts
 from bench.hysteresis.operator import Operator, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
+from bench.hysteresis.two_stage_state import TwoStageState
 
 S = TypeVar("S")
 Stage: TypeAlias = Operator[Any]
@@ -101,33 +102,6 @@ class Coupled(Model, ABC, Generic[S]):
         )
 
     _arguments: ClassVar[tuple[str, ...]] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class TwoStageState:
-    """The memories of both stages and where they are now.
-
-    Parameters
-    ----------
-    voltage, force : float
-        Present inputs.
-    first, second : object
-        States of the two operators.
-    blocked : float
-        Output of the first stage, the force at resting length, force units.
-    argument : float
-        Input of the second stage, force - blocked.
-    length : float
-        Output of the second stage, length units.
-    """
-
-    voltage: float
-    force: float
-    first: Any
-    second: Any
-    blocked: float
-    argument: float
-    length: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,11 +128,13 @@ def _explained(explained: float, template: Operator[Any], signed: bool) -> list[
 
 def _samples(samples: int, found: Fit, smoothing: float) -> list[str]:
     free, count = found.certificate.passive, found.coefficients.size
-    if smoothing or (samples >= _SAMPLES_EACH * free and samples >= count):
+    # With smoothing more coefficients are free than the data have to determine.
+    if samples >= count and (smoothing or samples >= _SAMPLES_EACH * free):
         return []
+    remedy = "fewer --levels" if smoothing else "fewer --levels, --smoothing or --cross-validate"
     return [
         f"{samples} samples are few for {count} coefficients, {free} of them free: on other inputs the errors will "
-        "be larger than these; use fewer --levels, --smoothing or --cross-validate"
+        f"be larger than these; use {remedy}"
     ]
 
 

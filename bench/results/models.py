@@ -261,13 +261,14 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            tried = SMOOTHING if cross_validated else (smoothing or 0.0,)
             ridge = ridge or 0.0
+            # A signed density is not fitted without a penalty.
+            tried = cross_validated or (smoothing is None and not find_model(model).constrained)
             trials = cross_validate(
                 model,
                 inputs,
                 outputs,
-                smoothing=tried,
+                smoothing=SMOOTHING if tried else (smoothing or 0.0,),
                 ridge=ridge,
                 levels=orders,
                 weights=weights,

@@ -31,8 +31,7 @@ from bench.control.tracking import Command, ControllerBase, check_positive, wide
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
 from bench.controllers import ControllerSetup, ControllerSpec
 from bench.errors import DataError
-from bench.hysteresis import TwoStageState, _checks
-from bench.hysteresis.inverse import Reach
+from bench.hysteresis import Reach, TwoStageState, _checks
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from bench.control.latched import Latched, LatchParameters, reversible_slope, wa
 from bench.control.references import modulated_sine, tracking_targets
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse, Reach
+from bench.hysteresis import MemoryCurve, Polynomial, Preisach, Reach, uniform_levels
+from bench.hysteresis.inverse import PreisachInverse
 
 LOW, HIGH = 21.0, 84.0
 NARROW = (45.0, 66.0)

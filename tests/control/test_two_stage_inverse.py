@@ -16,10 +16,10 @@ from bench.hysteresis import (
     PrandtlIshlinskii,
     Preisach,
     QuadraticTerm,
+    Reach,
     TwoStage,
     uniform_levels,
 )
-from bench.hysteresis.inverse import Reach
 
 
 def preisach(low, high, least, greatest, seed, order=20, zeros=0.85):

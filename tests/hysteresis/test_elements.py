@@ -19,7 +19,8 @@ from bench.hysteresis import (
     operator_from_json,
 )
 from bench.hysteresis.branch_inverse import BranchInverse
-from bench.hysteresis.inverse import NumericalInverse, Reach
+from bench.hysteresis.inverse import NumericalInverse
+from bench.hysteresis.reach import Reach
 
 RANGE = (-2.0, 3.0)
 

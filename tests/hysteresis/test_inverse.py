@@ -7,8 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.hysteresis import MemoryCurve, PolynomialTerm, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse, Reach
+from bench.hysteresis import (
+    MemoryCurve,
+    PolynomialTerm,
+    Preisach,
+    QuadraticTerm,
+    Reach,
+    ThermalExpansion,
+    uniform_levels,
+)
+from bench.hysteresis.inverse import PreisachInverse
 
 LOW, HIGH = 21.0, 84.0
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bench.control.loops import ReachTarget
 from bench.control.two_stage_inverse import TwoStageInverse
-from bench.hysteresis.inverse import Reach
+from bench.hysteresis import Reach
 from bench.identification import Series, identify_two_stage, voltage_steps
 from rigs.muscles.control import (
     FORCE_GAIN,
