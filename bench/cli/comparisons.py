@@ -100,7 +100,7 @@ def compare_(
             session=session,
             reading=reading,
         )
-    print_assumptions(data, result.assumptions)
+    print_assumptions(data.name, result.assumptions)
     if result.skip:
         console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")

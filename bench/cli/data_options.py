@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -66,7 +65,7 @@ layout_options = offer_options(_layout, "reading")
 """Offer a command's users the options of the layout of a file, in place of its parameter `reading`."""
 
 
-def print_assumptions(file: Path, assumptions: str) -> None:
+def print_assumptions(name: str, assumptions: str) -> None:
     """Print in a line what was assumed about the layout of a file; nothing for a run."""
     if assumptions:
-        console.print(f"read {file.name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"read {name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)

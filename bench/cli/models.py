@@ -21,7 +21,9 @@ from bench.cli.console import (
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.model_options import ModelOptions, offer_model_options
 from bench.cli.patience import show_patience
+from bench.cli.selection import Comparing, choose_model, is_comparison, offer_comparing, print_test
 from bench.cli.written import print_figures, write_fit, write_rows
+from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
@@ -52,15 +54,29 @@ InitialOption = Annotated[
 
 
 @app.command("identify")
+@offer_comparing
 @offer_model_options
 @layout_options
 @show_compilation()
 def identify_(
     context: typer.Context,
-    file: DataArgument,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Tables of measurements (text, .gz, .mat, .xlsx, .parquet), or folders of runs; one model of all.",
+        ),
+    ],
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
-    model: Annotated[str, typer.Option(metavar="NAME", help="Model to fit; `bench list` shows the names.")],
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME[,NAME...]|all",
+            help="Model to fit; `bench list` shows the names. Of several, or all, the one that predicts best what is "
+            "left out of its fit.",
+        ),
+    ] = "all",
     smoothing: Annotated[
         float | None,
         typer.Option(
@@ -110,6 +126,7 @@ def identify_(
     *,
     reading: ReadingOptions,
     options: ModelOptions,
+    comparing: Comparing,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
@@ -121,39 +138,59 @@ def identify_(
     from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file
 
-    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=(file,))
-    with show_patience(f"reading and fitting {file.name}"):
+    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=files)
+    names = ", ".join(file.name for file in files)
+    columns = (input_column, output_column)
+    settings: dict[str, Any] = {
+        "smoothing": smoothing,
+        "ridge": ridge,
+        "initial": initial,
+        "orientation": orientation,
+        "skip": skip,
+    }
+    selected = None
+    if is_comparison(model):
+        if cross_validate or weights_column:
+            raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
+        selected = choose_model(files, columns, model, options, settings, comparing, skip=skip, reading=reading)
+        model, settings = selected.model, settings | selected.settings()
+    elif comparing.table_out is not None:
+        raise ConfigurationError("--table-out goes with --model all, or several models")
+    else:
+        settings |= options.values
+    with show_patience(f"reading and fitting {names}"):
         found = identify_file(
-            file,
+            files,
             input_column=input_column,
             output_column=output_column,
             model=model,
-            smoothing=smoothing,
-            ridge=ridge,
-            skip=skip,
-            initial=initial,
-            orientation=orientation,
             cross_validated=cross_validate,
             weights_column=weights_column,
             levels_to_try=options.levels_to_try,
-            **options.values,
+            train=comparing.train,
             band=band,
             reading=reading,
+            **settings,
         )
-    print_assumptions(file, found.assumptions)
+    if selected is not None:
+        found = selected.record_in(found)
+    print_assumptions(names, found.assumptions)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
-    print_rows(f"{model} from {file.name}", certificate_lines(found))
+    print_rows(f"{model} from {names}", certificate_lines(found))
     if (banded := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
         print_band(banded)
+    tested = print_test(found, comparing, columns, reading)
     if out is not None:
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
-    write_fit(found, file, context=context, out=out, card=card, figures=figures)
-    write_json(json_file, found.summary())
+    write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
+    more = {"test": tested.to_json()} if tested else {}
+    more |= {"selection": selected.to_json()} if selected else {}
+    write_json(json_file, found.summary() | more)
 
 
 @app.command("predict")
@@ -206,7 +243,7 @@ def predict_(
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
-    print_assumptions(file, columns.assumptions)
+    print_assumptions(file.name, columns.assumptions)
     inputs = columns.values[input_column]
     check_unit(model.operator.input_unit, columns.units[input_column], input_column)
     if output_column:
@@ -291,7 +328,7 @@ def invert(
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [column], options=reading)
-    print_assumptions(file, columns.assumptions)
+    print_assumptions(file.name, columns.assumptions)
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
     found = invert_targets(

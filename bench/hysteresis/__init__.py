@@ -13,6 +13,7 @@ from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.models import ModelSpec, find_model, identifiable_models, model_class, model_from_json
 from bench.hysteresis.operator import Operator, Shape, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
+from bench.hysteresis.polynomial_plays import PolynomialPlays
 from bench.hysteresis.prandtl_ishlinskii import DeadZones, PrandtlIshlinskii
 from bench.hysteresis.preisach import Preisach, Segment, uniform_levels
 from bench.hysteresis.reach import Reach
@@ -47,6 +48,7 @@ __all__ = [
     "Operator",
     "Policy",
     "Polynomial",
+    "PolynomialPlays",
     "PolynomialTerm",
     "PrandtlIshlinskii",
     "Preisach",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from bench import registry
@@ -33,6 +33,12 @@ class ModelSpec:
         data, before the fit.
     estimate_state : callable or None
         Takes template, inputs, outputs, weights, skip and smoothing; returns the initial state that they suggest.
+    variants : mapping of str to tuple
+        Values of options of `template` that `bench identify --model all` compares, each in combination with all
+        others.
+    sizes : mapping of str to tuple
+        Values of options of `template` from the coarsest to the finest, which it goes through together as long as
+        the error falls.
     """
 
     summary: str
@@ -41,6 +47,8 @@ class ModelSpec:
     constrained: bool = True
     refine: Callable[..., Any] | None = None
     estimate_state: Callable[..., Any] | None = None
+    variants: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
 
 def identifiable_models() -> dict[str, ModelSpec]:

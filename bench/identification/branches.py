@@ -27,9 +27,8 @@ def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:
     moving = np.flatnonzero(np.append(True, np.diff(u) != 0.0))
     signs = np.sign(np.diff(u[moving]))
     # The last sample of a plateau at an extremum belongs to the branch that ends there.
-    ends = np.append(moving[1:] - 1, u.size - 1)
-    turns = ends[np.append(np.append(True, signs[1:] != signs[:-1]), True)] if signs.size else np.zeros(1, np.int64)
-    turns[0] = 0
+    ends = moving[1:] - 1
+    turns = np.unique([0, *ends[1:][signs[1:] != signs[:-1]], u.size - 1])
     if least <= 0.0 or turns.size < 3:
         return np.asarray(turns, dtype=np.int64)
     return _without_short_moves(u, turns, least)

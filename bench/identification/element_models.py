@@ -152,5 +152,8 @@ KRASNOSELSKII_POKROVSKII = ModelSpec(
     "Krasnosel'skii-Pokrovskii operator: relays with slope, on a plane",
     KrasnoselskiiPokrovskii,
     _krasnoselskii_pokrovskii,
+    sizes={"levels": (10, 20)},
 )
-MAXWELL_SLIP = ModelSpec("Maxwell-slip operator: springs that slip under a force", MaxwellSlip, _maxwell_slip)
+MAXWELL_SLIP = ModelSpec(
+    "Maxwell-slip operator: springs that slip under a force", MaxwellSlip, _maxwell_slip, sizes={"elements": (5, 15)}
+)

@@ -56,6 +56,9 @@ class Certificate:
     converged : bool
         Whether the conditions hold to the solver's tolerance. False if only columns too dependent on the
         passive ones were left to enter.
+    effective : float
+        Number of coefficients that the data determine, without the bias: the rank of the passive columns, less what
+        smoothness determines of them; nan if it is not known.
     """
 
     kkt_residual: float
@@ -66,6 +69,7 @@ class Certificate:
     swept: Flags
     iterations: int
     converged: bool
+    effective: float = float("nan")
 
     @property
     def coverage(self) -> float:
@@ -211,6 +215,7 @@ def fit_minimum_norm(
         swept=swept,
         iterations=1,
         converged=kkt <= 1e-8,
+        effective=float(rank),
     )
     return Fit(x, mean - float(means @ x), np.full(x.size, np.nan), certificate)
 
@@ -603,7 +608,8 @@ class _ActiveSet:
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
         inverse = self.factor.inverse() if passive.size else np.zeros((0, 0))
-        spare = samples - 1.0 - self.effective(inverse)
+        effective = self.effective(inverse)
+        spare = samples - 1.0 - effective
         if spare > 0.5:
             variance = (float(self.w @ self.residual() ** 2) + left) / spare
             uncertainties[:] = 0.0
@@ -618,5 +624,6 @@ class _ActiveSet:
             swept=self.swept,
             iterations=self.iterations,
             converged=kkt <= 1e-10,
+            effective=effective,
         )
         return Fit(coefficients, self.mean - float(self.means @ coefficients), uncertainties, certificate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ from bench.identification import (
     compare,
     cross_validate,
     identify,
+    measure_errors,
 )
+from bench.identification.memory_tests import MemoryTest, check_congruency, check_return_points
 from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import Resolution, resolve
@@ -36,6 +38,7 @@ from bench.model_file import ModelFile, load_model
 from bench.results.bands import band_json, calibrate
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.examined import Examined, band_columns, examine
+from bench.results.joined_files import fitted_rows, read_files
 from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
@@ -62,6 +65,8 @@ class IdentifiedFile:
         What is odd about the data, though usable.
     inputs, outputs : ndarray, shape (N,)
         The measurements.
+    return_points, congruency : MemoryTest
+        Whether the measurements agree with what a Preisach-type model takes for granted.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
     resolution : Resolution or None
@@ -77,6 +82,8 @@ class IdentifiedFile:
     warnings: tuple[str, ...]
     inputs: Floats
     outputs: Floats
+    return_points: MemoryTest
+    congruency: MemoryTest
     coverage: Coverage | None = None
     resolution: Resolution | None = None
     trials: CrossValidation | None = None
@@ -123,6 +130,8 @@ class IdentifiedFile:
             "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
+            "return_points": self.return_points.to_json(),
+            "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
             **band_json(self.file, self.inputs, found.initial_state),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
@@ -161,7 +170,7 @@ def errors_json(errors: Errors) -> dict[str, float]:
 
 
 def identify_file(
-    path: Path,
+    path: Path | Sequence[Path],
     *,
     input_column: str,
     output_column: str,
@@ -172,6 +181,7 @@ def identify_file(
     cross_validated: bool = False,
     weights_column: str | None = None,
     levels_to_try: Sequence[int] = (),
+    train: slice | None = None,
     band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
@@ -180,8 +190,8 @@ def identify_file(
 
     Parameters
     ----------
-    path : Path
-        A file that `read_columns` reads, or the folder of a run.
+    path : Path or sequence of Path
+        A file that `read_columns` reads, or the folder of a run; of several, each starts with a memory of its own.
     input_column, output_column : str
         Columns of the model's input and output, by name or by number from 1.
     model : str
@@ -196,6 +206,8 @@ def identify_file(
         Column of the weight of each row, >= 0 (inverse variance, say).
     levels_to_try : sequence of int
         Values of the option `levels` among which cross-validation chooses.
+    train : slice, optional
+        Rows that are fitted; all others still drive the memory. The errors are those of the rows fitted.
     band : bool
         Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
@@ -226,13 +238,19 @@ def identify_file(
     except ValueError as error:
         raise ConfigurationError(str(error)) from None
     names = (input_column, output_column, *((weights_column,) if weights_column else ()))
-    columns = read_columns(path, names, at_least=FEWEST_ROWS, options=reading)
+    paths = [path] if isinstance(path, Path) else path
+    files = read_files(paths, names, at_least=FEWEST_ROWS, options=reading)
+    columns = files.columns
     inputs, outputs = columns.values[input_column], columns.values[output_column]
     if inputs.size - skip < FEWEST_ROWS:
-        raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
-    warnings = tuple(check_excitation(columns, input_column))
-    weights = columns.values[weights_column] if weights_column else None
+        left = max(inputs.size - skip, 0)
+        raise DataError(f"{columns.source}: --skip {skip} leaves {left} of {inputs.size} rows; too few")
+    fitted, odd = fitted_rows(files, inputs, train)
+    warnings = (*check_excitation(columns, input_column), *odd)
     check_variation(columns, output_column)
+    weights = columns.values[weights_column] if weights_column else None
+    if not fitted.all():
+        weights = fitted.astype(np.float64) if weights is None else np.where(fitted, weights, 0.0)
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
@@ -243,14 +261,15 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            ridge = ridge or 0.0
             # A signed density is not fitted without a penalty.
-            tried = cross_validated or (smoothing is None and not find_model(model).constrained)
+            is_open = cross_validated or (smoothing is None and not find_model(model).constrained)
+            tried = SMOOTHING if is_open else (smoothing or 0.0,)
+            ridge = ridge or 0.0
             trials = cross_validate(
                 model,
                 inputs,
                 outputs,
-                smoothing=SMOOTHING if tried else (smoothing or 0.0,),
+                smoothing=tried,
                 ridge=ridge,
                 levels=orders,
                 weights=weights,
@@ -267,16 +286,21 @@ def identify_file(
         calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
-    warnings += found.warnings
+    if not fitted.all():
+        counted = fitted & (np.arange(inputs.size) >= found.skip)
+        found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
+    tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
+    warnings += (*found.warnings, *(test.text for test in tests if test.holds is False))
     memory = found.model.advance(found.initial_state, inputs)
     coverage = found.model.coverage(inputs, found.initial_state)
     penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
     resolution: Resolution | None = None
     if coverage is not None:
         regressor = found.model.regressor(inputs, found.initial_state)
-        resolution = resolve(regressor, np.ones(inputs.size), found.skip, penalties.smoothing, penalties.ridge)
+        counting = np.ones(inputs.size) if weights is None else weights
+        resolution = resolve(regressor, counting, found.skip, penalties.smoothing, penalties.ridge)
     provenance = {
-        "source": path.name,
+        "source": ", ".join(each.name for each in paths),
         "input": input_column,
         "output": output_column,
         "rows": int(inputs.size),
@@ -296,6 +320,7 @@ def identify_file(
         tuple(dict.fromkeys(warnings)),
         inputs,
         outputs,
+        *tests,
         coverage,
         resolution,
         trials,
@@ -430,6 +455,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
+        ("return points", identified.return_points.text),
+        ("loops", identified.congruency.text),
     )
 
 

@@ -5,6 +5,9 @@ from pathlib import Path
 
 from hypothesis import settings
 
+# For the modules beside the tests.
+sys.path.insert(0, str(Path(__file__).parent))
+
 settings.register_profile("compiled", deadline=None)
 settings.load_profile("compiled")
 

@@ -108,7 +108,8 @@ def test_given_levels_and_ranges():
             [0.0, 1.0],
             [0.0, 1.0],
             {},
-            "model_name: expected one of bouc-wen, duhem, .*, polynomial, prandtl-ishlinskii, preisach",
+            "model_name: expected one of bouc-wen, duhem, .*, polynomial, polynomial-plays, "
+            "prandtl-ishlinskii, preisach",
         ),
         ("preisach", [0.0, 1.0], [0.0], {}, "outputs: expected 2 values"),
         ("preisach", [], [], {}, "inputs: expected at least one"),

@@ -1,0 +1,217 @@
+"""`bench identify --model all`: the options of the comparison of models, its table, and errors on test rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from bench.cli.console import check_outputs, console, print_rows, warn
+from bench.cli.data_options import offer_options
+from bench.cli.model_options import ModelOptions
+from bench.errors import ConfigurationError
+from bench.results.reading.options import ReadingOptions
+
+if TYPE_CHECKING:
+    from bench.identification.evaluation import Candidate
+    from bench.results.models import IdentifiedFile
+    from bench.results.selection import SelectedModel, TestedModel
+
+# Rows of the printed table; all are in the file.
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class Comparing:
+    """What the command line says of the comparison of models.
+
+    Attributes
+    ----------
+    train : slice or None
+        Rows that are fitted.
+    test : str or None
+        Rows or a file on which the model is tested.
+    table_out : Path or None
+        File for the table.
+    """
+
+    train: slice | None = None
+    test: str | None = None
+    table_out: Path | None = None
+
+
+def _comparing(
+    train: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP", help="Rows to fit, from 0, without STOP; the others still drive the memory."
+        ),
+    ] = None,
+    test: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP|FILE", help="Rows, or another file, on which the errors of the model are stated."
+        ),
+    ] = None,
+    table_out: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="File for the table of the models that were compared.")
+    ] = None,
+) -> Comparing:
+    """Return what the command line says of the comparison of models; its signature is that of the options."""
+    from bench.results.joined_files import parse_rows
+
+    if table_out is not None:
+        check_outputs(out=table_out)
+    return Comparing(parse_rows("--train", train) if train is not None else None, test, table_out)
+
+
+offer_comparing = offer_options(_comparing, "comparing")
+"""Offer a command's users the options of the comparison of models, in place of its parameter `comparing`."""
+
+
+def is_comparison(model: str) -> bool:
+    """Return whether several models are asked for: `all`, or names with commas between them."""
+    from bench.results.selection import ALL
+
+    return model == ALL or "," in model
+
+
+def choose_model(
+    files: Sequence[Path],
+    columns: tuple[str, str],
+    model: str,
+    options: ModelOptions,
+    settings: dict[str, Any],
+    comparing: Comparing,
+    *,
+    skip: int,
+    reading: ReadingOptions,
+) -> SelectedModel:
+    """Compare models on measurements, and print the table.
+
+    Parameters
+    ----------
+    files, columns, skip, reading
+        The measurements.
+    model : str
+        `all`, or names with commas between them.
+    options : ModelOptions
+        Options of models that are given.
+    settings : dict
+        `smoothing`, `ridge`, `initial` and `orientation` as given.
+    comparing : Comparing
+        The options of the comparison.
+
+    Raises
+    ------
+    ConfigurationError
+        If an option is for one model, or none can be fitted.
+    """
+    from bench.identification.selection import Given
+    from bench.results.selection import named_models, select_model
+
+    if settings["ridge"] is not None:
+        raise ConfigurationError("--ridge goes with one --model NAME")
+    if options.levels_to_try:
+        raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
+    orientation = settings["orientation"]
+    given = Given(
+        options.values,
+        initial=settings["initial"],
+        orientation=None if orientation == "auto" else orientation,
+        smoothing=settings["smoothing"],
+    )
+    found = select_model(
+        files,
+        input_column=columns[0],
+        output_column=columns[1],
+        models=named_models(model),
+        given=given,
+        console=console,
+        skip=skip,
+        train=comparing.train,
+        reading=reading,
+    )
+    _print_table(found)
+    for warning in found.warnings:
+        warn(warning)
+    if comparing.table_out is not None:
+        found.save(comparing.table_out)
+        console.print(f"table: {comparing.table_out}", highlight=False, markup=False, soft_wrap=True)
+    return found
+
+
+def _print_table(found: SelectedModel) -> None:
+    selection = found.selection
+    table = Table(
+        title=f"models by their error on what was left out of the fit, in {found.unit or 'output units'}",
+        title_justify="left",
+        box=None,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("")
+    table.add_column("model")
+    for name in ("free", "training", "held out", "/ %", "cycles out", "s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for each in selection.evaluations[:_SHOWN]:
+        values = (
+            "*" if each is selection.chosen else "+" if each is selection.best else "",
+            _describe(each.candidate),
+            f"{each.free:.0f}",
+            f"{each.training:.3g}",
+            f"{each.rms:.3g} ± {each.spread:.1g}",
+            f"{100.0 * each.rms / selection.span:.2f}",
+            f"{each.units_rms:.3g}" if each.units else "",
+            f"{each.seconds:.1f}",
+        )
+        table.add_row(*(Text(value) for value in values))
+    console.print(table)
+    more = len(selection.evaluations) - _SHOWN
+    console.print(
+        "*: chosen, the simplest within one standard error of the least error (+)"
+        + (f"; {more} more were worse or given up" if more > 0 else ""),
+        highlight=False,
+        markup=False,
+    )
+    console.print(
+        f"held out: blocks of {selection.rows} rows with gaps of {selection.gap}; cycles out: whole kinds of cycles",
+        highlight=False,
+        markup=False,
+    )
+
+
+def _describe(one: Candidate) -> str:
+    """Return a model with its settings in a line."""
+    options = [value if isinstance(value, str) else f"{name} {value}" for name, value in one.options.items()]
+    parts = [*options, "" if one.orientation == "auto" else one.orientation]
+    parts.append(f"initial {one.initial}" if one.initial else "")
+    parts.append(f"smoothing {one.smoothing:g}" if one.smoothing else "")
+    return ", ".join((one.model, *(part for part in parts if part and part != "none")))
+
+
+def print_test(
+    found: IdentifiedFile, comparing: Comparing, columns: tuple[str, str], reading: ReadingOptions
+) -> TestedModel | None:
+    """Print the errors of a model on the test rows, if there are any, and return them."""
+    from bench.results.selection import evaluate_on_test
+
+    if comparing.test is None:
+        return None
+    tested = evaluate_on_test(found, comparing.test, columns, reading)
+    unit = found.file.operator.output_unit
+    raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
+    skipped = f", first {tested.skip} rows left out" if tested.skip else ""
+    print_rows(
+        f"on {tested.source}{skipped}",
+        (
+            ("largest error", f"{raw.maximum:.4g} {unit} ({raw.maximum_percent:.2f} % of the range)"),
+            ("RMS error", f"{raw.rms:.4g} {unit} ({raw.rms_percent:.2f} % of the range)"),
+            ("re-zeroed RMS error", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
+        ),
+    )
+    return tested

@@ -1,0 +1,288 @@
+"""Held-out errors of one candidate: how well a model with its settings predicts what was left out of its fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bench.hysteresis import PolynomialPlays
+from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
+from bench.identification.by_name import FitProblem, Initial, set_up_problem
+from bench.identification.folds import Flags, Fold, block_folds, unit_folds
+from bench.identification.least_squares import Fit
+from bench.identification.orientation import Orientation
+
+# Turns smaller than this part of the range need not be kept when rows are left out.
+_LEAST_MOVE = 0.005
+# Moves from this part of the range on make cycles.
+_LEAST_CYCLE = 0.02
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and the settings of its identification.
+
+    Attributes
+    ----------
+    model : str
+        Name in `bench.models`.
+    options : mapping of str to object
+        Options of the model, as `identify` takes them.
+    orientation : str
+        Whether the output rises or falls with the input; `auto` of a model without signs.
+    initial : str or None
+        Memory before the first sample, as `identify` takes it.
+    smoothing : float or None
+        Weight of the roughness penalty; None leaves it, and that of the size, to the fit of a density of either sign.
+    """
+
+    model: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    orientation: Orientation = "rising"
+    initial: Initial | None = None
+    smoothing: float | None = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What candidates are fitted to.
+
+    Attributes
+    ----------
+    inputs, outputs : ndarray, shape (N,)
+        The measured sequence; all of it drives the memory.
+    fitted : ndarray of bool, shape (N,)
+        Rows that may be fitted and tested.
+    known : int
+        First row that is tested: before it, outputs may depend on what came before the sequence.
+    gap : int
+        Rows next to those tested that are not fitted.
+    """
+
+    inputs: Floats
+    outputs: Floats
+    fitted: Flags
+    known: int = 0
+    gap: int = 0
+
+    @classmethod
+    def of(cls, inputs: Floats, outputs: Floats, fitted: Flags | None = None) -> Measurements:
+        """Return measurements of which rows are tested from where the inputs have overwritten all memory they do.
+
+        If that takes more than half of the rows, all are tested.
+        """
+        span = float(inputs.min()), float(inputs.max())
+        until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
+        rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
+        return cls(inputs, outputs, rows, until if until <= inputs.size // 2 else 0)
+
+    def thinned(self, most: int) -> Measurements:
+        """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.
+
+        The memory of an operator that does not depend on the rate is the same with and without the rows between.
+        """
+        if self.inputs.size <= most:
+            return self
+        chosen = np.zeros(self.inputs.size, dtype=bool)
+        chosen[:: -(-self.inputs.size // most)] = True
+        kept = chosen.copy()
+        kept[turning_points(self.inputs, _LEAST_MOVE * float(np.ptp(self.inputs)))] = True
+        known = int(np.count_nonzero(kept[: self.known]))
+        return Measurements(self.inputs[kept], self.outputs[kept], (self.fitted & chosen)[kept], known, self.gap)
+
+    @property
+    def tested(self) -> Flags:
+        """Rows that may be tested, shape (N,)."""
+        return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
+
+    def blocks(self) -> tuple[Fold, ...]:
+        """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""
+        return self._with_first_rows(block_folds(self.tested, blocks=self.count_of_blocks, gap=self.gap))
+
+    @property
+    def count_of_blocks(self) -> int:
+        """Number of blocks, 5 to 20: of a part of a cycle the rest of it would tell too much."""
+        moves = turning_points(self.inputs, _LEAST_CYCLE * float(np.ptp(self.inputs))).size - 1
+        return min(max(moves // 2, 5), 20, max(int(self.tested.sum()), 5))
+
+    def units(self) -> tuple[Fold, ...]:
+        """Return the folds of whole excitation units; none if there is one kind only."""
+        return self._with_first_rows(unit_folds(self.inputs, self.tested, gap=self.gap))
+
+    def _with_first_rows(self, folds: tuple[Fold, ...]) -> tuple[Fold, ...]:
+        first = self.fitted & ~self.tested
+        return tuple(Fold(fold.tested, fold.trained | first) for fold in folds)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a candidate did.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        What was evaluated.
+    blocks : tuple of float
+        Mean squared error of each block fold, output units squared; fewer than there are if it was stopped early.
+    units : tuple of float
+        That of each fold of excitation units.
+    training : float
+        RMS error of the rows fitted, mean over the folds, output units.
+    start : float
+        RMS error of the rows before the first that is tested, output units; 0 if there are none.
+    free : float
+        Coefficients that the data determine, mean over the folds: the rank of the passive set, less with smoothing.
+    seconds : float
+        CPU time, s.
+    failure : str
+        Why it could not be evaluated.
+    """
+
+    candidate: Candidate
+    blocks: tuple[float, ...] = ()
+    units: tuple[float, ...] = ()
+    training: float = float("nan")
+    start: float = 0.0
+    free: float = float("nan")
+    seconds: float = 0.0
+    failure: str = ""
+
+    @property
+    def rms(self) -> float:
+        """RMS error over blocks left out, output units; infinite if none was."""
+        return float(np.sqrt(np.mean(self.blocks))) if self.blocks else float("inf")
+
+    @property
+    def spread(self) -> float:
+        """Standard error of `rms` from the scatter of the folds, output units."""
+        if len(self.blocks) < 2 or not self.rms > 0.0:
+            return float("nan")
+        return float(np.std(self.blocks, ddof=1) / np.sqrt(len(self.blocks)) / (2.0 * self.rms))
+
+    @property
+    def units_rms(self) -> float:
+        """RMS error over excitation units left out, output units; nan if they were not."""
+        return float(np.sqrt(np.mean(self.units))) if self.units else float("nan")
+
+
+def evaluate(
+    measured: Measurements,
+    candidates: Sequence[Candidate],
+    *,
+    most_folds: int | None = None,
+    hopeless: float = float("inf"),
+    with_units: bool = False,
+) -> list[Evaluation]:
+    """Return how candidates do; a task that can be sent to a worker process.
+
+    Parameters
+    ----------
+    measured : Measurements
+        The data.
+    candidates : sequence of Candidate
+        What is evaluated, one after another.
+    most_folds : int or None
+        Number of block folds; all if None.
+    hopeless : float
+        RMS error, output units, above which a candidate is given up after two folds.
+    with_units : bool
+        Whether excitation units are left out as well.
+    """
+    blocks = measured.blocks()[:most_folds]
+    units = measured.units() if with_units else ()
+    return [_evaluate(measured, candidate, blocks, units, hopeless) for candidate in candidates]
+
+
+def _evaluate(
+    measured: Measurements, candidate: Candidate, blocks: Sequence[Fold], units: Sequence[Fold], hopeless: float
+) -> Evaluation:
+    begin = time.process_time()
+    try:
+        trial = _Trial(measured, candidate)
+        done = [trial.leave_out(fold) for fold in blocks[:2]]
+        if np.sqrt(np.mean([each.tested for each in done])) <= hopeless:
+            done += [trial.leave_out(fold) for fold in blocks[2:]]
+        by_unit = [trial.leave_out(fold) for fold in units] if len(done) == len(blocks) else []
+    # A model of another package must not end the comparison of the others.
+    except Exception as error:
+        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        return Evaluation(candidate, failure=text, seconds=time.process_time() - begin)
+    return Evaluation(
+        candidate,
+        blocks=tuple(each.tested for each in done),
+        units=tuple(each.tested for each in by_unit),
+        training=float(np.mean([each.training for each in done])),
+        start=float(np.mean([each.start for each in done])),
+        free=float(np.mean([each.free for each in done])),
+        seconds=time.process_time() - begin,
+    )
+
+
+def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
+    """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
+    trial = _Trial(measured, candidate)
+    found = trial.fit(trial.problem)
+    return measured.outputs - found.bias - trial.problem.regressor.product(found.coefficients)
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    tested: float
+    training: float
+    start: float
+    free: float
+
+
+class _Trial:
+    """A candidate's problem, which is set up once unless the outputs decide on more than the coefficients."""
+
+    def __init__(self, measured: Measurements, candidate: Candidate) -> None:
+        self.measured, self.candidate = measured, candidate
+        self.problem = self._set_up(measured.fitted)
+        spec = self.problem.spec
+        # Two penalties of all rows: to choose them anew in each fold would take longer than all the rest.
+        ridge = None if candidate.smoothing is None else 0.0
+        self.penalties = self.problem.regularization(candidate.smoothing, ridge)
+        # The few shape parameters are those of all rows too.
+        self.again = spec.refine is not None or candidate.initial == "estimate"
+        if self.problem.skip > measured.known:
+            raise ValueError(f"its memory is unknown until row {self.problem.skip}: too few rows are left")
+
+    def _set_up(self, trained: Flags) -> FitProblem:
+        each = self.candidate
+        return set_up_problem(
+            each.model,
+            self.measured.inputs,
+            self.measured.outputs,
+            trained.astype(np.float64),
+            # A specimen need not be saturated where its plane ends: what came before is unknown to any model.
+            self.measured.known if each.initial == "skip" else 0,
+            each.smoothing or 0.0,
+            each.initial,
+            dict(each.options),
+            orientation=each.orientation,
+        )
+
+    def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:
+        """Return the coefficients for the problem's weights or others, with the penalties of the candidate."""
+        return problem.fit(self.penalties.smoothing, weights, ridge=self.penalties.ridge)
+
+    def leave_out(self, fold: Fold) -> _LeftOut:
+        """Fit without a fold; return the errors."""
+        problem = self._set_up(fold.trained) if self.again else self.problem
+        found = self.fit(problem, fold.trained.astype(np.float64))
+        errors = (self.measured.outputs - found.bias - problem.regressor.product(found.coefficients)) ** 2
+        first = self.measured.fitted & ~self.measured.tested
+        trained = fold.trained.copy()
+        trained[: problem.skip] = False
+        return _LeftOut(
+            tested=float(errors[fold.tested].mean()),
+            training=float(np.sqrt(errors[trained].mean())),
+            start=float(np.sqrt(errors[first].mean())) if first.any() else 0.0,
+            free=effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive,
+        )

@@ -1,0 +1,447 @@
+"""Choice of a model by held-out errors: model, order, reversible part, initial memory, orientation and smoothing.
+
+1. Each model in each of its kinds is tried at its coarsest, in both orientations and from each initial memory, on two
+   folds. The best orientation and memory of each are kept; what errs many times more than the best is given up.
+2. Finer ones are tried as long as they gain, on all folds, then the weights of the roughness penalty.
+3. What is near the best is evaluated with whole units of the excitation left out, too.
+4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
+   error is within one standard error of the best, from the differences fold by fold: always one within 2 % of it, and
+   never one more than 5 % above.
+
+Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
+limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
+structure often predicts worse), hence the bound.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import product
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from bench.hysteresis import ModelSpec, Operator, find_model
+from bench.hysteresis._checks import Floats
+from bench.identification.by_name import Initial
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate, residuals_of
+from bench.identification.folds import correlated_rows
+from bench.identification.orientation import Orientation, has_orientation
+
+Task: TypeAlias = Callable[[], list[Evaluation]]
+Carry: TypeAlias = Callable[[Sequence[tuple[str, Task]]], Iterable[list[Evaluation]]]
+"""Carries named tasks out and returns their results in order."""
+
+SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+"""Weights of the roughness penalty that are tried."""
+
+# A candidate that errs so many times more than the best on the first folds is given up.
+_HOPELESS = 3.0
+# A kind of no more coefficients than these at its finest costs little: its coarsest says nothing against it.
+_FEW_COEFFICIENTS = 60
+# Structures for which all smoothing weights are tried, and within which factor of the best error.
+_SMOOTHED = 4
+_REMEMBERED = 2
+_NEAR = 2.0
+# A finer order has to lower the error to this part, or no finer one is tried.
+_GAIN = 0.98
+# Coefficients for each row up to which a finer order is tried.
+_MOST_COEFFICIENTS = 5
+# Errors this near are no difference: of smoothing weights the greatest is taken, of structures the simplest.
+_EQUAL = 1.02
+# What the simplest may err more than the best, however large the standard error.
+_WORSE = 1.05
+# Without units left out nothing bounds a density of either sign on other inputs: it has to be so much better.
+_UNBOUNDED = 1.2
+# Ratio of the two held-out errors from which the record is said to tell little of other inputs.
+_WARNED = 3.0
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is not to be chosen, as it is given.
+
+    Attributes
+    ----------
+    options : mapping of str to object
+        Options of models; each model takes those that it has.
+    initial, orientation, smoothing
+        As `Candidate`; None leaves the choice.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    initial: Initial | None = None
+    orientation: Orientation | None = None
+    smoothing: float | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was tried, and what was chosen.
+
+    Attributes
+    ----------
+    evaluations : tuple of Evaluation
+        The best of each structure first, by their error; those given up and those that failed last.
+    best : Evaluation
+        That of the least held-out error.
+    chosen : Evaluation
+        The simplest within one standard error of it.
+    gap : int
+        Rows left out next to each block.
+    rows : int
+        Rows that were fitted and tested.
+    span : float
+        Range of the outputs, output units.
+    """
+
+    evaluations: tuple[Evaluation, ...]
+    best: Evaluation
+    chosen: Evaluation
+    gap: int
+    rows: int
+    span: float
+
+    def warnings(self) -> list[str]:
+        """Return what the held-out errors say against the chosen model, in sentences."""
+        found = []
+        chosen = self.chosen
+        if not chosen.units:
+            found.append(
+                "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown: "
+                "record smaller cycles too, as `bench design` proposes"
+            )
+        elif chosen.units_rms > _WARNED * chosen.rms:
+            found.append(
+                f"the error with whole cycles left out is {chosen.units_rms / chosen.rms:.1f} times that with blocks "
+                "left out: expect it on inputs unlike the record, and record more kinds of cycles"
+            )
+        return found
+
+
+def select(
+    measured: Measurements, models: Sequence[str], given: Given | None = None, carry: Carry | None = None
+) -> Selection:
+    """Return the model that predicts best what was left out of its fit, and what else was tried.
+
+    Parameters
+    ----------
+    measured : Measurements
+        The data; `gap` is found from the residuals.
+    models : sequence of str
+        Names of models of `identifiable_models`.
+    given : Given, optional
+        Settings that are not to be chosen.
+    carry : callable, optional
+        Carries tasks out, such as in worker processes; one after another in this process if not given.
+
+    Raises
+    ------
+    ValueError
+        If no model can be fitted: names each and why.
+    """
+    return _Search(measured, models, given or Given(), carry or _one_after_another).run()
+
+
+def _one_after_another(tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
+    return [task() for _, task in tasks]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A model in one of its kinds: everything but sizes, orientation, memory and smoothing."""
+
+    model: str
+    fixed: tuple[tuple[str, Any], ...]
+    sizes: tuple[tuple[str, tuple[Any, ...]], ...]
+
+    def options(self, step: int) -> dict[str, Any]:
+        """Return the options of the step-th size, 0 the coarsest."""
+        return dict(self.fixed) | {name: values[min(step, len(values) - 1)] for name, values in self.sizes}
+
+    @property
+    def steps(self) -> int:
+        """Number of sizes."""
+        return max((len(values) for _, values in self.sizes), default=1)
+
+
+class _Search:
+    def __init__(self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry) -> None:
+        self.measured, self.given, self.carry = measured, given, carry
+        self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
+        self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
+        self.given_up: list[Evaluation] = []
+        self._has_plane: dict[_Kind, bool] = {}
+        self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
+
+    def run(self) -> Selection:
+        screened = self.screen()
+        least = min(each.rms for each in screened.values())
+        self.measured = replace(self.measured, gap=self._gap(min(screened.values(), key=lambda each: each.rms)))
+        left = {}
+        for kind, each in screened.items():
+            if each.rms > _HOPELESS * least and self._count(kind, kind.steps - 1) > _FEW_COEFFICIENTS:
+                self.given_up.append(each)
+            else:
+                left[kind] = each.candidate
+        self.refine(left, _HOPELESS * least)
+        self.smooth()
+        self.remember()
+        finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
+        return self.choose(self.with_units(finalists))
+
+    def screen(self) -> dict[_Kind, Evaluation]:
+        """Return each kind at its coarsest, with its best orientation and memory."""
+        tasks, kinds, failures = [], [], []
+        for kind in self.kinds:
+            try:
+                tries = self._first_tries(kind)
+            except (ValueError, TypeError) as error:
+                failures.append(Evaluation(Candidate(kind.model, kind.options(0)), failure=str(error)))
+            else:
+                kinds.append(kind)
+                tasks.append((kind.model, partial(evaluate, self.measured, tries, most_folds=2)))
+        result = {}
+        for kind, found in zip(kinds, self.carry(tasks), strict=True):
+            usable = [each for each in found if each.blocks]
+            if usable:
+                result[kind] = _best_memory(usable)
+            else:
+                failures.append(found[0])
+        self.given_up += failures
+        if not result:
+            raise ValueError("; ".join(dict.fromkeys(f"{each.candidate.model}: {each.failure}" for each in failures)))
+        return result
+
+    def refine(self, left: Mapping[_Kind, Candidate], hopeless: float) -> None:
+        """Evaluate finer and finer orders of each kind, as long as they gain."""
+        going = dict(left)
+        step = 0
+        while going:
+            names = list(going.items())
+            tasks = []
+            for kind, candidate in names:
+                sized = replace(candidate, options=kind.options(step))
+                weights: list[float | None] = [sized.smoothing]
+                # A fine plane without any smoothing may fail where the same plane with some does not.
+                if self._is_smoothed(kind) and step:
+                    weights.append(1e-2)
+                tries = [replace(sized, smoothing=weight) for weight in weights]
+                tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=hopeless)))
+            step += 1
+            for (kind, _), found in zip(names, self.carry(tasks), strict=True):
+                before = min((each.rms for each in self.done[kind]), default=float("inf"))
+                self.done[kind] += found
+                now = min(each.rms for each in found)
+                if step >= kind.steps or not now < _GAIN * before or self._is_too_fine(kind, step):
+                    del going[kind]
+
+    def _is_too_fine(self, kind: _Kind, step: int) -> bool:
+        """Return whether a kind has many more coefficients than there are rows."""
+        return self._count(kind, step) > _MOST_COEFFICIENTS * int(self.measured.tested.sum())
+
+    def _count(self, kind: _Kind, step: int) -> int:
+        """Return the number of coefficients of a kind at a size."""
+        template = find_model(kind.model).template
+        assert template is not None
+        operator: Operator[Any] = template(self.measured.inputs, **kind.options(step))
+        return operator.coefficients.size
+
+    def smooth(self) -> None:
+        """Try smaller and greater smoothing weights on the structures near the best, until the error rises."""
+        best = {kind: each for kind in self.kinds if (each := self._best(kind)) and self._is_smoothed(kind)}
+        least = min((each.rms for each in best.values()), default=0.0)
+        near = sorted((each.rms, self.kinds.index(kind)) for kind, each in best.items() if each.rms <= _NEAR * least)
+        going = [self.kinds[index] for _, index in near[:_SMOOTHED]]
+        while going:
+            tries = [(kind, each) for kind in going for each in self._neighbours(kind)]
+            tasks = [
+                (kind.model, partial(evaluate, self.measured, [each], hopeless=_NEAR * least)) for kind, each in tries
+            ]
+            for (kind, _), found in zip(tries, self.carry(tasks), strict=True):
+                self.done[kind] += found
+            going = [kind for kind in going if self._neighbours(kind)]
+
+    def _neighbours(self, kind: _Kind) -> list[Candidate]:
+        """Return the best candidate of a kind with the next smaller and greater smoothing, as far as not tried."""
+        best = self._best(kind)
+        assert best is not None
+        tried = {
+            each.candidate.smoothing
+            for each in self.done[kind]
+            if each.candidate.options == best.candidate.options
+        }  # fmt: skip
+        at = int(np.searchsorted(SMOOTHING, best.candidate.smoothing or 0.0))
+        return [
+            replace(best.candidate, smoothing=weight)
+            for weight in SMOOTHING[max(at - 1, 0) : at + 2]
+            if weight not in tried
+        ]
+
+    def remember(self) -> None:
+        """Try the other initial memories on the best, which were compared at the coarsest order only."""
+        best = sorted((each.rms, self.kinds.index(kind)) for kind in self.kinds if (each := self._best(kind)))
+        chosen = [self.kinds[index] for _, index in best[:_REMEMBERED]]
+        tasks = []
+        for kind in chosen:
+            one = self._best(kind)
+            assert one is not None
+            others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
+            tries = [replace(one.candidate, initial=memory) for memory in others]
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=_EQUAL * one.rms)))
+        for kind, found in zip(chosen, self.carry(tasks), strict=True):
+            self.done[kind] += found
+
+    def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists, those near the best with whole units of the excitation left out too."""
+        if not self.measured.units():
+            return finalists
+        least = min(each.rms for each in finalists)
+        near = [each for each in finalists if each.rms <= _NEAR * least]
+        tasks = [
+            (each.candidate.model, partial(evaluate, self.measured, [each.candidate], with_units=True))
+            for each in near
+        ]  # fmt: skip
+        found = [
+            replace(one, seconds=one.seconds + each.seconds)
+            for each, (one,) in zip(near, self.carry(tasks), strict=True)
+        ]
+        return found + [each for each in finalists if each not in near]
+
+    def choose(self, finalists: list[Evaluation]) -> Selection:
+        """Return the table with what is chosen."""
+        judged = [each for each in finalists if each.units] or self._bounded(finalists)
+        best = min(judged, key=lambda each: _score(each).mean())
+        within = [each for each in judged if is_within_one_standard_error(each, best)]
+        chosen = min(within, key=lambda each: (each.free, _score(each).mean()))
+        others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
+        table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
+        measured = self.measured
+        return Selection(
+            tuple(table), best, chosen, measured.gap, int(measured.tested.sum()), float(np.ptp(measured.outputs))
+        )
+
+    def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists without those of a plane and free signs, unless these are clearly better."""
+        free = {
+            kind.model for kind in self.kinds if self._has_plane.get(kind) and not find_model(kind.model).constrained
+        }
+        others = [each for each in finalists if each.candidate.model not in free]
+        least = min((each.rms for each in others), default=float("inf"))
+        return others + [each for each in finalists if each not in others and _UNBOUNDED * each.rms < least]
+
+    @property
+    def _folds(self) -> int:
+        return len(self.measured.blocks())
+
+    def _whole(self, kind: _Kind) -> list[Evaluation]:
+        """Return the candidates of a kind that were not given up."""
+        return [each for each in self.done[kind] if len(each.blocks) == self._folds]
+
+    def _of_each_size(self, kind: _Kind) -> list[Evaluation]:
+        """Return the best smoothing of each size of a kind."""
+        sizes: dict[str, list[Evaluation]] = {}
+        for each in self._whole(kind):
+            sizes.setdefault(repr(sorted(each.candidate.options.items())), []).append(each)
+        return [best_smoothing(_of_best_memory(each)) for each in sizes.values()]
+
+    def _best(self, kind: _Kind) -> Evaluation | None:
+        """Return the best candidate of a kind."""
+        return min(self._whole(kind), key=lambda each: each.rms, default=None)
+
+    def _is_smoothed(self, kind: _Kind) -> bool:
+        """Return whether a smoothing weight is to be chosen: the model has a plane and signs, and none is given."""
+        return (
+            self.given.smoothing is None and find_model(kind.model).constrained and self._has_plane.get(kind, False)
+        )
+
+    def _first_tries(self, kind: _Kind) -> list[Candidate]:
+        """Return a kind at its coarsest in each orientation and from each initial memory that it has.
+
+        Raises ValueError if the data do not suit it.
+        """
+        spec = find_model(kind.model)
+        assert spec.template is not None
+        template: Operator[Any] = spec.template(self.measured.inputs, **kind.options(0))
+        self._has_plane[kind] = bool(template.densities())
+        orientations: tuple[Orientation, ...] = ("auto",)
+        if has_orientation(spec, template):
+            given = self.given.orientation
+            orientations = ("rising", "falling") if given in (None, "auto") else (given,)
+        memories: tuple[Initial | None, ...] = (None,)
+        if not template.memoryless:
+            estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
+            memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
+        self._memories[kind] = memories
+        if template.shape_parameters().names and self.given.initial is None:
+            # Each set-up is a search for the shape; the others are tried on the best only.
+            memories = (None, "skip")
+        weight: float | None = 0.0
+        if self._has_plane[kind]:
+            weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing
+        return [
+            Candidate(kind.model, kind.options(0), orientation, initial, weight)
+            for orientation, initial in product(orientations, memories)
+        ]
+
+    def _gap(self, each: Evaluation) -> int:
+        """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
+        block = int(self.measured.tested.sum()) // self.measured.count_of_blocks
+        return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
+
+
+def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
+    """Return whether an error is within one standard error of the best, or 2 %, and at most 5 % above it.
+
+    The standard error is that of the differences fold by fold: what is hard to predict is so for both.
+    """
+    first, second = _score(simple), _score(best)
+    difference = first - second
+    allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
+    allowed = min(max(allowed, (_EQUAL**2 - 1.0) * second.mean()), (_WORSE**2 - 1.0) * second.mean())
+    return bool(difference.mean() <= allowed)
+
+
+def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
+    """Return the try of the least error; of several within 2 % of it the smoothest."""
+    least = min(each.rms for each in tries)
+    return max(
+        (each for each in tries if each.rms <= _EQUAL * least),
+        key=lambda each: (each.candidate.smoothing or 0.0, -each.rms),
+    )
+
+
+def _of_best_memory(tries: Sequence[Evaluation]) -> list[Evaluation]:
+    """Return the tries from the initial memory of the best of them."""
+    memories: dict[Initial | None, list[Evaluation]] = {}
+    for each in tries:
+        memories.setdefault(each.candidate.initial, []).append(each)
+    chosen = _best_memory([min(each, key=lambda one: one.rms) for each in memories.values()])
+    return memories[chosen.candidate.initial]
+
+
+def _best_memory(tries: Sequence[Evaluation]) -> Evaluation:
+    """Return the try of the least error; of several within 2 % of it that of the least error in the first rows."""
+    least = min(each.rms for each in tries)
+    return min((each for each in tries if each.rms <= _EQUAL * least), key=lambda each: each.start)
+
+
+def _score(each: Evaluation) -> Floats:
+    """Return the mean squared errors that decide, fold by fold: those of blocks, and of units where there are any."""
+    return np.array(each.blocks + each.units)
+
+
+def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:
+    """Return a model in each of its kinds: with the options that are given."""
+    assert spec.template is not None
+    taken = inspect.signature(spec.template).parameters
+    fixed = {name: value for name, value in given.options.items() if name in taken}
+    sizes = tuple((name, tuple(values)) for name, values in spec.sizes.items() if name not in fixed)
+    varied = {name: values for name, values in spec.variants.items() if name not in fixed}
+    return [
+        _Kind(model, (*fixed.items(), *zip(varied, choice, strict=True)), sizes)
+        for choice in product(*varied.values())
+    ]

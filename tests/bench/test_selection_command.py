@@ -1,0 +1,160 @@
+"""`bench identify` without a model, with rows or files kept for the test, and from several files."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.hysteresis import PrandtlIshlinskii
+from bench.identification import ramps
+from bench.model_file import load_model
+from bench.results.joined_files import read_files
+
+COLUMNS = ("--input", "voltage", "--output", "travel")
+# Few models keep this short; `all` is tested once.
+SOME = ("--model", "polynomial,polynomial-plays,prandtl-ishlinskii")
+
+
+def measure(path: Path, seed: int = 0, offset: float = 0.0, unit: str = "V") -> None:
+    """Write a record of plays between random turns: 0 to 10 V first, and noise of 0.5 % of the range."""
+    rng = np.random.default_rng(seed)
+    inputs = ramps([0.0, 10.0, *rng.uniform(0.0, 10.0, 16)], 0.4)
+    plays = PrandtlIshlinskii(np.arange(5.0), [1.0, 0.4, 0.8, 0.3, 0.5], input_range=(0.0, 10.0))
+    outputs = plays.evaluate(inputs, plays.saturated_state(-1)) + offset
+    outputs += 0.005 * np.ptp(outputs) * rng.standard_normal(outputs.size)
+    rows = np.column_stack([inputs, outputs])
+    np.savetxt(path, rows, header=f"voltage [{unit}],travel [mm]", delimiter=",", comments="")
+
+
+@pytest.fixture
+def record(tmp_path):
+    measure(tmp_path / "record.csv")
+    return tmp_path / "record.csv"
+
+
+def test_without_a_model_all_are_compared_and_one_is_saved(bench, record, tmp_path):
+    out, table, result = tmp_path / "model.json", tmp_path / "table.csv", tmp_path / "result.json"
+    code, text, err = bench(
+        "identify", record, *COLUMNS, "--levels", 5, "--out", out, "--table-out", table, "--json", result
+    )
+    assert code == 0, err
+    assert "held out" in text
+    assert "±" in text
+    assert "return-point memory" in text
+    content = json.loads(result.read_text())
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    chosen = [row for row in rows if row["note"] == "chosen"]
+    assert len(chosen) == 1
+    assert chosen[0]["model"] == content["model"] == load_model(out).name
+    assert {"preisach", "preisach-signed", "polynomial"} <= {row["model"] for row in rows}
+    assert float(chosen[0]["held_out_percent"]) < 2.0
+    assert len(content["selection"]["table"]) == len(rows)
+    assert load_model(out).provenance["selection"]["table"] == content["selection"]["table"]
+    assert content["return_points"]["holds"] is True
+
+
+def test_the_chosen_model_is_found_and_has_its_errors_again(bench, record, tmp_path):
+    out, result, predicted = tmp_path / "model.json", tmp_path / "result.json", tmp_path / "predicted.json"
+    code, _, err = bench("identify", record, *COLUMNS, *SOME, "--out", out, "--json", result)
+    assert code == 0, err
+    content = json.loads(result.read_text())
+    assert content["model"] == "prandtl-ishlinskii"
+    code, _, err = bench("predict", out, record, *COLUMNS, "--out", tmp_path / "p.csv", "--json", predicted)
+    assert code == 0, err
+    assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
+
+
+def test_rows_are_kept_for_the_test(bench, record, tmp_path):
+    result = tmp_path / "result.json"
+    code, text, err = bench(
+        "identify", record, *COLUMNS, *SOME, "--train", "0:150", "--test", "150:", "--json", result
+    )
+    assert code == 0, err
+    assert "on rows 150:" in text
+    content = json.loads(result.read_text())
+    assert content["test"]["source"] == "rows 150:"
+    assert content["test"]["raw"]["rms_percent"] < 2.0
+
+
+def test_the_rows_of_the_test_are_not_fitted(bench, record, tmp_path):
+    """With the rows of the test spoilt, the model is the same and the test is bad."""
+    lines = record.read_text().splitlines()
+    spoilt = tmp_path / "spoilt.csv"
+    changed = [f"{line.split(',')[0]},{1e3 + row}" for row, line in enumerate(lines[151:])]
+    spoilt.write_text("\n".join([*lines[:151], *changed]) + "\n")
+    models = []
+    for path in (record, spoilt):
+        out, result = tmp_path / f"{path.stem}.json", tmp_path / f"{path.stem}-result.json"
+        code, _, err = bench(
+            "identify", path, *COLUMNS, "--model", "prandtl-ishlinskii", "--train", ":150", "--test", "150:",
+            "--out", out, "--json", result,
+        )  # fmt: skip
+        assert code == 0, err
+        models.append((load_model(out).operator.coefficients, json.loads(result.read_text())))
+    np.testing.assert_allclose(models[0][0], models[1][0], rtol=1e-9)
+    assert models[1][1]["rms"] == pytest.approx(models[0][1]["rms"])
+    assert models[1][1]["test"]["raw"]["rms"] > 100 * models[0][1]["test"]["raw"]["rms"]
+
+
+def test_another_file_is_the_test(bench, record, tmp_path):
+    measure(tmp_path / "other.csv", seed=1, offset=3.0)
+    result = tmp_path / "result.json"
+    code, _, err = bench(
+        "identify", record, *COLUMNS, "--model", "prandtl-ishlinskii", "--test", tmp_path / "other.csv", "--json",
+        result,
+    )  # fmt: skip
+    assert code == 0, err
+    test = json.loads(result.read_text())["test"]
+    assert test["source"] == "other.csv"
+    assert test["offset"] == pytest.approx(3.0, abs=0.2)
+    assert test["rezeroed"]["rms_percent"] < 3.0 < test["raw"]["rms_percent"]
+
+
+def test_one_model_of_several_files(bench, record, tmp_path):
+    """The second starts from a memory of its own: its rows count once its inputs have overwritten that."""
+    measure(tmp_path / "second.csv", seed=1)
+    result = tmp_path / "result.json"
+    code, _, err = bench(
+        "identify", record, tmp_path / "second.csv", *COLUMNS, "--model", "prandtl-ishlinskii", "--json", result
+    )
+    assert code == 0, err
+    assert json.loads(result.read_text())["rms_percent"] < 3.0
+    files = read_files([record, tmp_path / "second.csv"], ["voltage", "travel"], at_least=10, options=None)
+    assert files.starts[1] == len(record.read_text().splitlines()) - 1
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (("--model", "polynomial", "--train", "5"), "START:STOP"),
+        (("--model", "polynomial", "--train", "9000:"), "--train leaves none"),
+        (("--model", "polynomial", "--test", "9000:"), "--test 9000:"),
+        (("--model", "polynomial,plain"), "there is no model 'plain'"),
+        (("--model", "polynomial", "--table-out", "t.csv"), "--table-out"),
+        ((*SOME, "--cross-validate"), "--cross-validate"),
+        ((*SOME, "--levels", "5"), "levels: none of the models has this option"),
+    ],
+)
+def test_wrong_options_are_named(bench, record, options, word):
+    code, _, err = bench("identify", record, *COLUMNS, *options)
+    assert code == 2
+    assert word in err
+
+
+def test_a_second_file_in_another_unit_is_refused(bench, record, tmp_path):
+    measure(tmp_path / "second.csv", unit="kV")
+    code, _, err = bench("identify", record, tmp_path / "second.csv", *COLUMNS, *SOME)
+    assert code == 3
+    assert "kV" in err
+
+
+def test_a_ratcheting_output_is_warned_of(bench, record, tmp_path):
+    lines = record.read_text().splitlines()
+    drifting = [f"{u},{float(y) + 0.2 * row}" for row, (u, y) in enumerate(line.split(",") for line in lines[1:])]
+    (tmp_path / "drift.csv").write_text("\n".join([lines[0], *drifting]) + "\n")
+    code, _, err = bench("identify", tmp_path / "drift.csv", *COLUMNS, "--model", "preisach")
+    assert code == 0
+    assert "no return-point memory" in err
+    assert "may not be used" in " ".join(err.split())

@@ -1,0 +1,167 @@
+"""Choice among models: the true structure is found, the rule of one standard error holds, and nothing is left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hysteretic_plants import duhem, random_reversals, settled
+
+from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
+from bench.identification.selection import Given, best_smoothing, is_within_one_standard_error, select
+
+INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
+NAMES = ("polynomial", "polynomial-plays", "prandtl-ishlinskii")
+
+
+def noisy(outputs, part=0.005, seed=2):
+    return outputs + part * np.ptp(outputs) * np.random.default_rng(seed).standard_normal(outputs.size)
+
+
+def evaluation(blocks, units=(), free=1.0, smoothing=0.0):
+    return Evaluation(Candidate("preisach", smoothing=smoothing), blocks=tuple(blocks), units=tuple(units), free=free)
+
+
+class TestTheRuleOfOneStandardError:
+    def test_differences_count_fold_by_fold(self):
+        best = evaluation([1.0, 4.0, 9.0, 16.0, 25.0])
+        # Worse by as much in every fold: certain, though far below the scatter of the folds.
+        assert not is_within_one_standard_error(evaluation(np.array(best.blocks) * 1.06), best)
+        # As much worse on average, by chance.
+        uneven = np.add(best.blocks, [3.0, -3.0, 3.0, -3.0, 2.0])
+        assert is_within_one_standard_error(evaluation(uneven), best)
+
+    def test_two_percent_are_no_difference_and_more_than_five_are_never_taken(self):
+        best = evaluation([1.0] * 5)
+        assert is_within_one_standard_error(evaluation([1.019**2] * 5), best)
+        assert not is_within_one_standard_error(evaluation([1.021**2] * 5), best)
+        # Within one standard error, but too much.
+        assert not is_within_one_standard_error(evaluation([3.0, 0.2, 2.5, 0.1, 0.8]), best)
+
+    def test_units_left_out_count_as_much_as_blocks(self):
+        best = evaluation([1.0] * 5, [1.0] * 5)
+        assert not is_within_one_standard_error(evaluation([1.0] * 5, [1.3] * 5), best)
+
+    def test_the_smoothest_of_equal_errors_is_taken(self):
+        tries = [evaluation([square] * 5, smoothing=weight) for weight, square in ((0, 1.0), (0.1, 1.03), (1, 1.1))]
+        assert best_smoothing(tries).candidate.smoothing == 0.1
+
+
+class TestTheTrueStructureIsFound:
+    def test_a_polynomial_is_not_given_a_memory(self):
+        found = select(Measurements.of(INPUTS, noisy(INPUTS**3 - 0.4 * INPUTS)), NAMES).chosen.candidate
+        assert (found.model, found.options["degree"]) == ("polynomial", 3)
+
+    def test_plays_are_plays(self):
+        truth = PrandtlIshlinskii(np.arange(5) / 5.0, [0.5, 0.3, 0.6, 0.2, 0.4])
+        found = select(Measurements.of(INPUTS, noisy(truth.evaluate(INPUTS))), NAMES)
+        assert found.chosen.candidate.model == "prandtl-ishlinskii"
+        assert found.chosen.candidate.options["plays"] == 5
+        assert found.chosen.candidate.orientation == "rising"
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_a_density_is_a_density_and_its_orientation_is_found(self, sign):
+        levels = uniform_levels(-1.0, 1.0, 10)
+        density = np.random.default_rng(5).exponential(1.0, 55) * (np.random.default_rng(6).random(55) < 0.4)
+        truth = Preisach(levels, density)
+        given = Given({"levels": 10}, smoothing=0.0)
+        measured = Measurements.of(INPUTS, sign * noisy(truth.evaluate(INPUTS)))
+        found = select(measured, (*NAMES, "preisach"), given)
+        assert found.chosen.candidate.model == "preisach"
+        assert found.chosen.candidate.options["reversible"] == "none"
+        assert found.chosen.candidate.orientation == ("rising" if sign > 0 else "falling")
+        # The error left out is that of the noise.
+        assert found.chosen.rms < 1.6 * 0.005 * np.ptp(measured.outputs)
+
+    def test_a_first_part_from_another_memory_is_left_out_or_known(self):
+        truth = Preisach(uniform_levels(-1.0, 1.0, 10), np.ones(55))
+        path = np.concatenate([[1.0, -0.2], 0.1 * np.arange(-2, 11), INPUTS])
+        outputs = noisy(truth.evaluate(path, truth.saturated_state(1)))[1:]
+        found = select(Measurements.of(path[1:], outputs), ("preisach",), Given({"levels": 10, "reversible": "none"}))
+        assert found.chosen.candidate.initial in ("positive", "estimate", "skip")
+
+
+def test_settings_that_are_given_are_kept():
+    given = Given({"plays": 7}, initial="positive", orientation="falling", smoothing=0.25)
+    found = select(Measurements.of(INPUTS, -duhem(INPUTS)), ("prandtl-ishlinskii",), given)
+    for each in found.evaluations:
+        one = each.candidate
+        assert (one.options["plays"], one.initial, one.orientation) == (7, "positive", "falling")
+
+
+def test_a_polynomial_with_a_few_plays_bounds_the_error_of_few_samples():
+    inputs = random_reversals(np.random.default_rng(0), 60, 8)
+    measured = Measurements.of(inputs, noisy(settled(duhem, inputs), 0.01))
+    found = select(measured, (*NAMES, "preisach"))
+    plays = evaluate(measured, [Candidate("polynomial-plays", {"degree": 3, "plays": 3}, "auto")])[0]
+    assert found.chosen.rms <= 1.5 * plays.rms
+
+
+def test_one_kind_of_cycle_is_warned_of():
+    inputs = np.tile(np.append(np.linspace(0, 1, 20), np.linspace(1, 0, 20)), 8)
+    found = select(Measurements.of(inputs, noisy(inputs)), ("polynomial",))
+    assert not found.chosen.units
+    assert any("amplitude" in text for text in found.warnings())
+    ratio = replace(found, chosen=evaluation([1.0] * 5, [16.0] * 5))
+    assert any("4.0 times" in text for text in ratio.warnings())
+
+
+def test_a_model_of_another_package_takes_part_and_one_that_fails_says_so(monkeypatch):
+    def template(inputs, *, order: int = 2):
+        if order == 3:
+            raise ValueError("order: not 3")
+        return Polynomial(np.zeros(order), (float(inputs.min()), float(inputs.max())))
+
+    def broken(inputs):
+        raise ValueError("no such plant")
+
+    foreign = {
+        "foreign": ModelSpec("", Polynomial, template, constrained=False, variants={"order": (3, 2)}),
+        "broken": ModelSpec("", Polynomial, broken),
+    }
+    known = models.identifiable_models
+    monkeypatch.setattr(models, "identifiable_models", lambda: known() | foreign)
+    found = select(Measurements.of(INPUTS, noisy(INPUTS**2)), ("broken", "foreign", "polynomial-plays"))
+    assert found.chosen.candidate.model == "foreign"
+    assert found.chosen.candidate.options == {"order": 2}
+    assert {each.failure for each in found.evaluations if each.failure} == {"order: not 3", "no such plant"}
+    with pytest.raises(ValueError, match="broken: no such plant"):
+        select(Measurements.of(INPUTS, INPUTS), ("broken",))
+
+
+def test_errors_left_out_are_those_of_fits_without_them():
+    """Brute force: the normal equations of each fold, without the machinery."""
+    measured = replace(Measurements.of(INPUTS, noisy(np.sin(2.0 * INPUTS))), gap=3)
+    found = evaluate(measured, [Candidate("polynomial", {"degree": 4}, "auto")])[0]
+    columns = np.vander(INPUTS, 5)
+    expected = []
+    for fold in measured.blocks():
+        x = np.linalg.lstsq(columns[fold.trained], measured.outputs[fold.trained], rcond=None)[0]
+        expected.append(np.mean((measured.outputs - columns @ x)[fold.tested] ** 2))
+    np.testing.assert_allclose(found.blocks, expected, rtol=1e-8)
+
+
+def test_what_is_left_out_still_drives_the_memory():
+    truth = Preisach(uniform_levels(-1.0, 1.0, 4), np.ones(10))
+    measured = Measurements.of(INPUTS, truth.evaluate(INPUTS))
+    found = evaluate(measured, [Candidate("preisach", {"levels": 4})])[0]
+    assert found.rms < 1e-9
+
+
+def test_rows_between_do_not_change_the_memory():
+    thin = Measurements.of(INPUTS, duhem(INPUTS)).thinned(150)
+    assert thin.inputs.size < 220
+    # Every row that is kept is one of the sequence, in its order.
+    rows = np.searchsorted(np.arange(INPUTS.size), np.flatnonzero(np.isin(INPUTS, thin.inputs)))
+    assert thin.inputs.tolist() == INPUTS[rows].tolist()
+    truth = Preisach(uniform_levels(-1.0, 1.0, 10), np.random.default_rng(0).random(55))
+    whole = truth.evaluate(INPUTS)
+    np.testing.assert_allclose(truth.evaluate(thin.inputs), whole[rows], atol=0.01 * np.ptp(whole))
+    assert thin.fitted.sum() == -(-INPUTS.size // 3)
+
+
+def test_hopeless_candidates_are_given_up_after_two_folds():
+    measured = Measurements.of(INPUTS, noisy(INPUTS**3))
+    found = evaluate(measured, [Candidate("polynomial", {"degree": 1}, "auto")], hopeless=1e-3)[0]
+    assert len(found.blocks) == 2
+    assert not found.units
