@@ -261,14 +261,15 @@ def identify_file(
             if isinstance(options.get("levels"), int):
                 orders = orders or [others["levels"]]
                 del others["levels"]
-            ridge = ridge or 0.0
             # A signed density is not fitted without a penalty.
-            tried = cross_validated or (smoothing is None and not find_model(model).constrained)
+            is_open = cross_validated or (smoothing is None and not find_model(model).constrained)
+            tried = SMOOTHING if is_open else (smoothing or 0.0,)
+            ridge = ridge or 0.0
             trials = cross_validate(
                 model,
                 inputs,
                 outputs,
-                smoothing=SMOOTHING if tried else (smoothing or 0.0,),
+                smoothing=tried,
                 ridge=ridge,
                 levels=orders,
                 weights=weights,
