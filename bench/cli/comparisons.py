@@ -39,6 +39,9 @@ def compare_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
+    time_column: Annotated[
+        str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for models with time.")
+    ] = None,
     skip: Annotated[
         int,
         typer.Option(
@@ -59,9 +62,9 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or skip or figures or reading != ReadingOptions():
+        if input_column or output_column or time_column or skip or figures or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --figures and how a file is read are for models, with --data FILE"
+                "--input, --output, --time, --skip, --figures and how a file is read are for models, with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
@@ -70,7 +73,9 @@ def compare_(
 
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
-        result = compare_models(compared, data, input_column, output_column, skip=skip, reading=reading)
+        result = compare_models(
+            compared, data, input_column, output_column, skip=skip, time_column=time_column, reading=reading
+        )
     print_assumptions(data, result.assumptions)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")

@@ -41,6 +41,11 @@ ContinueMemory = Annotated[
 ]
 
 
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for a model with time.")
+]
+
+
 @app.command("identify")
 @layout_options
 @show_compilation()
@@ -80,6 +85,19 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
+    time_column: TimeColumn = None,
+    static: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
+    ] = None,
+    dynamics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
+            "none; chosen by the data if not given (hammerstein).",
+        ),
+    ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE", help="Another numerical option of the model; repeatable."),
@@ -116,13 +134,16 @@ def identify_(
             smoothing=smoothing,
             skip=skip,
             initial=initial,
+            time_column=time_column,
+            static=static,
+            dynamics=dynamics,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
             reading=reading,
         )
     print_assumptions(file, found.assumptions)
     if found.trials is not None:
-        console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
+        console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
@@ -149,6 +170,7 @@ def predict_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
+    time_column: TimeColumn = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
@@ -162,23 +184,26 @@ def predict_(
     from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, errors_json, outside_of_range, predict
+    from bench.results.times import read_times
 
     check_outputs(out=out, json_file=json_file)
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
-        columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
+        names = [name for name in (input_column, output_column, time_column) if name]
+        columns = read_columns(file, names, options=reading)
     print_assumptions(file, columns.assumptions)
     inputs = columns.values[input_column]
-    check_unit(model.operator.input_unit, columns.units[input_column], input_column)
+    check_unit(model.response.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
-    predicted = predict(model, inputs, continue_memory=continue_memory)
+    times = read_times(columns, time_column) if time_column else None
+    predicted = predict(model, inputs, continue_memory=continue_memory, times=times)
     write_csv(out, [input_column, "predicted"], [inputs, predicted])
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
     if output_column:
         errors = measure_errors(columns.values[output_column], predicted)
         result |= errors_json(errors)
-        unit = model.operator.output_unit
+        unit = model.response.output_unit
         print_rows(
             f"{model.name} on {file.name}",
             (

@@ -5,7 +5,14 @@ from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model
 from bench.hysteresis.inverse import Inverse, Inversion, Policy, Reach
 from bench.hysteresis.memory import MemoryCurve
-from bench.hysteresis.models import ModelSpec, find_model, identifiable_models, model_class, model_from_json
+from bench.hysteresis.models import (
+    ModelSpec,
+    find_model,
+    identifiable_models,
+    model_class,
+    model_from_json,
+    timed_models,
+)
 from bench.hysteresis.operator import Operator, Shape, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
 from bench.hysteresis.prandtl_ishlinskii import DeadZones, PrandtlIshlinskii
@@ -18,6 +25,7 @@ from bench.hysteresis.reversible import (
     ThermalExpansion,
     reversible_from_json,
 )
+from bench.hysteresis.timed import TimedModel
 from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage, TwoStageState
 
 __all__ = [
@@ -45,6 +53,7 @@ __all__ = [
     "Shape",
     "Summed",
     "ThermalExpansion",
+    "TimedModel",
     "TwoStage",
     "TwoStageState",
     "find_model",
@@ -53,5 +62,6 @@ __all__ = [
     "model_from_json",
     "operator_from_json",
     "reversible_from_json",
+    "timed_models",
     "uniform_levels",
 ]

@@ -32,6 +32,9 @@ class ModelSpec:
         data, before the fit.
     estimate_state : callable or None
         Takes template, inputs, outputs, weights, skip and smoothing; returns the initial state that they suggest.
+    fit_in_time : callable or None
+        For a model with time (`TimedModel`), in place of `template`: takes times, inputs, outputs and the keyword
+        options `weights`, `skip`, `initial`, units and its own; returns an `Identification`.
     """
 
     summary: str
@@ -40,11 +43,17 @@ class ModelSpec:
     constrained: bool = True
     refine: Callable[..., Any] | None = None
     estimate_state: Callable[..., Any] | None = None
+    fit_in_time: Callable[..., Any] | None = None
 
 
 def identifiable_models() -> dict[str, ModelSpec]:
     """Return the registered models that `identify` can fit, by name; entries that cannot be imported are left out."""
     return {name: spec for name, spec in _specs().items() if spec.template is not None}
+
+
+def timed_models() -> dict[str, ModelSpec]:
+    """Return the registered models with time that can be fitted, by name; what cannot be imported is left out."""
+    return {name: spec for name, spec in _specs().items() if spec.fit_in_time is not None}
 
 
 def find_model(name: str) -> ModelSpec:

@@ -8,14 +8,14 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import ModelSpec, Operator, Regressor, _checks, find_model
+from bench.hysteresis import ModelSpec, Operator, Regressor, TimedModel, _checks, find_model
 from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit
 from bench.identification.measures import Errors, measure_errors
 from bench.identification.shape import fit_operator, fit_shape
 
-M = TypeVar("M", bound=Operator[Any])
+M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
 
 
@@ -27,8 +27,8 @@ class Identification(Generic[M]):
     ----------
     model_name : str
         Name of the model in `bench.models`.
-    model : Operator
-        The identified operator.
+    model : Operator or TimedModel
+        The identified model.
     residuals : ndarray, shape (N,)
         Measured output minus `model.evaluate(inputs, initial_state)` for every sample, the skipped ones too,
         output units.

@@ -20,10 +20,11 @@ from bench.hysteresis import (
     Preisach,
     Reach,
     ThermalExpansion,
+    TimedModel,
     find_model,
-    identifiable_models,
     uniform_levels,
 )
+from bench.hysteresis.timed import TimedSequence
 from bench.identification import (
     Assessment,
     Comparison,
@@ -41,6 +42,8 @@ from bench.identification import (
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
 from bench.results.reading.options import ReadingOptions
+from bench.results.times import bind_times, check_model_name, read_times
+from bench.timed import identify_in_time
 
 Floats = npt.NDArray[np.float64]
 
@@ -88,7 +91,7 @@ class IdentifiedFile:
         """Return the result for programs."""
         found = self.identification
         certificate = found.certificate
-        operator = self.file.operator
+        operator = self.file.response
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -153,6 +156,7 @@ def identify_file(
     smoothing: float = 0.0,
     skip: int = 0,
     cross_validated: bool = False,
+    time_column: str | None = None,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
@@ -172,6 +176,8 @@ def identify_file(
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
+    time_column : str or None
+        Column of times, for a model with time.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
@@ -184,14 +190,11 @@ def identify_file(
     ConfigurationError
         If an option is wrong or does not belong to the model.
     """
-    try:
-        find_model(model)
-    except ValueError:
-        known = ", ".join(identifiable_models())
-        raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
+    check_model_name(model, time_column)
     if skip < 0:
         raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
-    columns = read_columns(path, (input_column, output_column), at_least=FEWEST_ROWS, options=reading)
+    names = (input_column, output_column, *(() if time_column is None else (time_column,)))
+    columns = read_columns(path, names, at_least=FEWEST_ROWS, options=reading)
     inputs, outputs = columns.values[input_column], columns.values[output_column]
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
@@ -201,22 +204,32 @@ def identify_file(
         if columns.units[column]:
             options[key] = columns.units[column]
     trials: CrossValidation | None = None
+    if time_column is not None and (cross_validated or smoothing):
+        raise ConfigurationError(f"model {model} takes no --smoothing and no --cross-validate yet")
     try:
-        if cross_validated:
-            others = {name: value for name, value in options.items() if name != "levels"}
-            orders = [options["levels"]] if "levels" in options else None
-            trials = cross_validate(model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others)
-            smoothing = trials.best.smoothing
-        found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
+        if time_column is not None:
+            times = read_times(columns, time_column)
+            found = identify_in_time(model, times, inputs, outputs, skip=skip, **options)
+            memory, coverage = found.model.run(times, inputs, found.initial_state)[1], None
+        else:
+            if cross_validated:
+                others = {name: value for name, value in options.items() if name != "levels"}
+                orders = [options["levels"]] if "levels" in options else None
+                trials = cross_validate(
+                    model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others
+                )
+                smoothing = trials.best.smoothing
+            found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
+            memory = found.model.advance(found.initial_state, inputs)
+            coverage = found.model.coverage(inputs, found.initial_state)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
-    memory = found.model.advance(found.initial_state, inputs)
-    coverage = found.model.coverage(inputs, found.initial_state)
     provenance = {
         "source": path.name,
         "input": input_column,
         "output": output_column,
+        **({} if time_column is None else {"time": time_column}),
         "rows": int(inputs.size),
         "skipped": skip,
         **errors_json(found.errors),
@@ -228,8 +241,10 @@ def identify_file(
     )
 
 
-def _shape(operator: Operator[Any]) -> dict[str, float]:
+def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:
     """Return the shape parameters by name; none of an operator that is linear in all it has."""
+    if isinstance(operator, TimedModel):
+        return {name: value for name, (value, _) in operator.parameters().items()}
     shape = operator.shape_parameters()
     return dict(zip(shape.names, shape.values, strict=True))
 
@@ -239,7 +254,9 @@ def _largest(uncertainties: Floats) -> float | None:
     return float(known.max()) if known.size else None
 
 
-def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) -> Floats:
+def predict(
+    model: ModelFile, inputs: Floats, *, continue_memory: bool = False, times: Floats | None = None
+) -> Floats:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
     Parameters
@@ -251,8 +268,15 @@ def predict(model: ModelFile, inputs: Floats, *, continue_memory: bool = False) 
     continue_memory : bool
         Start from the memory that the model file keeps, the end of its identification data, rather than from
         the state from which identification started.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
+
+    Raises
+    ------
+    ConfigurationError
+        If a model with time has none.
     """
-    return np.asarray(model.operator.evaluate(inputs, model.memory if continue_memory else None))
+    return bind_times(model, times).evaluate(inputs, model.memory if continue_memory else None)
 
 
 @dataclass(frozen=True)
@@ -321,24 +345,28 @@ def check_unit(expected: str, unit: str, column: str) -> None:
 
 def outside_of_range(model: ModelFile, inputs: Floats) -> str:
     """Return a warning if inputs leave the range for which the model was identified, else an empty text."""
-    low, high = model.operator.input_range
+    low, high = model.response.input_range
     outside = np.flatnonzero((inputs < low) | (inputs > high))
     if outside.size == 0:
         return ""
     return (
         f"{outside.size} of {inputs.size} inputs (first: row {outside[0] + 1}, {inputs[outside[0]]:g}) are outside "
-        f"of {low:g} to {high:g} {model.operator.input_unit}, for which the model was identified"
+        f"of {low:g} to {high:g} {model.response.input_unit}, for which the model was identified"
     )
 
 
 def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     """Return what a person should know of a fit, as (name, text) pairs."""
-    found, operator = identified.identification, identified.file.operator
+    found, operator = identified.identification, identified.file.response
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate = found.errors, found.certificate
-    shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
+    if isinstance(operator, TimedModel):
+        own = [(name, f"{value:.4g} {its}".rstrip()) for name, (value, its) in operator.parameters().items()]
+    else:
+        shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
+        own = [("shape", shape)] if shape else []
     return (
-        *([("shape", shape)] if shape else []),
+        *own,
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
@@ -383,6 +411,7 @@ def compare_models(
     output_column: str | None,
     *,
     skip: int = 0,
+    time_column: str | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -397,6 +426,8 @@ def compare_models(
         Columns; those that the first model was identified from if None.
     skip : int
         First rows that drive the memory but do not count.
+    time_column : str or None
+        Column of times, for models with time; that of the first such model if None.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -412,18 +443,22 @@ def compare_models(
         given or str(files[0].provenance.get(key, ""))
         for key, given in (("input", input_column), ("output", output_column))
     ]
-    columns = read_columns(data, names, options=reading)
+    timed = [file for file in files if isinstance(file.model, TimedModel)]
+    if time_column is None and timed:
+        time_column = str(timed[0].provenance.get("time", ""))
+    columns = read_columns(data, [*names, *([time_column] if time_column else [])], options=reading)
     inputs, outputs = (columns.values[name] for name in names)
+    times = read_times(columns, time_column) if time_column else None
     if not 0 <= skip < inputs.size:
         raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
-    operators: dict[str, Operator[Any]] = {}
+    operators: dict[str, Operator[Any] | TimedSequence] = {}
     for path, file in zip(paths, files, strict=True):
-        check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
-        check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
+        check_unit(file.response.input_unit, columns.units[names[0]], names[0])
+        check_unit(file.response.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
-        operators[name] = file.operator
+        operators[name] = bind_times(file, times)
     comparisons = compare(operators, inputs, outputs, skip=skip)
-    return ComparedModels(comparisons, files[0].operator.output_unit, columns.assumptions)
+    return ComparedModels(comparisons, files[0].response.output_unit, columns.assumptions)
 
 
 def assess_designs(
