@@ -205,7 +205,7 @@ class _Projection:
             self._creep = {
                 part.delay: [replace(part, creep_strengths=bank).respond(times, basis)[0] - fast for bank in banks]
             }
-        result = replace(part, creep_times=(), creep_strengths=()).respond(times, basis)[0]
+        result = replace(part, creep_times=np.empty(0), creep_strengths=np.empty(0)).respond(times, basis)[0]
         for strength, bank in zip(strengths, self._creep[part.delay], strict=False):
             result += strength * bank
         return result
