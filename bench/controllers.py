@@ -17,10 +17,12 @@ from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
+from bench.control.opposite_output import OppositeOutput
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
+from bench.hysteresis.falling_inverse import FallingInverse
 from bench.model_file import ModelFile, load_model
 
 T = TypeVar("T")
@@ -137,7 +139,7 @@ def _look_up(setup: ControllerSetup) -> LookUp:
     return LookUp(operator, setup.limits, wait=_wait(setup))
 
 
-def _latched(setup: ControllerSetup) -> Latched:
+def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
     inverse: Any = setup.inverse()
     if getattr(setup.model.operator, "reversible", None) is None:
         raise DataError(
@@ -146,7 +148,11 @@ def _latched(setup: ControllerSetup) -> Latched:
         )
     options = dict(setup.options)
     correction = tuned(Latched.correction(setup.spans), options.pop("correction", {}))
-    return Latched(inverse, setup.state, setup.limits, setup.tuned(LatchParameters.scaled, options), correction)
+    numbers = setup.tuned(LatchParameters.scaled, options), correction
+    if isinstance(inverse, FallingInverse):
+        opposite: Any = inverse.opposite
+        return OppositeOutput(Latched(opposite, setup.state, setup.limits, *numbers))
+    return Latched(inverse, setup.state, setup.limits, *numbers)
 
 
 def _integral(setup: ControllerSetup) -> IntegralParameters:

@@ -29,9 +29,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypedDict
+from datetime import date
+from typing import Any, ClassVar, Self, TypedDict
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bench.clock import Clock
 from bench.errors import DeviceConnectionError, DeviceError, LimitError
@@ -279,6 +280,18 @@ class DriverSettings(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    calibrated: date | None = Field(default=None, description="day of the last calibration, such as 2026-03-01")
+    calibration_due: date | None = Field(default=None, description="day from which a new calibration is due")
+
+    @model_validator(mode="after")
+    def _dates_in_order(self) -> Self:
+        if self.calibrated and self.calibration_due and self.calibration_due <= self.calibrated:
+            raise ValueError(
+                f"calibration_due: expected a day after {self.calibrated}, that of the calibration, got "
+                f"{self.calibration_due}"
+            )
+        return self
 
 
 class Device(ABC):

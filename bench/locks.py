@@ -144,6 +144,7 @@ class Locks:
         self._take({f"folder {folder.resolve()}": "it"}, f"folder {folder}")
 
     def _take(self, wanted: dict[str, str], what: str = "") -> None:
+        _make_folder()
         with ExitStack() as taken:
             # Two benches that ask in the same order cannot refuse each other.
             for name in sorted(wanted.keys() - self._taken):
@@ -161,6 +162,18 @@ class Locks:
                 _write(file, self._holder)
             self._taken |= wanted.keys()
             self._stack.push(taken.pop_all().__exit__)
+
+
+def is_in_use(folder: Path) -> bool:
+    """Return whether a process of this computer works in a folder, as `Locks.take_folder` says."""
+    path = _path(f"folder {folder.resolve()}")
+    if not path.exists():
+        return False
+    file = _take_file(path)
+    if file is None:
+        return True
+    _free(path, file)
+    return False
 
 
 def port_of(settings: DriverSettings) -> str:
@@ -230,7 +243,11 @@ def _canonical(address: str) -> str:
 
 def _folder() -> Path:
     """Return the folder of the locks, the same one for all users and sessions of this computer."""
-    folder = Path(tempfile.gettempdir()) / _FOLDER
+    return Path(tempfile.gettempdir()) / _FOLDER
+
+
+def _make_folder() -> None:
+    folder = _folder()
     try:
         folder.mkdir(exist_ok=True)
         # The mode of mkdir is cut by the process's mask. Only the owner can, and has to.
@@ -238,7 +255,6 @@ def _folder() -> Path:
             folder.chmod(_EVERYBODY)
     except OSError as error:
         raise ConfigurationError(f"the folder of the locks, {folder}, cannot be made: {error.strerror}") from None
-    return folder
 
 
 def _path(name: str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from rich.console import Console
 from bench.errors import ConfigurationError, DataError
 from bench.interrupts import Interrupts
 from bench.journal import Record
-from bench.protocol import ProtocolDefinition, find_protocol, source_of
+from bench.protocol import ProtocolDefinition, digest_of, find_protocol
 from bench.recorded_files import PROTOCOL_NAME, Original, unpack
 from bench.results.run_comparison import RunComparison, compare_runs
 from bench.rig_file import RigFile, rig_of_content
@@ -162,8 +161,8 @@ def recorded_protocol(run: Path, meta: Mapping[str, Any], folder: Path) -> Proto
 
 def _check_source(run: Path, meta: Mapping[str, Any], definition: ProtocolDefinition) -> None:
     """Raise DataError if the protocol of an installed package was changed since it ran."""
-    source, file = meta["protocol_source"], source_of(definition)
-    if source["installed"] and (file is None or hashlib.sha256(file.read_bytes()).hexdigest() != source["sha256"]):
+    source, now = meta["protocol_source"], digest_of(definition)
+    if source["installed"] and (now is None or now != source["sha256"]):
         raise DataError(
             f"{run} cannot be repeated: protocol {meta['protocol']} ({source['module']}) was changed since it ran, "
             f"with actuator-bench {meta['packages']['actuator-bench']} of git {meta['git']}; bench run takes the new "

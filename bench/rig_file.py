@@ -64,6 +64,7 @@ import importlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date, time
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -362,7 +363,7 @@ def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) 
     `extending` are the rigs on the way to it.
     """
     try:
-        content = tomllib.loads(text)
+        content = _without_dates(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     if isinstance(rig := content.get("rig"), dict) and str(rig.get("twin", "")).endswith(".toml"):
@@ -401,6 +402,19 @@ def _over(base: dict[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def _without_dates(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a file with its days as text, as the record of a run keeps it as JSON."""
+
+    def text_of(value: Any) -> Any:  # noqa: ANN401 - any TOML
+        if isinstance(value, dict):
+            return {key: text_of(each) for key, each in value.items()}
+        if isinstance(value, list):
+            return [text_of(each) for each in value]
+        return value.isoformat() if isinstance(value, date | time) else value
+
+    return {key: text_of(value) for key, value in content.items()}
+
+
 def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # noqa: ANN401 - any TOML
     for part in parents:
         content = content.get(part) if isinstance(content, dict) else None
@@ -416,7 +430,7 @@ def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
     try:
-        table[last] = tomllib.loads(f"value = {value}")["value"]
+        table[last] = _without_dates(tomllib.loads(f"value = {value}"))["value"]
     except tomllib.TOMLDecodeError:
         table[last] = value
 

@@ -24,7 +24,7 @@ from bench.binding import Slots
 from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
-from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, is_installed, source_of
+from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, digest_of, is_installed
 from bench.recorded_files import file_name
 
 _PACKAGES = (
@@ -103,7 +103,11 @@ def metadata(
         "rig_content": file.content,
         "protocol": protocol.name,
         "protocol_summary": protocol.summary,
-        "protocol_source": _source(protocol),
+        "protocol_source": {
+            "module": protocol.generator.__module__,
+            "installed": is_installed(protocol),
+            "sha256": digest_of(protocol),
+        },
         "parameters": parameters.model_dump(mode="json"),
         "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
         "controls": protocol.controlled(slots),
@@ -213,15 +217,6 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 
         yield key, value
 
 
-def _source(protocol: ProtocolDefinition) -> dict[str, Any]:
-    file = source_of(protocol)
-    return {
-        "module": protocol.generator.__module__,
-        "installed": is_installed(protocol),
-        "sha256": None if file is None else hashlib.sha256(file.read_bytes()).hexdigest(),
-    }
-
-
 @cache
 def _versions() -> Mapping[str, str]:
     """Return the versions of the packages that compute, talk to instruments, or register parts."""
@@ -230,10 +225,11 @@ def _versions() -> Mapping[str, str]:
         # Two packages with one name are refused where the name is asked for.
         with suppress(ConfigurationError):
             packages |= {entry.package for entry in registry.entries(group).values()}
-    return {package: _version(package) for package in sorted(packages)}
+    return {package: version_of(package) for package in sorted(packages)}
 
 
-def _version(package: str) -> str:
+def version_of(package: str) -> str:
+    """Return the version of a distribution, or `not installed`."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

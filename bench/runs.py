@@ -16,7 +16,7 @@ from rich.console import Console
 
 from bench.attachment import Attachment, attach
 from bench.binding import Slots
-from bench.clock import Clock, Stopwatch
+from bench.clock import Clock, Stopwatch, wall_time
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
@@ -38,7 +38,7 @@ from bench.remaining_time import Expectation
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
 from bench.run_record import differences, make_folder, metadata, run_name
-from bench.start_checks import check_start
+from bench.start_checks import check_start, overdue_calibrations
 from bench.station.interface import Station
 from bench.station.local import LocalStation
 from bench.terminal import ProgressDisplay, RehearsalDisplay, ask_operator
@@ -256,7 +256,10 @@ def _checked(
         )
     if not guarded:
         return ()
-    return check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate")
+    return (
+        *check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"),
+        *overdue_calibrations(file, wall_time().astimezone().date()),
+    )
 
 
 def _shown(description: RigDescription) -> tuple[str, ...]:

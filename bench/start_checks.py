@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from datetime import date
 
 from bench.description import RigDescription
 from bench.devices import Actuator, DeviceDescription
 from bench.errors import ConfigurationError
 from bench.interlocks import SETPOINT, Interlock, Level
+from bench.rig_file import RigFile
 
 SHARE_OF_WATCHDOG = 0.4
 """Longest silence of the host on purpose, as a share of the shortest watchdog: one late answer may double it."""
@@ -55,6 +57,16 @@ def check_start(
     if wrong:
         raise ConfigurationError("\n".join(f"{file.path}: {problem}" for problem in wrong))
     return tuple(f"{file.path}: {problem}; accepted, as safety.unattended = false" for problem in unguarded)
+
+
+def overdue_calibrations(file: RigFile, today: date) -> tuple[str, ...]:
+    """Return a warning for each device of a rig file whose calibration is due on a day or before it."""
+    return tuple(
+        f"{file.path}: devices.{entry.name}: its calibration was due on {due}; calibrate it, then set calibrated and "
+        "calibration_due"
+        for entry in file.devices
+        if (due := entry.settings.calibration_due) is not None and due <= today
+    )
 
 
 def _wrong_intervals(

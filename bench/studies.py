@@ -9,21 +9,21 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
 from rich.console import Console
 from rich.table import Table
 
 from bench.clock import Stopwatch
-from bench.compilation_display import CompilationDisplay
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record
 from bench.protocol import find_protocol
-from bench.results.report import export_run
 from bench.results.tracking import TargetResults, target_results
-from bench.runs import Run, RunResult, carry_out
-from bench.workers import Pending, Workers, task_console
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
+    from bench.workers import Pending, Workers
 
 P = ParamSpec("P")
 
@@ -137,6 +137,11 @@ def _carry_out(
     live: bool,
 ) -> RunResult:
     """Carry one run of a campaign out."""
+    # Here, as they take a while to load and `bench list` reads the studies' names.
+    from bench.compilation_display import CompilationDisplay
+    from bench.runs import Run, carry_out
+    from bench.workers import task_console
+
     console = task_console()
     with CompilationDisplay(console, console):
         result = carry_out(
@@ -281,6 +286,9 @@ def reproduce(
     except MissingExtraError as error:
         console.print(f"no recordings: {error}", highlight=False, markup=False, soft_wrap=True)
         recorded = False
+    from bench.results.report import export_run
+    from bench.workers import Workers
+
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
     with Workers(1 if live else workers, console, name) as pool:

@@ -32,11 +32,12 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import ClassVar, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, field_validator
 
 from bench.clock import Clock
+from bench.deferred import DeferredModule
 from bench.devices import Finding, Identity
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.roles import LoadCell
@@ -53,8 +54,12 @@ from drivers.modbus import (
     swapped,
     unpack,
 )
-from drivers.pymodbus_client import SerialClient
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+
+if TYPE_CHECKING:
+    from drivers import pymodbus_client
+else:
+    pymodbus_client = DeferredModule("drivers.pymodbus_client")
 
 T = TypeVar("T")
 
@@ -206,11 +211,11 @@ class _Line:
         self.lost = False
         self.longest_silence = 0.0
         self.repeats = 0
-        self._client: RtuClient | SerialClient
+        self._client: RtuClient | pymodbus_client.SerialClient
         if settings.port.startswith(EMULATED):
             self._client = RtuClient(open_port(name, settings), settings.address)
         else:
-            self._client = SerialClient(name, settings, settings.address, settings.parity)
+            self._client = pymodbus_client.SerialClient(name, settings, settings.address, settings.parity)
 
     def close(self) -> None:
         """Release the line."""

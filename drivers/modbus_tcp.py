@@ -6,31 +6,19 @@ A LabJack T7 accepts two connections on port 502 (T-series datasheet, 6.0 Ethern
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import serial
-from pymodbus.client import ModbusTcpClient
-from pymodbus.pdu import ModbusPDU
 
-from drivers.modbus import EMULATED, FEEDBACK, ModbusClient, TcpClient
-from drivers.pymodbus_client import PymodbusClient
+from bench.deferred import DeferredModule
+from drivers.modbus import EMULATED, ModbusClient, TcpClient
+
+if TYPE_CHECKING:
+    from drivers import pymodbus_client
+else:
+    pymodbus_client = DeferredModule("drivers.pymodbus_client")
 
 _UNIT = 1  # LabJack takes any
-
-
-class _Feedback(ModbusPDU):
-    """The reply to LabJack's function 76."""
-
-    function_code = FEEDBACK
-    values = b""
-
-    def encode(self) -> bytes:
-        """Return what follows the function."""
-        return self.values
-
-    def decode(self, data: bytes) -> None:
-        """Keep what follows the function."""
-        self.values = data
 
 
 def _open_client(port: str, timeout: float) -> ModbusClient:
@@ -38,12 +26,7 @@ def _open_client(port: str, timeout: float) -> ModbusClient:
         line: Any = serial.serial_for_url(port, timeout=timeout)
         return TcpClient(line, _UNIT)
     host, _, number = port.removeprefix("tcp://").rpartition(":")
-    # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
-    client = ModbusTcpClient(host.strip("[]"), port=int(number), timeout=timeout, retries=0)
-    client.register(_Feedback)
-    if not client.connect():  # type: ignore[no-untyped-call]
-        raise ConnectionError
-    return PymodbusClient(client, _UNIT)
+    return pymodbus_client.connect_tcp(host.strip("[]"), int(number), timeout, _UNIT)
 
 
 class Connection:

@@ -11,6 +11,7 @@ from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOEx
 from pymodbus.pdu import ModbusPDU
 
 from drivers.modbus import (
+    FEEDBACK,
     LONGEST_REPLY,
     SHORTEST_REPLY,
     ModbusClient,
@@ -84,6 +85,34 @@ class PymodbusClient(ModbusClient):
     def is_open(self) -> bool:
         """Whether the line can be used."""
         return self._client.is_socket_open()
+
+
+class _Feedback(ModbusPDU):
+    """The reply to LabJack's function 76."""
+
+    function_code = FEEDBACK
+    values = b""
+
+    def encode(self) -> bytes:
+        """Return what follows the function."""
+        return self.values
+
+    def decode(self, data: bytes) -> None:
+        """Keep what follows the function."""
+        self.values = data
+
+
+def connect_tcp(host: str, port: int, timeout: float, unit: int) -> PymodbusClient:
+    """Return a client of Modbus TCP that is connected, and knows LabJack's function 76; timeout in s.
+
+    Raises ConnectionError if there is no connection.
+    """
+    # TCP repeats lost packets by itself: repeating a request would only delay the report of a dead device.
+    client = ModbusTcpClient(host, port=port, timeout=timeout, retries=0)
+    client.register(_Feedback)
+    if not client.connect():  # type: ignore[no-untyped-call]
+        raise ConnectionError
+    return PymodbusClient(client, unit)
 
 
 class SerialClient(PymodbusClient):

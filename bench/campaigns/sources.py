@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import importlib.util
 import json
 from collections.abc import Collection
@@ -13,6 +12,7 @@ from typing import Any
 
 from bench import registry
 from bench.errors import ConfigurationError
+from bench.run_record import version_of
 
 PROGRAMS = (".py",)
 PROGRAMS_AND_RIGS = (".py", ".toml")
@@ -35,7 +35,7 @@ def code_digest() -> str:
         for group in registry.GROUPS
         for entry in registry.entries(group).values()
     }
-    found: dict[str, Any] = {name: _version(name) for name in _LIBRARIES}
+    found: dict[str, Any] = {name: version_of(name) for name in _LIBRARIES}
     for top in sorted(tops):
         spec = importlib.util.find_spec(top)
         places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
@@ -64,10 +64,3 @@ def content_of(path: Path, beside: Collection[str] = ()) -> dict[str, bytes]:
 def file_digest(path: Path, beside: Collection[str] = ()) -> str:
     """Return the hash of `content_of` these; raises as that."""
     return digest({name: hashlib.sha256(content).hexdigest() for name, content in content_of(path, beside).items()})
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return ""

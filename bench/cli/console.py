@@ -23,6 +23,11 @@ error_console = Console(stderr=True)
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
 ]
+LiveOption = Annotated[bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
+]
 
 
 def fail(error: BenchError) -> NoReturn:

@@ -98,6 +98,13 @@ def identify_(
             "none; chosen by the data if not given (hammerstein).",
         ),
     ] = None,
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
+        ),
+    ] = "auto",
     options: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE", help="Another numerical option of the model; repeatable."),
@@ -137,6 +144,7 @@ def identify_(
             time_column=time_column,
             static=static,
             dynamics=dynamics,
+            orientation=orientation,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
             reading=reading,

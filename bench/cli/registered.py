@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from bench import registry
-from bench.cli.console import JsonOption, console, show_compilation, write_json
+from bench.cli.console import JsonOption, LiveOption, console, show_compilation, write_json
 from bench.errors import ConfigurationError
 
 
@@ -68,9 +68,7 @@ class Studies(RegisteredCommands):
             out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for runs, models and figures.")] = Path(
                 "recordings"
             ),
-            live: Annotated[
-                bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-            ] = False,
+            live: LiveOption = False,
             workers: Annotated[
                 int | None,
                 typer.Option(

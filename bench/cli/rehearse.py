@@ -10,7 +10,15 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from bench.cli.console import JsonOption, console, parse_assignments, print_rows, show_compilation, write_json
+from bench.cli.console import (
+    JsonOption,
+    SettingsOption,
+    console,
+    parse_assignments,
+    print_rows,
+    show_compilation,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from bench.rehearsal import Extremes, Rehearsal
@@ -28,10 +36,7 @@ def rehearse(
         str,
         typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
     ],
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
-    ] = None,
+    settings: SettingsOption = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),

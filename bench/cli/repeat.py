@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, parse_assignments, show_compilation, warn
+from bench.cli.console import JsonOption, LiveOption, console, parse_assignments, show_compilation, warn
 from bench.cli.runs import print_result
 
 app = typer.Typer()
@@ -29,9 +29,7 @@ def repeat(
         Path | None,
         typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`, for a run that had one."),
     ] = None,
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
+    live: LiveOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Carry a run out again from its record alone, and say whether the same came out.

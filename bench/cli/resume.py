@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, show_compilation
+from bench.cli.console import JsonOption, LiveOption, console, show_compilation
 from bench.cli.runs import print_result
 
 app = typer.Typer()
@@ -40,9 +40,7 @@ def resume(
         Path | None,
         typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`, if the run was attached."),
     ] = None,
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
+    live: LiveOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Go on with a run that was killed, aborted or failed, from its last finished step, in its own record.

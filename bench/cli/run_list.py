@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_STYLES = {"completed": "", "unfinished": "yellow"}
+_STYLES = {"completed": "", "running": "green", "unfinished": "yellow"}
 
 
 @app.command("runs")
@@ -31,7 +31,7 @@ def runs_(
     ] = None,
     status: Annotated[
         str | None,
-        typer.Option(metavar="STATUS", help="Only completed, aborted, failed, unfinished or damaged ones."),
+        typer.Option(metavar="STATUS", help="Only completed, aborted, failed, running, unfinished or damaged ones."),
     ] = None,
     protocol: Annotated[str | None, typer.Option(metavar="PROTOCOL", help="Only runs of this protocol.")] = None,
     rig: Annotated[str | None, typer.Option("--rig", metavar="RIG", help="Only runs on this rig.")] = None,
@@ -39,8 +39,9 @@ def runs_(
 ) -> None:
     """List the runs below a folder in the order of their start: how they ended, what was set, what came out.
 
-    `unfinished` is a run that goes on, or whose process died; `damaged` one whose journal cannot be read. Shown are
-    the parameters that differ from their defaults; any can be searched for: `bench runs --where controller=integral`.
+    `running` is a run of a process of this computer, `unfinished` one whose process died or is of another computer,
+    `damaged` one whose journal cannot be read. Shown are the parameters that differ from their defaults; any can be
+    searched for: `bench runs --where controller=integral`.
     """
     from bench.results.run_list import list_runs, select_runs
 

@@ -13,6 +13,8 @@ from rich.table import Table
 
 from bench.cli.console import (
     JsonOption,
+    LiveOption,
+    SettingsOption,
     console,
     error_console,
     parse_assignments,
@@ -100,10 +102,7 @@ def run(
         str | None,
         typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
-    ] = None,
+    settings: SettingsOption = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
@@ -159,9 +158,7 @@ def run(
         bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
     ] = False,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
-    live: Annotated[
-        bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")
-    ] = False,
+    live: LiveOption = False,
     json_file: JsonOption = None,
     help_: Annotated[
         bool,

@@ -143,8 +143,8 @@ class Inverse(ABC, Generic[S]):
     ) -> float:
         """Return the input nearest to the present one that meets a target, or else comes closest.
 
-        For operators that rise with their input. The bounds replace the operating range; a saturated operator may
-        disregard them.
+        For operators that rise with their input, or fall. The bounds replace the operating range; a saturated
+        operator may disregard them.
         """
 
     def follow(self, targets: ArrayLike, state: S | None = None) -> Following[S]:
@@ -235,14 +235,15 @@ class NumericalInverse(Inverse[S]):
     ) -> float:
         """Return the input nearest to the present one that meets a target; see `Inverse.nearest_input`."""
         low, high = around(present, bounds or self.operator.input_range)
-        least, greatest = self.operator.step(state, low)[1], self.operator.step(state, high)[1]
+        ends = self.operator.step(state, low)[1], self.operator.step(state, high)[1]
+        least, greatest = min(ends), max(ends)
         tolerance = _ROUNDING * max(abs(least), abs(greatest))
         wanted = min(max(target, least), greatest)
         here = self.operator.step(state, present)[1]
         if abs(wanted - here) <= tolerance:
             return present
         sign = 1.0 if wanted > here else -1.0
-        end = high if sign > 0.0 else low
+        end = high if (sign > 0.0) == (ends[0] <= ends[1]) else low
         return first_where(lambda x: sign * (self.operator.step(state, x)[1] - wanted) >= -tolerance, present, end)
 
 
@@ -337,9 +338,10 @@ class PlayInverse(NumericalInverse["PlayState"]):
     ) -> float:
         """Return the input nearest to the present one that meets a target; see `Inverse.nearest_input`."""
         low, high = around(present, bounds or self.operator.input_range)
-        if target >= self.operator.step(state, high)[1]:
+        sign = 1.0 if self.operator.rises() else -1.0
+        if sign * target >= sign * self.operator.step(state, high)[1]:
             return high
-        if target <= self.operator.step(state, low)[1]:
+        if sign * target <= sign * self.operator.step(state, low)[1]:
             return low
         found = self._inverse.step(self.operator.inverse_state(state), target)[1]
         return min(max(found, low), high)

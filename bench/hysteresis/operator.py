@@ -142,7 +142,10 @@ class Operator(Model, ABC, Generic[S]):
         )
 
     def nonnegative(self) -> NDArray[np.bool_]:
-        """Return which coefficients must not be negative, shape (K,); by default all."""
+        """Return which coefficients must not be negative, shape (K,); by default all.
+
+        Of a model that is fitted falling they must not be positive: `with_coefficients` takes either.
+        """
         return np.ones(self.coefficients.size, dtype=bool)
 
     def shape_parameters(self) -> Shape:
@@ -168,7 +171,14 @@ class Operator(Model, ABC, Generic[S]):
 
     def rises(self) -> bool:
         """Return whether the output never falls while the input rises; by default as sampled from the start."""
-        outputs = self.evaluate(np.linspace(*self.input_range, _SAMPLES))
+        return self._never_falls(1.0)
+
+    def falls(self) -> bool:
+        """Return whether the output never rises while the input rises; by default as sampled from the start."""
+        return self._never_falls(-1.0)
+
+    def _never_falls(self, sign: float) -> bool:
+        outputs = sign * self.evaluate(np.linspace(*self.input_range, _SAMPLES))
         return not (np.diff(outputs) < -1e-14 * np.abs(outputs).max()).any()
 
     def inverse(self, policy: Policy = "nearest") -> Inverse[S]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,24 +25,24 @@ PlayState: TypeAlias = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class DeadZones:
-    """A rising piecewise linear map with S(0) = 0, the superposition of one-sided dead zones.
+    """A monotone piecewise linear map with S(0) = 0, the superposition of one-sided dead zones.
 
     Kuhnen 2003 (European Journal of Control 9, 407-418) writes it as a sum of weights times max(x - r, 0) for
     thresholds r > 0, min(x - r, 0) for r < 0, and x. The slope between two thresholds is the
     sum of the weights that are active there, and the slopes are what is kept here: the map rises if and only
-    if none is negative, and its inverse is again such a map.
+    if none is negative, falls if none is positive, and its inverse is again such a map.
 
     Parameters
     ----------
     thresholds : array_like, shape (m,)
         Increasing points at which the slope changes, units of the argument, m >= 1.
     slopes : array_like, shape (m + 1,)
-        Slope below the first threshold, between thresholds, and above the last one, >= 0.
+        Slope below the first threshold, between thresholds, and above the last one, all >= 0 or all <= 0.
 
     Raises
     ------
     ValueError
-        If the thresholds do not increase, a slope is negative, a number is not finite or a length is wrong.
+        If the thresholds do not increase, slopes have both signs, a number is not finite or a length is wrong.
     """
 
     thresholds: Floats
@@ -55,8 +55,8 @@ class DeadZones:
             raise ValueError(
                 f"slopes: expected {thresholds.size + 1} values for {thresholds.size} thresholds, got {slopes.size}"
             )
-        if (slopes < 0.0).any():
-            raise ValueError(f"slopes: expected values >= 0, got {slopes.min()}")
+        if (slopes < 0.0).any() and (slopes > 0.0).any():
+            raise ValueError(f"slopes: expected values >= 0, or all <= 0, got {slopes.min()} and {slopes.max()}")
         object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
         object.__setattr__(self, "slopes", _checks.frozen(slopes))
 
@@ -97,9 +97,15 @@ class DeadZones:
 
         Raises ValueError if a slope is zero.
         """
-        if (self.slopes <= 0.0).any():
-            raise ValueError(f"slopes: expected values > 0 for an inverse, got {self.slopes.min()}")
-        return DeadZones(self(self.thresholds), 1.0 / self.slopes)
+        if (self.slopes == 0.0).any():
+            raise ValueError("slopes: expected values > 0 for an inverse, or all < 0, got 0")
+        thresholds, slopes = self(self.thresholds), 1.0 / self.slopes
+        return DeadZones(thresholds, slopes) if self.sign > 0 else DeadZones(thresholds[::-1], slopes[::-1])
+
+    @property
+    def sign(self) -> Literal[-1, 1]:
+        """-1 if the map falls, else 1."""
+        return -1 if (self.slopes < 0.0).any() else 1
 
     def to_json(self) -> dict[str, Any]:
         """Return the map as a JSON object."""
@@ -123,15 +129,15 @@ class PrandtlIshlinskii(Operator[PlayState]):
 
     With x = before(input - origin), each play keeps a state z = max(x - r, min(x + r, z before)), and
     output = bias + after(sum of weight * z). `after` adds saturation and asymmetry (Kuhnen 2003). The output
-    never falls while the input rises. The state is the tuple of play states, in the units of x, outermost
-    last; the first one, of threshold 0, is x itself.
+    never falls while the input rises, or never rises. The state is the tuple of play states, in the units of x,
+    outermost last; the first one, of threshold 0, is x itself.
 
     Parameters
     ----------
     thresholds : array_like, shape (n,)
         Increasing, from 0 on, in the units of x.
     weights : array_like, shape (n,)
-        Output per unit of x, of either sign, every running sum >= 0 (for instance all >= 0).
+        Output per unit of x, of either sign, every running sum >= 0 (for instance all >= 0), or every one <= 0.
     bias : float
         Constant, output units.
     origin : float
@@ -146,8 +152,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
     Raises
     ------
     ValueError
-        If the thresholds do not increase from 0, there are not as many weights, a running sum of the weights
-        is negative, a number is not finite, or the range does not increase.
+        If the thresholds do not increase from 0, there are not as many weights, the running sums of the weights
+        have both signs, a number is not finite, or the range does not increase.
     """
 
     kind: ClassVar[str] = "prandtl-ishlinskii"
@@ -173,8 +179,9 @@ class PrandtlIshlinskii(Operator[PlayState]):
         if weights.size != thresholds.size:
             raise ValueError(f"weights: expected {thresholds.size} values, one for each play, got {weights.size}")
         sums = np.cumsum(weights)
-        if sums.min() < -1e-12 * np.abs(weights).max():
-            raise ValueError(f"weights: expected running sums >= 0, got {sums.min()}")
+        rounding = 1e-12 * np.abs(weights).max()
+        if sums.min() < -rounding and sums.max() > rounding:
+            raise ValueError(f"weights: expected running sums >= 0, or all <= 0, got {sums.min()} and {sums.max()}")
         origin = _checks.number("origin", self.origin)
         reach = float(thresholds[-1]) or 1.0
         span = (origin - reach, origin + reach) if self.input_range is None else self.input_range
@@ -193,7 +200,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PrandtlIshlinskii:
         """Return the same operator with other coefficients and bias.
 
-        Raises ValueError if their number is wrong, one is not finite, or the output would fall with a rising input.
+        Raises ValueError if their number is wrong, one is not finite, or the output would not be monotone.
         """
         values = _checks.samples("coefficients", coefficients)
         if values.size != self.coefficients.size:
@@ -209,12 +216,14 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def saturated_state(self, direction: int, value: float | None = None) -> PlayState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
 
-        Every play then is dragged: at the low end z = x + r, at the high end z = x - r. Raises ValueError if
+        Every play then is dragged: at the low end z = x + r, at the high end z = x - r (the other way round behind a
+        falling map). Raises ValueError if
         `direction` is neither -1 nor 1.
         """
         _, end = self._ends(direction)
         x = self._inner(end if value is None else value)
-        return tuple([x - direction * r for r in self._lists[0]])
+        turn = direction if self.before is None else direction * self.before.sign
+        return tuple([x - turn * r for r in self._lists[0]])
 
     def present_input(self, state: PlayState) -> float:
         """Return the input of a state: where the first play, of threshold 0, stands."""
@@ -309,40 +318,53 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest output that the operating range can produce from the relaxed state.
 
-        The output rises with the input, so both are at the ends of the range. There a play too wide to
+        The output is monotone in the input, so both are at the ends of the range. There a play too wide to
         follow still depends on how far the input had been the other way; the output is piecewise linear in that
         distance and is tested at every break.
         """
-        low, high = (self._inner(end) for end in self.input_range)
-        ends = -self._highest(-high, -low), self._highest(low, high)
+        low, high = sorted(self._inner(end) for end in self.input_range)
+        ends = [-self._farthest(-high, -low), self._farthest(low, high)]
         if self.after is not None:
-            ends = self.after.value(ends[0]), self.after.value(ends[1])
-        return self.bias + ends[0], self.bias + ends[1]
+            ends = [self.after.value(end) for end in ends]
+        least, greatest = sorted(ends)
+        return self.bias + least, self.bias + greatest
 
-    def _highest(self, low: float, high: float) -> float:
-        """Return the greatest sum of weighted plays for x from low to high, reached at high."""
+    def _farthest(self, low: float, high: float) -> float:
+        """Return the sum of weighted plays for x from low to high that is farthest from 0, reached at high."""
         r = self.thresholds
         turns = np.clip(np.concatenate([[low, high, 0.0], -r, high - 2.0 * r]), low, high)
         states = np.maximum(high - r, np.minimum(0.0, turns[:, None] + r))
-        return float((states @ self.weights).max())
+        sums = states @ self.weights
+        return float(sums.max() if self._sign > 0 else sums.min())
 
     @cached_property
     def _sums(self) -> Floats:
         return np.asarray(np.cumsum(self.weights))
 
+    @cached_property
+    def _sign(self) -> Literal[-1, 1]:
+        """-1 if the sum of the plays falls with x, else 1."""
+        return -1 if -self._sums.min() > self._sums.max() else 1
+
+    @property
+    def _direction(self) -> int:
+        """-1 if the output falls with the input, else 1."""
+        maps = [zones.sign for zones in (self.before, self.after) if zones is not None]
+        return math.prod([self._sign, *maps])
+
     def inverse_operator(self) -> PrandtlIshlinskii:
         """Return the operator that gives the input back: itself a Prandtl-Ishlinskii operator.
 
-        Thresholds r'_i = sum over j <= i of w_j (r_i - r_j); weights 1/w_0 and -w_i / (W_i W_{i-1}) with the running
-        sums W (Kuhnen 2003). Its states come from `inverse_state`; its operating range is this operator's
+        Thresholds r'_i = |sum over j <= i of w_j (r_i - r_j)|; weights 1/w_0 and -w_i / (W_i W_{i-1}) with the
+        running sums W (Kuhnen 2003). Its states come from `inverse_state`; its operating range is this operator's
         `output_range`. Raises ValueError if a running sum of the weights or a slope of the dead zones is zero: a
         plateau has no inverse.
         """
         w, r, sums = self.weights, self.thresholds, self._sums
-        if not (sums > 0.0).all():
-            at = int(np.argmax(sums <= 0.0))
+        if not (self._sign * sums > 0.0).all():
+            at = int(np.argmax(self._sign * sums <= 0.0))
             raise ValueError(f"weights: expected running sums > 0 for an inverse, got {sums[at]} at play {at}")
-        thresholds = np.append(0.0, np.cumsum(sums[:-1] * np.diff(r)))
+        thresholds = np.append(0.0, np.cumsum(np.abs(sums[:-1]) * np.diff(r)))
         weights = np.append(1.0 / w[0], -w[1:] / (sums[1:] * sums[:-1]))
         return PrandtlIshlinskii(
             thresholds,
@@ -368,13 +390,17 @@ class PrandtlIshlinskii(Operator[PlayState]):
         return tuple((self._sums * z + beyond).tolist())
 
     def rises(self) -> bool:
-        """Return True: running sums of the weights and slopes of the dead zones are not negative."""
-        return True
+        """Return whether the running sums of the weights and the slopes of the dead zones make the output rise."""
+        return self._direction > 0
+
+    def falls(self) -> bool:
+        """Return whether they make it fall."""
+        return self._direction < 0
 
     def inverse(self, policy: Policy = "nearest") -> Inverse[PlayState]:
         """Return the exact inverse, or the numerical one if the operator has a plateau."""
         from bench.hysteresis.inverse import NumericalInverse, PlayInverse
 
-        slopes = [zones.slopes.min() for zones in (self.before, self.after) if zones is not None]
-        exact = min([*slopes, self._sums.min()]) > 0.0
+        slopes = [np.abs(zones.slopes).min() for zones in (self.before, self.after) if zones is not None]
+        exact = min([*slopes, (self._sign * self._sums).min()]) > 0.0
         return PlayInverse(self) if exact else NumericalInverse(self, policy)

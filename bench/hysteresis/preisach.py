@@ -22,7 +22,7 @@ from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import Reversible, reversible_from_json
 
 if TYPE_CHECKING:
-    from bench.hysteresis.inverse import Policy, PreisachInverse
+    from bench.hysteresis.inverse import Inverse, Policy
 
 
 class Segment(NamedTuple):
@@ -367,6 +367,14 @@ class Preisach(Operator[MemoryCurve]):
 
     def rises(self) -> bool:
         """Return whether the output can only rise with the input, with every memory."""
+        return bool((self.density >= 0.0).all() and min(self._reversible_slopes()) >= 0.0)
+
+    def falls(self) -> bool:
+        """Return whether the output can only fall while the input rises, with every memory."""
+        return bool((self.density <= 0.0).all() and max(self._reversible_slopes()) <= 0.0)
+
+    def _reversible_slopes(self) -> list[float]:
+        """Return the slopes of the reversible part at the ends of its pieces, and 0."""
         slopes = [0.0]
         if self.reversible is not None:
             breaks, quadratics = self.reversible.pieces()
@@ -374,13 +382,15 @@ class Preisach(Operator[MemoryCurve]):
             bounds = [low, *np.clip(breaks, low, high).tolist(), high]
             for (_, b, a), ends in zip(quadratics, pairwise(bounds), strict=True):
                 slopes += [b + 2.0 * a * end for end in ends]
-        return bool((self.density >= 0.0).all() and min(slopes) >= 0.0)
+        return slopes
 
-    def inverse(self, policy: Policy = "nearest") -> PreisachInverse:
+    def inverse(self, policy: Policy = "nearest") -> Inverse[MemoryCurve]:
         """Return the exact inverse."""
+        from bench.hysteresis.falling_inverse import FallingInverse
         from bench.hysteresis.inverse import PreisachInverse
 
-        return PreisachInverse(self, policy)
+        falling = (self.density <= 0.0).all() and (self.density < 0.0).any()
+        return FallingInverse(self, policy) if falling else PreisachInverse(self, policy)
 
     @property
     def plane(self) -> tuple[float, float]:

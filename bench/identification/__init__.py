@@ -14,6 +14,7 @@ from bench.identification.excitation import damped_oscillation, ramps, random_va
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
 from bench.identification.measures import Comparison, Errors, compare, measure_errors
+from bench.identification.orientation import Orientation
 from bench.identification.two_stage import (
     CoupledIdentification,
     Series,
@@ -35,6 +36,7 @@ __all__ = [
     "Fit",
     "Identification",
     "Initial",
+    "Orientation",
     "Regressor",
     "Series",
     "Trial",

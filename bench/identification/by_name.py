@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -11,8 +11,16 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import ModelSpec, Operator, Regressor, TimedModel, _checks, find_model
 from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
-from bench.identification.least_squares import Certificate, Fit
+from bench.identification.least_squares import Certificate, Fit, counted_weights
 from bench.identification.measures import Errors, measure_errors
+from bench.identification.orientation import (
+    NAMES,
+    Orientation,
+    Sign,
+    better_sign,
+    has_orientation,
+    possible_signs,
+)
 from bench.identification.shape import fit_operator, fit_shape
 
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
@@ -44,6 +52,8 @@ class Identification(Generic[M]):
         State before the first sample from which the model was fitted.
     warnings : tuple of str
         What is odd about the data or not covered by them.
+    orientation : {"rising", "falling"} or None
+        Whether the output rises or falls with the input; None for a model whose coefficients have either sign.
     """
 
     model_name: str
@@ -55,6 +65,7 @@ class Identification(Generic[M]):
     skip: int
     initial_state: Any = None
     warnings: tuple[str, ...] = ()
+    orientation: Orientation | None = None
 
 
 def identify(
@@ -66,6 +77,7 @@ def identify(
     skip: int = 0,
     smoothing: float = 0.0,
     initial: Initial | None = None,
+    orientation: Orientation = "auto",
     **options: Any,  # noqa: ANN401 - each template names and types its own
 ) -> Identification[Any]:
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
@@ -87,6 +99,9 @@ def identify(
     `input_unit` and `output_unit` are options of each. Packages may register further models in `bench.models`; see
     `ModelSpec`. The shape parameters of an operator (`Operator.shape_parameters`), on which its output does not
     depend linearly, are fitted together with its coefficients by variable projection.
+
+    A model whose coefficients must not be negative has an output that rises with the input. With the `orientation`
+    "falling" the coefficients must not be positive instead; with "auto" the one that fits better is taken.
 
     The memory before the first sample (`initial`) is one of
 
@@ -110,6 +125,8 @@ def identify(
         Weight of the roughness penalty of `fit`; only for nonnegative densities.
     initial : {"negative", "positive", "skip", "estimate"} or None
         The memory before the first sample, as above.
+    orientation : {"auto", "rising", "falling"}
+        Whether the output rises or falls with the input; only "auto" for a model of free signs.
     **options
         As listed above; `levels` is the number of intervals or the increasing levels themselves.
 
@@ -118,7 +135,9 @@ def identify(
     ValueError
         If the name is unknown, an option does not belong to it, or the data are unfit; see `fit`.
     """
-    problem = set_up_problem(model_name, inputs, outputs, weights, skip, smoothing, initial, options)
+    problem = set_up_problem(
+        model_name, inputs, outputs, weights, skip, smoothing, initial, options, orientation=orientation
+    )
     solution = problem.fit(smoothing)
     model = problem.template.with_coefficients(solution.coefficients, solution.bias)
     predicted = model.evaluate(problem.inputs, problem.state)
@@ -132,12 +151,17 @@ def identify(
         skip=problem.skip,
         initial_state=problem.state,
         warnings=problem.warnings(),
+        orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """A measured sequence set up for a model: everything but the smoothing."""
+    """A measured sequence set up for a model: everything but the smoothing.
+
+    `orientation` is -1 if the model is fitted to the opposite output and its coefficients are the opposite ones;
+    `known` is the fit for one smoothing by which that was decided, if it had to be.
+    """
 
     spec: ModelSpec
     inputs: Floats
@@ -147,13 +171,24 @@ class FitProblem:
     template: Operator[Any]
     state: Any
     regressor: Regressor
+    orientation: Sign = 1
+    known: tuple[float, Fit] | None = None
 
     def fit(self, smoothing: float, weights: Floats | None = None) -> Fit:
         """Return the coefficients for the problem's weights or others."""
+        if self.known is not None and weights is None and self.known[0] == smoothing:
+            return self.known[1]
         w = self.weights if weights is None else weights
-        return fit_operator(
-            self.spec.constrained, self.template, self.regressor, self.outputs, w, self.skip, smoothing
-        )
+        y = self.outputs if self.orientation > 0 else -self.outputs
+        found = fit_operator(self.spec.constrained, self.template, self.regressor, y, w, self.skip, smoothing)
+        if self.orientation > 0:
+            return found
+        return replace(found, coefficients=0.0 - found.coefficients, bias=0.0 - found.bias)
+
+    def cost(self, fit: Fit) -> float:
+        """Return the weighted sum of squares that a fit leaves."""
+        errors = (self.outputs - fit.bias - self.regressor.product(fit.coefficients))[self.skip :]
+        return float(self.weights[self.skip :] @ errors**2)
 
     def warnings(self) -> tuple[str, ...]:
         """Return what is odd about the data or not covered by them."""
@@ -173,6 +208,8 @@ def set_up_problem(
     smoothing: float,
     initial: Initial | None,
     options: dict[str, Any],
+    *,
+    orientation: Orientation = "auto",
 ) -> FitProblem:
     """Return the problem that `identify` solves; its arguments are those of `identify`."""
     spec = find_model(model_name)
@@ -184,6 +221,8 @@ def set_up_problem(
     w = np.ones(sequence.size) if weights is None else _checks.samples("weights", weights)
     if initial not in (None, "negative", "positive", "skip", "estimate"):
         raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
+    if initial == "estimate" and spec.estimate_state is None:
+        raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     if smoothing and not spec.constrained:
         raise ValueError(f"smoothing: {model_name} takes the least-norm solution instead")
     try:
@@ -192,10 +231,36 @@ def set_up_problem(
         raise ValueError(f"options of {model_name}: {error}") from None
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
-    elif initial == "estimate":
-        if spec.estimate_state is None:
-            raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
-        state = spec.estimate_state(template, sequence, measured, w, skip, smoothing)
+    counted = counted_weights(sequence.size, w, skip)
+    signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
+    problems = {
+        sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial) for sign in signs
+    }
+    if len(problems) == 1:
+        return problems[signs[0]]
+    fits = {sign: problem.fit(smoothing) for sign, problem in problems.items()}
+    rising, falling = (problems[sign].cost(fits[sign]) for sign in signs)
+    best = better_sign(rising, falling, measured, counted)
+    return replace(problems[best], known=(smoothing, fits[best]))
+
+
+def _orient(
+    sign: Sign,
+    spec: ModelSpec,
+    template: Operator[Any],
+    inputs: Floats,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    smoothing: float,
+    initial: Initial | None,
+) -> FitProblem:
+    """Return the problem with the output of one sign, its initial memory and its shape found from the data."""
+    measured = outputs if sign > 0 else -outputs
+    state: Any = None
+    if initial == "estimate":
+        assert spec.estimate_state is not None
+        state = spec.estimate_state(template, inputs, measured, weights, skip, smoothing)
 
     def start(operator: Operator[Any]) -> Any:  # noqa: ANN401 - each operator has its own state
         if initial in ("negative", "positive"):
@@ -203,7 +268,8 @@ def set_up_problem(
         return state if initial == "estimate" else operator.initial_state()
 
     if spec.refine is not None:
-        template = spec.refine(template, sequence, measured, w, skip, start(template))
-    template = fit_shape(template, spec.constrained, start, sequence, measured, w, skip, smoothing)
+        template = spec.refine(template, inputs, measured, weights, skip, start(template))
+    template = fit_shape(template, spec.constrained, start, inputs, measured, weights, skip, smoothing)
     before = start(template)
-    return FitProblem(spec, sequence, measured, w, skip, template, before, template.regressor(sequence, before))
+    regressor = template.regressor(inputs, before)
+    return FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, sign)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.identification.by_name import Initial, set_up_problem
+from bench.identification.orientation import Orientation
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def cross_validate(
     weights: ArrayLike | None = None,
     skip: int = 0,
     initial: Initial | None = None,
+    orientation: Orientation = "auto",
     **options: Any,  # noqa: ANN401 - those of `identify`
 ) -> CrossValidation:
     """Return how well a model predicts parts of the sequence that were left out of its fit.
@@ -83,11 +85,11 @@ def cross_validate(
     The sequence is cut into blocks of successive samples, and block b belongs to fold b modulo `folds`: neighbours
     are nearly the same measurement, and samples left out one by one would be predicted by them. What is left out
     of the cost still drives the memory. An estimated initial memory (`initial="estimate"`) is that of the whole
-    sequence.
+    sequence, and so is the orientation.
 
     Parameters
     ----------
-    model_name, inputs, outputs, weights, skip, initial, **options
+    model_name, inputs, outputs, weights, skip, initial, orientation, **options
         As `identify`.
     smoothing : sequence of float
         Weights to try.
@@ -115,7 +117,9 @@ def cross_validate(
     trials = []
     for order in levels if levels is not None else [None]:
         chosen = options if order is None else {**options, "levels": order}
-        problem = set_up_problem(model_name, inputs, outputs, weights, skip, max(smoothing), initial, chosen)
+        problem = set_up_problem(
+            model_name, inputs, outputs, weights, skip, max(smoothing), initial, chosen, orientation=orientation
+        )
         used = problem.outputs.size - problem.skip
         if used < blocks:
             raise ValueError(f"blocks: expected at most {used}, one for each sample used, got {blocks}")

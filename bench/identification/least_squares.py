@@ -207,6 +207,11 @@ def _cost(regressor: Regressor, outputs: ArrayLike, weights: ArrayLike | None, s
     y = _checks.samples("outputs", outputs)
     if y.size != count:
         raise ValueError(f"outputs: expected {count} values, one for each input, got {y.size}")
+    return y, counted_weights(count, weights, skip)
+
+
+def counted_weights(count: int, weights: ArrayLike | None, skip: int) -> Floats:
+    """Return the checked weights, shape (count,), zero for the samples to skip; errors as `fit`."""
     w = np.ones(count) if weights is None else _checks.samples("weights", weights).copy()
     if w.size != count:
         raise ValueError(f"weights: expected {count} values, one for each input, got {w.size}")
@@ -217,7 +222,7 @@ def _cost(regressor: Regressor, outputs: ArrayLike, weights: ArrayLike | None, s
     w[:skip] = 0.0
     if w.sum() <= 0.0:
         raise ValueError("weights: expected at least one positive weight after the skipped samples")
-    return y, w
+    return w
 
 
 @cache

@@ -14,10 +14,12 @@ import numpy as np
 
 from bench.devices import Signal
 from bench.errors import DataError
+from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import models_beside
 from bench.journal.opening import OpenedJournal
-from bench.journal.rows import FILE_NAME, READABLE, SCHEMA, Event, StepRecord, checksum, checksums, quoted
+from bench.journal.rows import FILE_NAME, FIRST, READABLE, SCHEMA, Event, StepRecord, checksum, checksums, quoted
 from bench.journal.table import Table
+from bench.locks import is_in_use
 from bench.settling import Settled
 
 _FAILED = {each.value for each in Settled if each.failed}
@@ -51,10 +53,30 @@ class Record:
             self.close()
             raise
 
-    @property
     def remark(self) -> str:
-        """How the journal is read, where that is not the usual way; empty otherwise."""
-        return self._opened.remark
+        """Return what is unusual: how the journal is read, and how many rows only a second file has; else nothing."""
+        return "; ".join(filter(None, (self._opened.remark, self._waiting())))
+
+    def _waiting(self) -> str:
+        if "status" in self.meta or is_in_use(self.path.parent):
+            # A run that goes on has all its rows in the second file as well.
+            return ""
+        beside: dict[str, set[int]] = {table: set() for table in FIRST}
+        for second in second_files(self.path):
+            for entry in read_mirror(second):
+                if entry.table in beside:
+                    beside[entry.table].update(int(row[0]) for row in entry.rows)
+        waiting = [
+            f"{len(lacking)} of {table}"
+            for table, numbers in beside.items()
+            if (lacking := numbers.difference(int(row[0]) for row in self._rows(table)))
+        ]
+        if not waiting:
+            return ""
+        return (
+            f"{self.path} lacks rows that its second file has ({', '.join(waiting)}): bench recover-journal writes a "
+            "journal with them, bench resume takes them in"
+        )
 
     def _read_heading(self) -> None:
         try:

@@ -1,7 +1,7 @@
 """Protocols: the vocabulary of operator scripts, their parameters, their plan, and their discovery."""
 
 from bench.binding import Slot, Slots
-from bench.protocol.discovery import Packaged, find_protocol, is_installed, packaged_protocols, source_of
+from bench.protocol.discovery import Packaged, digest_of, find_protocol, is_installed, packaged_protocols, source_of
 from bench.protocol.parameters import (
     ParameterHelp,
     ProtocolDefinition,
@@ -51,6 +51,7 @@ __all__ = [
     "Slots",
     "Step",
     "UntilSteady",
+    "digest_of",
     "find_protocol",
     "from_slot",
     "is_installed",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import importlib.util
 import inspect
@@ -98,6 +99,12 @@ def source_of(definition: ProtocolDefinition) -> Path | None:
     """Return the file in which a protocol is written; None if there is none, as in a notebook."""
     file = inspect.getsourcefile(definition.generator)
     return Path(file) if file and Path(file).is_file() else None
+
+
+def digest_of(definition: ProtocolDefinition) -> str | None:
+    """Return the SHA-256 of the file in which a protocol is written; None if there is none."""
+    file = source_of(definition)
+    return None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def is_installed(definition: ProtocolDefinition) -> bool:

@@ -105,6 +105,7 @@ class IdentifiedFile:
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
             "smoothing": self.trials.best.smoothing if self.trials else None,
+            "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
@@ -118,7 +119,7 @@ def model_options(model: str) -> tuple[str, ...]:
     own = inspect.signature(template).parameters if template is not None else {}
     # The first takes the inputs; the units are those of the columns.
     names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "skip", "initial", "cross_validated")
+    return (*names, "smoothing", "skip", "initial", "orientation", "cross_validated")
 
 
 def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -181,7 +182,7 @@ def identify_file(
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
-        `initial` and the options of the model, as in `identify`; None leaves the model's own default.
+        `initial`, `orientation` and the options of the model, as in `identify`; None leaves the default.
 
     Raises
     ------
@@ -234,6 +235,7 @@ def identify_file(
         "skipped": skip,
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "orientation": found.orientation,
     }
     file = ModelFile(model, found.model, memory, provenance)
     return IdentifiedFile(
@@ -371,6 +373,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
         ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),

@@ -62,8 +62,8 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         folder = _make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
-        if record.remark:
-            console.print(record.remark, highlight=False, markup=False, soft_wrap=True)
+        if remark := record.remark():
+            console.print(remark, highlight=False, markup=False, soft_wrap=True)
         _print_status(record, len(steps), console)
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)

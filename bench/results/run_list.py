@@ -10,9 +10,10 @@ from typing import Any
 
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, Record
+from bench.locks import is_in_use
 from bench.recorded_files import file_name
 
-DAMAGED = "damaged"
+DAMAGED, RUNNING = "damaged", "running"
 _RESULT = re.compile(r"\b(RMS|error|spread)\b")
 """What the note of a protocol has that says how well it went."""
 
@@ -26,7 +27,8 @@ class ListedRun:
     folder : Path
         Its folder.
     status : str
-        `completed`, `aborted`, `failed`, `unfinished` (it goes on, or its process died) or `damaged`.
+        `completed`, `aborted`, `failed`, `running` (in a process of this computer), `unfinished` (its process
+        died, or is of another computer) or `damaged`.
     protocol, rig : str
         What ran, and on what.
     started : str
@@ -120,7 +122,7 @@ def _listed(path: Path) -> ListedRun:
             meta = record.meta
             return ListedRun(
                 folder,
-                record.status,
+                RUNNING if record.status == "unfinished" and is_in_use(folder) else record.status,
                 str(meta["protocol"]),
                 str(meta["rig"]),
                 str(meta["host"]["started"]),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 from bench.devices import Status
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
@@ -19,6 +19,11 @@ from bench.station.interface import Arrivals, News, Station, masked, news_of
 from bench.station.reconnection import TRIES, longest_away, reconnect
 
 _T = TypeVar("_T")
+
+_SLOW = 0.2
+"""Time from which on the answer of a device is late, s."""
+_JUST_BEFORE = 10.0
+"""Time within which what kept a watchdog from being fed may be the cause of an error, s."""
 
 
 class LocalStation(Station):
@@ -46,6 +51,8 @@ class LocalStation(Station):
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
         self._lost: set[str] = set()
+        self._slow: dict[str, tuple[float, float]] = {}
+        """When a device that took long had answered or failed, and how long it took, s."""
         self._longest_away = longest_away(rig.file, rig.devices)
 
     @property
@@ -76,9 +83,7 @@ class LocalStation(Station):
             try:
                 values = self._rig.assembled({name: self._ask(name, read) for name, read in readers.items()})
             except DeviceError as error:
-                if others := (lost | self._lost) - {error.device}:
-                    raise _blamed(error, others) from error
-                raise
+                self._raise_blamed(error, lost | self._lost)
             # What other devices gave before a line was back is too old to stand beside it.
             if not self._lost:
                 break
@@ -199,11 +204,28 @@ class LocalStation(Station):
         self._rig.close()
 
     def _ask(self, name: str, call: Callable[[], _T]) -> _T:
+        began = self.clock.now()
         try:
             return call()
         except DeviceConnectionError as error:
             self._reconnect(name, error)
             return call()
+        finally:
+            now = self.clock.now()
+            if now - began > _SLOW:
+                self._slow[name] = now, now - began
+
+    def _raise_blamed(self, error: DeviceError, lost: Collection[str]) -> NoReturn:
+        """Raise an error that also names the devices that kept the others waiting, which may be the cause of it."""
+        since = self.clock.now() - _JUST_BEFORE
+        others = {name: f"took {took:.1f} s to answer" for name, (t, took) in self._slow.items() if t >= since}
+        others |= dict.fromkeys(lost, "had been out of reach")
+        others.pop(error.device, None)
+        if not others:
+            raise error
+        text = str(error).removeprefix(f"{error.device}: ")
+        causes = ", ".join(f"{name} {what}" for name, what in sorted(others.items()))
+        raise type(error)(error.device, f"{text} ({causes} just before)") from error
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
         device, longest = self._rig.devices[name], self._longest_away[name]
@@ -228,9 +250,3 @@ class LocalStation(Station):
     def _raise_if_tripped(self) -> None:
         if self._core.cause is not None:
             raise self._core.cause
-
-
-def _blamed(error: DeviceError, lost: Collection[str]) -> DeviceError:
-    """Return an error that also names the devices that were out of reach, which may be the cause of it."""
-    text = str(error).removeprefix(f"{error.device}: ")
-    return type(error)(error.device, f"{text} ({', '.join(sorted(lost))} had been out of reach just before)")

@@ -23,6 +23,7 @@ from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
 from bench.identification.least_squares import Fit, _one_thread, fit, fit_minimum_norm
 from bench.identification.measures import measure_errors
+from bench.identification.orientation import NAMES, Orientation, has_orientation
 from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.linear_parts import LinearPart, logarithmic_creep
 
@@ -61,7 +62,6 @@ class _Search:
     times: Floats
     static: FitProblem
     columns: Floats
-    orientation: int
     roots: Floats
     elapsed: Floats = field(init=False)
     step: float = field(init=False)
@@ -131,7 +131,8 @@ class _Search:
         """Return the coefficients of operator and drift for given parameters."""
         part, time = self.linear(self.parameters(elements), values)
         drifts = self.drifts(elements, time)
-        columns = self.orientation * part.respond(self.times, self.columns)[0]
+        sign = self.static.orientation
+        columns = sign * part.respond(self.times, self.columns)[0]
         regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
         problem = self.static
         if not problem.spec.constrained:
@@ -140,7 +141,7 @@ class _Search:
             signs = np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)])
             found = fit(regressor, problem.outputs, nonnegative=signs, weights=problem.weights, skip=problem.skip)
         turned = found.coefficients.copy()
-        turned[: columns.shape[1]] *= self.orientation
+        turned[: columns.shape[1]] *= sign
         return replace(found, coefficients=turned)
 
     def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
@@ -263,6 +264,7 @@ def identify_hammerstein(
     weights: ArrayLike | None = None,
     skip: int = 0,
     initial: Initial | None = None,
+    orientation: Orientation = "auto",
     static: str = "preisach",
     dynamics: str | None = None,
     **options: Any,  # noqa: ANN401 - those of the operator
@@ -286,8 +288,8 @@ def identify_hammerstein(
         s, strictly increasing.
     inputs, outputs : array_like, shape (N,)
         The measured sequence.
-    weights, skip, initial
-        As `identify`.
+    weights, skip, initial, orientation
+        As `identify`; the orientation is that of the operator.
     static : str
         Name of the operator in `bench.models`.
     dynamics : str or None
@@ -306,7 +308,9 @@ def identify_hammerstein(
     chosen = None if dynamics is None else _elements(dynamics)
     if static == "preisach":
         options = {"reversible": "linear", **options}
-    problem = set_up_problem(static, sequence, measured, weights, skip, 0.0, initial, options)
+    problem = set_up_problem(
+        static, sequence, measured, weights, skip, 0.0, initial, options, orientation=orientation
+    )
     if math.prod(problem.regressor.shape) > _LARGEST:
         rows, count = problem.regressor.shape
         size = 8e-9 * rows * count
@@ -344,6 +348,7 @@ def identify_hammerstein(
         skip=problem.skip,
         initial_state=state,
         warnings=tuple(warnings),
+        orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
     )
 
 
@@ -362,14 +367,9 @@ def _elements(text: str) -> tuple[str, ...]:
 
 
 def _set_up(times: Floats, problem: FitProblem) -> _Search:
-    columns = problem.regressor.dense()
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    searches = [_Search(times, problem, columns, sign, roots) for sign in (1, -1)]
-    if not problem.spec.constrained:
-        return searches[0]
-    none = np.empty(0)
-    return min(searches, key=lambda each: each.cost((), none, each.fit((), none)))
+    return _Search(times, problem, problem.regressor.dense(), roots)
 
 
 def _choose(search: _Search) -> _Found:

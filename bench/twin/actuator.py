@@ -11,13 +11,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from bench.hysteresis._checks import Floats
-from bench.twin import _kernels
 from bench.twin.recording import Recording
 from bench.twin.specimen import ActuatorDynamics
+
+if TYPE_CHECKING:
+    from bench.twin import _kernels
+else:
+    _kernels = DeferredModule("bench.twin._kernels")
 
 GRID = 0.02
 """Step of time with which drives are simulated, s; shorter for one of a shorter time constant."""

@@ -11,17 +11,22 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.deferred import DeferredModule
 from bench.hysteresis import Operator, Preisach, uniform_levels
 from bench.hysteresis._checks import Floats
-from bench.twin import _kernels
 from bench.twin.actuator import LONGEST_PART, at_rows, grid_step, latency
 from bench.twin.recording import Recording
 from bench.twin.specimen import ActuatorDynamics, ResponseDynamics
+
+if TYPE_CHECKING:
+    from bench.twin import _kernels
+else:
+    _kernels = DeferredModule("bench.twin._kernels")
 
 _INSTANT = 0.03
 """Standard uncertainty of the instant of a reading, s."""

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
-from bench.twin import _kernels
+
+if TYPE_CHECKING:
+    from bench.twin import _kernels
+else:
+    _kernels = DeferredModule("bench.twin._kernels")
 
 
 @dataclass(frozen=True)

@@ -6,21 +6,20 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import date
 from functools import partial
 
 from bench.binding import RoleTable, reading_of
-from bench.clock import Clock
-from bench.devices import Actuator, Device, DeviceDescription, Finding, Limits, Status
+from bench.clock import Clock, wall_time
+from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Finding, Limits, Status
 from bench.errors import BenchError, DeviceConnectionError, DeviceError
 from bench.rig_file import RigFile
 from bench.safety import SAFE, make_safe
+from bench.start_checks import SHARE_OF_WATCHDOG
 from bench.upkeep.opening import Workplace
 
 GLANCES, MEASUREMENTS = 20, 5
 """How many of each are taken for noise and time."""
-
-FED_WITHIN = 0.4
-"""Longest pause between two readings as a part of a watchdog, so that one that is late does not trip it."""
 
 _MUCH_NOISE = 3.0
 """Noise beyond what is typical, as a factor."""
@@ -77,7 +76,8 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
     list of DeviceCheck
         One a device in the order of the rig file, and one of the rig as a whole.
     """
-    found: dict[str, list[Finding]] = {entry.name: [] for entry in place.entries}
+    today = wall_time().astimezone().date()
+    found = {entry.name: _calibration(entry.settings, today) for entry in place.entries}
     identities: dict[str, str] = {}
     failed: set[str] = set()
     devices: dict[str, Device] = {}
@@ -132,6 +132,18 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
     return [*checks, DeviceCheck("", "", tuple(whole))]
 
 
+def _calibration(settings: DriverSettings, today: date) -> list[Finding]:
+    """Say when a device was calibrated, and whether it is due again."""
+    day, due = settings.calibrated, settings.calibration_due
+    parts = [*([f"of {day}"] if day else []), *([f"due on {due}"] if due else [])]
+    if not parts:
+        return []
+    if due is not None and due <= today:
+        parts.append(f"{(today - due).days} days ago")
+        return [Finding("calibration", ", ".join(parts), "calibrate it, then set calibrated and calibration_due")]
+    return [Finding("calibration", ", ".join(parts))]
+
+
 def _failure(name: str, error: BenchError) -> Finding:
     text = str(error).removeprefix(f"{name}: ")
     if isinstance(error, DeviceConnectionError):
@@ -167,7 +179,7 @@ def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list
         findings.append(Finding(signal.name, text, advice))
     text = f"{1e3 * glance_time:.3g} ms a quick reading, {1e3 * measure_time:.3g} ms a measurement"
     advice = ""
-    if device.watchdog and measure_time > FED_WITHIN * device.watchdog:
+    if device.watchdog and measure_time > SHARE_OF_WATCHDOG * device.watchdog:
         text += f", {measure_time / device.watchdog:.0%} of its watchdog of {device.watchdog:g} s"
         advice = "take fewer samples in a measurement, or lengthen the watchdog"
     return [*findings, Finding("time", text, advice)]
@@ -236,12 +248,12 @@ def _watchdog(device: Actuator, file: RigFile) -> list[Finding]:
             return [Finding("watchdog", "none")]
         return [Finding("watchdog", "none, and its output heats", f"set the key watchdog of devices.{device.name}")]
     text = f"{watchdog:g} s"
-    if period > FED_WITHIN * watchdog:
+    if period > SHARE_OF_WATCHDOG * watchdog:
         return [
             Finding(
                 "watchdog",
                 f"{text}, with {period:g} s between two readings (telemetry.period)",
-                f"let telemetry.period be {FED_WITHIN * watchdog:g} s at most, or lengthen the watchdog",
+                f"let telemetry.period be {SHARE_OF_WATCHDOG * watchdog:g} s at most, or lengthen the watchdog",
             )
         ]
     return [Finding("watchdog", text)]
@@ -255,7 +267,7 @@ def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, flo
     text = f"{1e3 * total:.3g} ms a quick reading of all devices, every {period:g} s"
     if total > period:
         return [Finding("time", text, "lengthen telemetry.period, or read faster (speed of the lines, samples)")]
-    if total > FED_WITHIN * shortest:
+    if total > SHARE_OF_WATCHDOG * shortest:
         return [Finding("time", f"{text}; the shortest watchdog is {shortest:g} s", "lengthen the watchdog")]
     return [Finding("time", text)]
 

@@ -15,16 +15,23 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import serial
-from can import CanError
 from pydantic import Field
 
 from bench.clock import Clock
+from bench.deferred import DeferredModule
 from bench.errors import DeviceConnectionError, DeviceError
-from drivers.roboteq.slcan import SlcanAdapter
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
+
+if TYPE_CHECKING:
+    import can
+
+    from drivers.roboteq import slcan
+else:
+    can = DeferredModule("can")
+    slcan = DeferredModule("drivers.roboteq.slcan")
 
 _MOST_DOWNLOADS = 64  # that are kept; a voltage that is held is commanded again and again
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
@@ -150,8 +157,8 @@ class NodeLine:
         self.repeats = 0
         self.answered = self.restarted = self.urgent = False
         try:
-            self._adapter = SlcanAdapter(settings, settings.bitrate)
-        except (CanError, serial.SerialException, OSError, ValueError) as error:
+            self._adapter = slcan.SlcanAdapter(settings, settings.bitrate)
+        except (can.CanError, serial.SerialException, OSError, ValueError) as error:
             raise DeviceConnectionError(device, f"cannot open {settings.port}: {_cause(error)}") from None
         self._heard_at = clock.now()
 
@@ -174,7 +181,7 @@ class NodeLine:
                 line = self._adapter.line()
                 if line is not None:
                     self._notice(line)
-        except (CanError, serial.SerialException, OSError) as error:
+        except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
 
     def read(self, item: Entry, sub: int) -> int:
@@ -229,7 +236,7 @@ class NodeLine:
         """Send a line; raises `DeviceConnectionError` if the line is lost."""
         try:
             self._adapter.transmit(line)
-        except (CanError, serial.SerialException, OSError) as error:
+        except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
 
     def synchronize(self, heads: tuple[bytes, ...], before: bytes = b"") -> Sequence[bytes]:
@@ -281,7 +288,7 @@ class NodeLine:
                     self._notice(line)
                 if clock.now() >= end:
                     break
-        except (CanError, serial.SerialException, OSError) as error:
+        except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
         return []
 
@@ -344,7 +351,7 @@ class NodeLine:
                         raise AbortedError(int.from_bytes(answer[4:], "little"))
                     return answer
             self._quiet_at = sent_at + _LATEST * self._settings.timeout
-        except (CanError, serial.SerialException, OSError) as error:
+        except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
         raise self._silence(adapter.refusals - refusals)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,7 @@ from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
-from bench.runs import RunResult
 from bench.studies import Campaign, ResultTable, Study, StudyResult
-from bench.workers import Pending
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
     BASE,
@@ -40,6 +38,10 @@ from rigs.hybrid.identification import (
     sine_at,
 )
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
+    from bench.workers import Pending
 
 Floats = npt.NDArray[np.float64]
 

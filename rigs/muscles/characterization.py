@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,7 @@ from bench.identification.two_stage import CoupledIdentification, Series, measur
 from bench.journal import add_model
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
-from bench.runs import RunResult
 from bench.studies import Campaign, ResultTable
-from bench.workers import Pending
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -31,6 +29,10 @@ from rigs.muscles.identification import (
     read_resting,
     read_series,
 )
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
+    from bench.workers import Pending
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +20,11 @@ from bench.journal import Record, add_model
 from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
 from bench.results.tracking import FollowingResult, TargetResults, following_result
-from bench.runs import RunResult
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
-from bench.workers import Pending
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
+    from bench.workers import Pending
 
 Floats = npt.NDArray[np.float64]
 

@@ -39,18 +39,23 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from bench.devices import Identity
 from bench.errors import DeviceError
 from bench.roles import LoadCell
-from sim_devices.instruments import _flintec_kernels as kernels
 from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
+
+if TYPE_CHECKING:
+    from sim_devices.instruments import _flintec_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.instruments._flintec_kernels")
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
 """3 dB cut-off by filter setting 0 to 8 (Technical Manual, 10.4.2, IIR filter)."""
@@ -110,9 +115,11 @@ def reading_interval(setting: int) -> float:
     return 0.5 / CUTOFF_HZ[setting]
 
 
-# Kept, as the instrument mostly converts at even intervals.
-_fading = lru_cache(maxsize=256)(kernels.fading.py_func)
-_next_look = kernels.next_look.py_func
+@lru_cache(maxsize=256)
+def _fading(lags: float) -> tuple[float, float, float, float]:
+    """Return `kernels.fading`; kept, as the instrument mostly converts at even intervals."""
+    found: tuple[float, float, float, float] = kernels.fading.py_func(lags)
+    return found
 
 
 class Course(Protocol):
@@ -298,7 +305,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
-        due: float = _next_look(self._converted, now, self._conversion)
+        due: float = kernels.next_look.py_func(self._converted, now, self._conversion)
         return due
 
     def _may_wait(self, course: Course, now: float) -> bool:

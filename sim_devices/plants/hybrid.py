@@ -19,11 +19,11 @@ the classic piezo cantilever this plant without `drive`.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim_devices.plants import _hybrid_kernels as kernels
+from bench.deferred import DeferredModule
 from sim_devices.plants.cooler import CooledPlant
 from sim_devices.plants.grid import (
     ABSOLUTE_ZERO,
@@ -33,6 +33,11 @@ from sim_devices.plants.grid import (
     fluctuation,
 )
 from sim_devices.plants.hybrid_parameters import HybridParameters, piezo_dynamics, thermal_sensitivity
+
+if TYPE_CHECKING:
+    from sim_devices.plants import _hybrid_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.plants._hybrid_kernels")
 
 # Rise (K) at which the free convection's share is that of the parameters.
 _CONVECTION_RISE = 10.0

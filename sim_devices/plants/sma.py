@@ -16,12 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_devices.plants import _sma_kernels as kernels
+from bench.deferred import DeferredModule
 from sim_devices.plants.grid import Floats, NotNegative, Record, Signed, fluctuation, record
 from sim_devices.plants.muscle import MILLIMETRE, HeatedParameters, Muscle
+
+if TYPE_CHECKING:
+    from sim_devices.plants import _sma_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.plants._sma_kernels")
 
 _FORCES = 128
 """Grid points of which the force is kept."""

@@ -16,12 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_devices.plants import _vo2_kernels as kernels
+from bench.deferred import DeferredModule
 from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
 from sim_devices.plants.grid import Floats, NotNegative, Record, Seed, Signed, check_temperature, fluctuation, record
+
+if TYPE_CHECKING:
+    from sim_devices.plants import _vo2_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.plants._vo2_kernels")
 
 
 @dataclass(frozen=True, kw_only=True)

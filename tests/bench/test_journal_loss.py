@@ -22,6 +22,7 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import elsewhere, read_mirror
 from bench.journal.recovery import RECOVERED_NAME, recover
 from bench.journal.store import Store
+from bench.locks import Holder, Locks
 from bench.settling import Settled
 
 SIGNALS = (Signal("tec_temperature", "°C", "object temperature"), Signal("force", "N", "force", 4))
@@ -139,6 +140,11 @@ class TestAnotherProgramWrites:
         journal.close()
         with Record(copy) as run:
             assert len(run.steps()) == 0
+            assert "lacks rows that its second file has (3 of steps, 3 of telemetry, 3 of events)" in run.remark()
+            with Locks(Holder.of_this_process("heater", "a run")) as locks:
+                locks.take_folder(copy)
+                # Of a run that goes on every row is there.
+                assert run.remark() == ""
         journal = Journal.reopen(copy)
         assert (journal.steps, journal.ticks) == (3, 3)
         add(journal, 2)
@@ -351,7 +357,7 @@ class TestReadOnlyMedium:
         count = add(journal, 3)
         with Record(tmp_path) as run:
             assert len(run.steps()) == count
-            assert str(other_disk) in run.remark
+            assert str(other_disk) in run.remark()
             assert len(files_of(other_disk)) == 1
         assert files_of(other_disk) == []
         journal.close()
@@ -369,7 +375,7 @@ def test_one_whose_process_died_while_it_was_closed_is_read_from_a_copy(tmp_path
         copy = shutil.copytree(tmp_path, other_disk / "died")
         db.execute("ROLLBACK")
     with Record(copy) as run:
-        assert "was not closed" in run.remark
+        assert "was not closed" in run.remark()
         assert len(run.steps()) == count
     assert f"{FILE_NAME}-journal" in files_of(copy)
 

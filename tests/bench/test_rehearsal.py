@@ -1,12 +1,15 @@
 import io
 import json
 import math
+import os
 import re
 import signal
+import sys
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+import pexpect
 import pytest
 from adaptive_protocols import bisect, climb, secant, wait_for_ever
 from heater_laboratory import CLOSED, HeaterLaboratory
@@ -17,7 +20,7 @@ from bench.clock import VirtualClock
 from bench.emulated_twin import twin_of
 from bench.errors import AbortError, ConfigurationError
 from bench.hysteresis import Preisach, ThermalExpansion, uniform_levels
-from bench.journal import Record, run_card
+from bench.journal import FILE_NAME, Record, run_card
 from bench.model_file import ModelFile
 from bench.protocol import Dwell, Step, find_protocol, plan, protocol
 from bench.rehearsal import Rehearsal, rehearse
@@ -267,17 +270,23 @@ class TestEnd:
             ("length-voltage", "sma", {"loads": "0.98, 2.94", "points": 11, "dwell": 5}, "x100"),
         ],
     )
-    def test_it_fits_within_a_tenth(self, make, model, name, rig, settings, clock):
-        definition = find_protocol(name)
-        if "model" in definition.parameters.model_fields:
+    @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+    def test_it_fits_within_a_tenth(self, model, tmp_path, name, rig, settings, clock):
+        if "model" in find_protocol(name).parameters.model_fields:
             settings = {"model": model, **settings}
-        console = Console(file=io.StringIO(), width=400, force_terminal=True, color_system=None)
-        run = make(definition=definition, settings=settings, rig=rig, clock=clock, seed=3)
-        outcome = carry_out(run, console).outcome
-        assert outcome.status == "completed", outcome.reason
+        command = ["-m", "bench", "run", name, "--rig", rig, "--clock", clock, "--seed", "3", "--out", str(tmp_path)]
+        command += [f"--set={key}={value}" for key, value in settings.items()]
+        environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
+        with pexpect.spawn(
+            sys.executable, command, dimensions=(40, 400), env=environment, encoding="utf-8", timeout=180
+        ) as terminal:
+            terminal.expect(pexpect.EOF)
+            text = terminal.before
         ended = datetime.now()  # noqa: DTZ005 - as the display
-        whole = outcome.laboratory_seconds
-        shown = re.findall(r"t (\S+)  left (\S+), ends ([\d:]+)", console.file.getvalue())
+        assert terminal.exitstatus == 0, text
+        with Record(next(tmp_path.glob(f"*/{FILE_NAME}"))) as record:
+            whole = record.meta["finished"]
+        shown = re.findall(r"t (\S+)  left (\S+), ends ([\d:]+)", text)
         frames = [(seconds(t), seconds(left), end) for t, left, end in shown if seconds(t) > 0.05 * whole]
         assert len(frames) > 3
         for t, left, end in frames:

@@ -11,6 +11,7 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.journal import FILE_NAME, Record
+from bench.locks import Holder, Locks
 from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
 from bench.protocol.number_list import NumberList
 from bench.results.run_comparison import compare_runs
@@ -62,6 +63,16 @@ def test_every_run_below_a_folder_is_listed(bench, runs, tmp_path):
     assert "is not a readable journal" in by_name["damaged"]["result"]
     assert "count=3, increment=7.5" in out
     assert "5 runs" in out
+
+
+def test_a_run_that_goes_on_is_told_from_one_that_died(bench, runs, tmp_path):
+    folder = runs["unfinished"]
+    with Locks(Holder.of_this_process("heater", str(folder))) as locks:
+        locks.take_folder(folder)
+        _, found = listed(bench, tmp_path, folder.parent, "--status", "running")
+        assert [run["folder"] for run in found] == [str(folder)]
+    _, found = listed(bench, tmp_path, folder.parent, "--status", "running")
+    assert found == []
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
+import json
 from dataclasses import replace
+from datetime import date
 
 import pytest
 
@@ -10,7 +12,7 @@ from bench.interlocks import Interlock
 from bench.rig import Rig
 from bench.rig_file import SafetyTable, load_rig, packaged_rigs
 from bench.roles import PositionSensor, TECAmplifier
-from bench.start_checks import check_start
+from bench.start_checks import check_start, overdue_calibrations
 
 
 class Heater(TECAmplifier):
@@ -224,3 +226,30 @@ def test_the_packaged_rigs_can_be_left_to_themselves(name):
     for devices in (declared, strict):
         description = replace(rig.description, devices=devices)
         assert check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate") == ()
+
+
+class TestCalibrations:
+    def rig(self, tmp_path, lines):
+        path = tmp_path / "mine.toml"
+        path.write_text(f'extends = "vo2"\n[devices.psd]\n{lines}\n')
+        return load_rig(str(path))
+
+    @pytest.mark.parametrize("day", ["2027-03-01", '"2027-03-01"'])
+    def test_is_due_from_its_day_on(self, tmp_path, day):
+        file = self.rig(tmp_path, f"calibrated = 2026-03-01\ncalibration_due = {day}")
+        assert overdue_calibrations(file, date(2027, 2, 28)) == ()
+        (warning,) = overdue_calibrations(file, date(2027, 3, 1))
+        assert "devices.psd: its calibration was due on 2027-03-01" in warning
+        # As the record of a run has it.
+        assert json.loads(json.dumps(file.content))["devices"]["psd"]["calibration_due"] == "2027-03-01"
+
+    @pytest.mark.parametrize(
+        ("lines", "message"),
+        [
+            ('calibrated = "last spring"', r"devices\.psd\.calibrated"),
+            ("calibrated = 2026-03-01\ncalibration_due = 2026-03-01", "expected a day after 2026-03-01"),
+        ],
+    )
+    def test_bad_days(self, tmp_path, lines, message):
+        with pytest.raises(ConfigurationError, match=message):
+            self.rig(tmp_path, lines)

@@ -310,6 +310,7 @@ class TestDoctor:
                 "outside of its interlock",
             ),
             ("telemetry.period=0.01", ("", "time"), "every 0.01 s"),
+            ("devices.psd.calibration_due=2020-02-29", ("psd", "calibration"), "due on 2020-02-29, "),
         ],
     )
     def test_what_should_be_mended(self, bench, tmp_path, override, place, words):

@@ -35,6 +35,12 @@ def test_a_run_with_a_fault_ends_safe_and_true(matrix, rig, fault):
     assert not cell.failures, cell
 
 
+def test_an_instrument_that_keeps_others_waiting_is_named(matrix):
+    # The watchdog of the servo is what ends the run, as the supply answers late again and again.
+    cell = matrix.run_cell("sma", "supply.corrupt", 4)
+    assert cell.results["names"] == "ok", cell
+
+
 def test_a_wrong_value_is_found_out(matrix, monkeypatch):
     monkeypatch.setattr(matrix, "LYING", ())
     cell = matrix.run_cell("hybrid", "base.drifting", 1)

@@ -22,7 +22,7 @@ def served():
 
 def kill_both(bench):
     guardian = find_guardian(bench.pid)
-    # Held first: a bench that lives on for a moment makes safe what its guardian has left, and keeps the locks so long.
+    # Held first: a bench that lives on for a moment makes safe what its guardian left, and has the locks meanwhile.
     os.kill(bench.pid, signal.SIGSTOP)
     os.kill(guardian, signal.SIGKILL)
     bench.kill()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from bench.errors import DataError
@@ -14,7 +15,7 @@ _SYMBOL = (
     r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|%|‰|psi|lbf|inch|in|mil|counts?|sec|volts?|a\.u\.|arb\. ?u\.)"
 )
 _FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
-_UNIT = re.compile(rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-")
+_UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
 _SPELLINGS = {"degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "sec": "s"}
 
 
@@ -35,9 +36,15 @@ class Head:
     unit: str
 
 
+@cache
+def _unit_pattern() -> re.Pattern[str]:
+    # At its first use, as it takes 20 ms to compile.
+    return re.compile(_UNIT)
+
+
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, such as `V`, `µm` or `m/s²`; a plain `1` or `-` counts."""
-    return _UNIT.fullmatch(text.strip()) is not None
+    return _unit_pattern().fullmatch(text.strip()) is not None
 
 
 def split_unit(head: str) -> tuple[str, str]:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from sim_devices.plants import friction_muscle as kernels
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
+from sim_devices.plants.friction_muscle import contact_table
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
@@ -105,7 +105,7 @@ coiled = pytest.mark.parametrize("case", [COILED], indirect=True, ids=name)
 
 
 def test_contacts_are_those_of_the_population(case):
-    stiffness, weight, share = kernels.contact_table(replace(case.plain, contact_count=100_000))
+    stiffness, weight, share = contact_table(replace(case.plain, contact_count=100_000))
     assert stiffness.sum() == pytest.approx(case.contact_stiffness)
     assert np.ptp(stiffness) == 0.0
     assert weight.sum() == pytest.approx(1.0)
@@ -313,7 +313,7 @@ class NaiveMuscle:
 
     def __init__(self, muscle, drive):
         self.p = muscle.parameters
-        stiffness, self.weight, self.share = kernels.contact_table(self.p)
+        stiffness, self.weight, self.share = contact_table(self.p)
         self.stiffness = stiffness * 1e3
         self.rest = muscle._coefficients["rest"] * 1e-3
         self.x = muscle.length + self.rest
