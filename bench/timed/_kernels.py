@@ -70,3 +70,58 @@ def filtered(
             value[k] = columns[n + 1, k] - lag * slope + free[n, 0] * left + free[n, 1] * more
             rate[k] = slope + free[n, 2] * left + free[n, 3] * more
     return result
+
+
+@njit(cache=True)
+def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, outputs: Floats) -> bool:
+    """Integrate m y'' + c y' + k y + z = u, z' = a y' - b |y'| z - d y' |z| by Runge and Kutta's method of order 4.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (N - 1, 2 S + 1)
+        Input at the ends and middles of the S substeps of each step.
+    steps : ndarray, shape (N - 1,)
+        s.
+    parameters : ndarray, shape (6,)
+        m, c, k, a, b, d.
+    state : ndarray, shape (3,)
+        y, y' and z at the first sample, and at the last on return.
+    outputs : ndarray, shape (N,)
+        y at the samples; written.
+
+    Returns
+    -------
+    Whether it stayed finite; outputs from there on are those of the last sample before.
+    """
+    m, c, k, a, b, d = parameters
+    y, v, z = state
+    substeps = (inputs.shape[1] - 1) // 2
+    outputs[0] = y
+    for n in range(steps.size):
+        h = steps[n] / substeps
+        for s in range(substeps):
+            u0, u1, u2 = inputs[n, 2 * s], inputs[n, 2 * s + 1], inputs[n, 2 * s + 2]
+            v1 = v
+            f1 = (u0 - c * v - k * y - z) / m
+            g1 = a * v - b * abs(v) * z - d * v * abs(z)
+            v2 = v + 0.5 * h * f1
+            z2 = z + 0.5 * h * g1
+            f2 = (u1 - c * v2 - k * (y + 0.5 * h * v1) - z2) / m
+            g2 = a * v2 - b * abs(v2) * z2 - d * v2 * abs(z2)
+            v3 = v + 0.5 * h * f2
+            z3 = z + 0.5 * h * g2
+            f3 = (u1 - c * v3 - k * (y + 0.5 * h * v2) - z3) / m
+            g3 = a * v3 - b * abs(v3) * z3 - d * v3 * abs(z3)
+            v4 = v + h * f3
+            z4 = z + h * g3
+            f4 = (u2 - c * v4 - k * (y + h * v3) - z4) / m
+            g4 = a * v4 - b * abs(v4) * z4 - d * v4 * abs(z4)
+            y += h * (v1 + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+            v += h * (f1 + 2.0 * f2 + 2.0 * f3 + f4) / 6.0
+            z += h * (g1 + 2.0 * g2 + 2.0 * g3 + g4) / 6.0
+        if not (abs(y) < 1e100 and abs(v) < 1e100 and abs(z) < 1e100):
+            outputs[n + 1 :] = outputs[n]
+            return False
+        outputs[n + 1] = y
+    state[0], state[1], state[2] = y, v, z
+    return True
