@@ -41,7 +41,7 @@ class ControllerSetup:
     limits : (float, float)
         Set-points that it may ask for, input units.
     state : object
-        The specimen's memory, a state of the model; None is the model's initial one.
+        The specimen's memory, a state of the model; None is that at the start of the model's own data.
     policy : {"nearest", "paper"}
         Which answer of the inverse is taken where there are several.
     options : mapping
@@ -54,6 +54,11 @@ class ControllerSetup:
     state: Any = None
     policy: Policy = "nearest"
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def start(self) -> Any:  # noqa: ANN401 - each operator has its own
+        """The specimen's memory."""
+        return self.model.initial if self.state is None else self.state
 
     def inverse(self) -> Inverse[Any]:
         """Return the inverse of a model with memory.
@@ -151,8 +156,8 @@ def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
     numbers = setup.tuned(LatchParameters.scaled, options), correction
     if isinstance(inverse, FallingInverse):
         opposite: Any = inverse.opposite
-        return OppositeOutput(Latched(opposite, setup.state, setup.limits, *numbers))
-    return Latched(inverse, setup.state, setup.limits, *numbers)
+        return OppositeOutput(Latched(opposite, setup.start, setup.limits, *numbers))
+    return Latched(inverse, setup.start, setup.limits, *numbers)
 
 
 def _integral(setup: ControllerSetup) -> IntegralParameters:
@@ -162,22 +167,22 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
 
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopInverse(s.inverse(), s.state, s.limits, wait=_wait(s)),
+    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s)),
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(s.inverse(), s.state, s.limits, s.tuned(CorrectionParameters.scaled)),
+    lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled)),
 )
 LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
 INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits, _integral(s)))
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopFollower(s.inverse(), s.state, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopFollower(s.inverse(), s.state, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: ClosedLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
     "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))

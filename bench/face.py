@@ -165,9 +165,9 @@ def identify(
         Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
         `response` if not given.
     **options
-        As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial` and the options
-        of the model; and those of `ReadingOptions` where the layout of a file is not found from it: `delimiter`,
-        `decimal`, `encoding`, `skip_lines`, `table`.
+        As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`
+        and the options of the model; and those of `ReadingOptions` where the layout of a file is not found from it:
+        `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
 
     Raises
     ------
@@ -201,7 +201,9 @@ def identify(
     return identify_file(folder, input_column=input, output_column=output, model=model, reading=reading, **options)
 
 
-def predict(model: Model, inputs: npt.ArrayLike, *, continue_memory: bool = False) -> npt.NDArray[np.float64]:
+def predict(
+    model: Model, inputs: npt.ArrayLike, *, initial: str | None = None, continue_memory: bool = False
+) -> npt.NDArray[np.float64]:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its units.
 
     Parameters
@@ -210,23 +212,29 @@ def predict(model: Model, inputs: npt.ArrayLike, *, continue_memory: bool = Fals
         The model.
     inputs : array_like, shape (N,)
         Inputs in the unit of the model.
+    initial : {"file", "negative", "positive"}, optional
+        The memory before the first input: that at the start of the model's own data (if not given), or saturation at
+        the low or the high end of the operating range.
     continue_memory : bool
-        Whether to start from the memory at the end of the model's own data, not from its initial state.
+        Whether to start from the memory at the end of the model's own data instead.
 
     Raises
     ------
     DataError
         If a model file cannot be read.
     """
-    return predict_file(_model(model), np.asarray(inputs, dtype=np.float64), continue_memory=continue_memory)
+    values = np.asarray(inputs, dtype=np.float64)
+    return predict_file(_model(model), values, initial=initial, continue_memory=continue_memory)
 
 
-def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = False) -> InvertedTargets:
+def invert(
+    model: Model, targets: npt.ArrayLike, *, initial: str | None = None, continue_memory: bool = False
+) -> InvertedTargets:
     """Return the set-points that bring a model's output to one target after another; see `InvertedTargets`.
 
     Parameters
     ----------
-    model, continue_memory
+    model, initial, continue_memory
         As for `predict`.
     targets : array_like, shape (N,)
         Targets in the unit of the model's output.
@@ -236,7 +244,8 @@ def invert(model: Model, targets: npt.ArrayLike, *, continue_memory: bool = Fals
     DataError
         If a model file cannot be read, or the model has several inputs.
     """
-    return invert_targets(_model(model), np.asarray(targets, dtype=np.float64), continue_memory=continue_memory)
+    values = np.asarray(targets, dtype=np.float64)
+    return invert_targets(_model(model), values, initial=initial, continue_memory=continue_memory)
 
 
 def load(path: str | Path) -> RunFolder | ModelFile:

@@ -13,8 +13,11 @@ A file of version 2 is an object with these keys:
 `memory`
     The state of an operator, or of a model with time, at the end of the data from which it was identified; null for
     a model without memory or of several inputs.
+`initial`
+    Its state before the first row of these data, written alike; may be missing: the model's own initial state.
 `provenance`
-    `source`, `input`, `output`, `rows`, `skipped`, errors and certificate of the fit, `bench` (version).
+    `source`, `input`, `output`, `rows`, `skipped` (first rows that did not count), `initial` (what was asked for),
+    `input_sha256` (of the input column), `orientation`, errors and certificate of the fit, `bench` (version).
 
 Version 1 had three formats, which are still read: `bench-model`, with `operator` in place of `kind` and `model`, and
 `bench-coupled-model` and `bench-hybrid-model`, without `kind` and `memory`.
@@ -54,12 +57,16 @@ class ModelFile:
         other models.
     provenance : mapping
         Where it comes from.
+    initial : object
+        State of an operator before the first row of these data, from which it predicts unless told otherwise; None
+        for the operator's own initial state, and for other models.
     """
 
     name: str
     model: Any
     memory: Any = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    initial: Any = None
 
     @property
     def operator(self) -> Operator[Any]:
@@ -89,6 +96,7 @@ class ModelFile:
             "kind": self.model.kind,
             "model": self.model.to_json(),
             "memory": None if self.memory is None else self.response.state_to_json(self.memory),
+            "initial": None if self.initial is None else self.response.state_to_json(self.initial),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -111,7 +119,7 @@ class ModelFile:
                 f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
             )
         again = parse_model(json.loads(text), str(path)).to_json()
-        if any(again[key] != content[key] for key in ("kind", "model", "memory")):
+        if any(again[key] != content[key] for key in ("kind", "model", "memory", "initial")):
             raise DataError(
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
@@ -187,14 +195,16 @@ def parse_model(content: object, source: str) -> ModelFile:
         if not former and content["kind"] != model.kind:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
         memory = content["memory"] if format_ == FORMAT else None
+        initial = None if former else content.get("initial")
         if isinstance(model, Operator | TimedModel):
             for key in ("input_unit", "output_unit"):
                 if not isinstance(getattr(model, key), str):
                     raise TypeError(f"operator: expected a text for {key}, got {getattr(model, key)!r}")
             memory = None if memory is None else model.state_from_json(memory)
-        elif memory is not None:
-            raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory!r}")
-        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]))
+            initial = None if initial is None else model.state_from_json(initial)
+        elif memory is not None or initial is not None:
+            raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory or initial!r}")
+        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:

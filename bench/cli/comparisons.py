@@ -11,6 +11,7 @@ from rich.text import Text
 
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
 from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.models import InitialOption
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -43,11 +44,15 @@ def compare_(
         str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for models with time.")
     ] = None,
     skip: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the errors."
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the models' own data those "
+            "that their identifications left out.",
         ),
-    ] = 0,
+    ] = None,
+    initial: InitialOption = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -62,9 +67,11 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        if input_column or output_column or time_column or skip or figures or reading != ReadingOptions():
+        models_only = (input_column, output_column, time_column, skip, initial, figures)
+        if any(models_only) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --time, --skip, --figures and how a file is read are for models, with --data FILE"
+                "--input, --output, --time, --skip, --initial, --figures and how a file is read are for models, "
+                "with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
@@ -74,9 +81,18 @@ def compare_(
     check_outputs(figures=figures, json_file=json_file)
     with show_patience(f"reading {data.name}"):
         result = compare_models(
-            compared, data, input_column, output_column, skip=skip, time_column=time_column, reading=reading
+            compared,
+            data,
+            input_column,
+            output_column,
+            skip=skip,
+            initial=initial,
+            time_column=time_column,
+            reading=reading,
         )
     print_assumptions(data, result.assumptions)
+    if result.skip:
+        console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
     for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):

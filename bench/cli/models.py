@@ -36,7 +36,16 @@ ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A mod
 ContinueMemory = Annotated[
     bool,
     typer.Option(
-        "--continue-memory", help="Start from the memory at the end of the model's data, not from saturation."
+        "--continue-memory", help="Start from the memory at the end of the model's data, not at their start."
+    ),
+]
+InitialOption = Annotated[
+    str | None,
+    typer.Option(
+        "--initial",
+        metavar="KIND",
+        help="Memory at the first row: file (that at the start of the model's data; if not given), negative or "
+        "positive saturation, or unknown: skip the rows that it could reach.",
     ),
 ]
 
@@ -179,6 +188,16 @@ def predict_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
     time_column: TimeColumn = None,
+    skip: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the model's own data those "
+            "that its identification left out.",
+        ),
+    ] = None,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
@@ -186,13 +205,15 @@ def predict_(
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
-    Writes a CSV file with the input column and `predicted`.
+    Writes a CSV file with the input column and `predicted`. The model starts from the memory that it had at the start
+    of its own data, so that on these data the errors are those of `bench identify`.
     """
     from bench.identification import measure_errors
     from bench.model_file import load_model
     from bench.results.data import read_columns, write_csv
-    from bench.results.models import check_unit, errors_json, outside_of_range, predict
-    from bench.results.times import read_times
+    from bench.results.models import check_unit, errors_json, outside_of_range
+    from bench.results.starting_state import starting_state
+    from bench.results.times import bind_times, read_times
 
     check_outputs(out=out, json_file=json_file)
     model = load_model(model_path)
@@ -204,17 +225,19 @@ def predict_(
     check_unit(model.response.input_unit, columns.units[input_column], input_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
+    start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
     times = read_times(columns, time_column) if time_column else None
-    predicted = predict(model, inputs, continue_memory=continue_memory, times=times)
+    predicted = bind_times(model, times).evaluate(inputs, start.state)
     write_csv(out, [input_column, "predicted"], [inputs, predicted])
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
     if output_column:
-        errors = measure_errors(columns.values[output_column], predicted)
-        result |= errors_json(errors)
+        errors = measure_errors(columns.values[output_column][start.skip :], predicted[start.skip :])
+        result |= {**errors_json(errors), "skipped": start.skip}
         unit = model.response.output_unit
         print_rows(
             f"{model.name} on {file.name}",
             (
+                ("samples", f"{inputs.size - start.skip} (skipped: {start.skip})"),
                 ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
@@ -301,6 +324,7 @@ def invert(
         PolicyOption,
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
     ] = PolicyOption.NEAREST,
+    initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
@@ -324,7 +348,9 @@ def invert(
     print_assumptions(file, columns.assumptions)
     units = (model.operator.input_unit, model.operator.output_unit)
     check_unit(units[1], columns.units[column], column)
-    found = invert_targets(model, columns.values[column], policy=policy.value, continue_memory=continue_memory)
+    found = invert_targets(
+        model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
+    )
     header = [
         header_with_unit(name, unit)
         for name, unit in (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -29,7 +29,12 @@ class TimedModel(Model, ABC, Generic[S]):
         The range of the inputs from which the model was identified, input units.
     input_unit, output_unit : str
         Units, for labels.
+    starts : tuple of str
+        The words by which `start` knows states before a first sample; "skip" is the initial state where the first
+        samples do not count.
     """
+
+    starts: ClassVar[tuple[str, ...]] = ()
 
     input_range: tuple[float, float]
     input_unit: str
@@ -46,13 +51,25 @@ class TimedModel(Model, ABC, Generic[S]):
         inputs : array_like, shape (N,)
             Input units.
         state : S or None
-            The state before the first sample; None is the model's own start.
+            The state before the first sample; default the initial state.
 
         Raises
         ------
         ValueError
             If a sequence is empty, not finite, not of equal length, or the times do not increase.
         """
+
+    @abstractmethod
+    def initial_state(self) -> S:
+        """Return the state from which identification starts."""
+
+    @abstractmethod
+    def start(self, word: str) -> S:
+        """Return the state before a first sample that one of `starts` names."""
+
+    def unknown_until(self, inputs: ArrayLike) -> int:  # noqa: ARG002
+        """Return the first sample from which inputs, shape (N,), have overwritten all memory they ever do."""
+        return 0
 
     @abstractmethod
     def parameters(self) -> Mapping[str, tuple[float, str]]:

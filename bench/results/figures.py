@@ -83,15 +83,20 @@ def plot_loops(
         axes.set(xlabel=input_label, ylabel=output_label)
 
 
-def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str) -> None:
-    """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, by its title."""
+def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, skip: int = 0) -> None:
+    """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, by its title.
+
+    The first `skip` samples are drawn in grey and do not count in the title.
+    """
     with _figure(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
         for i, (title, error) in enumerate(errors.items()):
-            panels[i].plot(error, color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            panels[i].plot(np.arange(skip, error.size), error[skip:], color=_COLORS[i % len(_COLORS)], linewidth=0.7)
+            if skip:
+                panels[i].plot(error[: skip + 1], color="0.7", linewidth=0.7)
             panels[i].set_ylabel(error_label)
-            rms = float(np.sqrt(np.mean(error**2)))
-            panels[i].set_title(f"{title}: max {np.max(np.abs(error)):.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
+            most, rms = np.max(np.abs(error[skip:])), float(np.sqrt(np.mean(error[skip:] ** 2)))
+            panels[i].set_title(f"{title}: max {most:.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
 
 

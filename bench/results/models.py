@@ -42,6 +42,7 @@ from bench.identification import (
 from bench.model_file import ModelFile, load_model
 from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
 from bench.results.reading.options import ReadingOptions
+from bench.results.starting_state import StartingState, digest, starting_state
 from bench.results.times import bind_times, check_model_name, read_times
 from bench.timed import identify_in_time
 
@@ -232,12 +233,14 @@ def identify_file(
         "output": output_column,
         **({} if time_column is None else {"time": time_column}),
         "rows": int(inputs.size),
-        "skipped": skip,
+        "skipped": found.skip,
+        "initial": options.get("initial"),
+        "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state)
     return IdentifiedFile(
         file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
     )
@@ -257,7 +260,12 @@ def _largest(uncertainties: Floats) -> float | None:
 
 
 def predict(
-    model: ModelFile, inputs: Floats, *, continue_memory: bool = False, times: Floats | None = None
+    model: ModelFile,
+    inputs: Floats,
+    *,
+    initial: str | None = None,
+    continue_memory: bool = False,
+    times: Floats | None = None,
 ) -> Floats:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
@@ -267,9 +275,8 @@ def predict(
         The model.
     inputs : ndarray, shape (N,)
         Inputs in the unit of the model, finite.
-    continue_memory : bool
-        Start from the memory that the model file keeps, the end of its identification data, rather than from
-        the state from which identification started.
+    initial, continue_memory
+        The state before the first input, as for `starting_state`.
     times : ndarray, shape (N,), or None
         s, for a model with time.
 
@@ -278,7 +285,8 @@ def predict(
     ConfigurationError
         If a model with time has none.
     """
-    return bind_times(model, times).evaluate(inputs, model.memory if continue_memory else None)
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    return bind_times(model, times).evaluate(inputs, start.state)
 
 
 @dataclass(frozen=True)
@@ -307,7 +315,12 @@ class InvertedTargets:
 
 
 def invert_targets(
-    model: ModelFile, targets: Floats, *, policy: Policy = "nearest", continue_memory: bool = False
+    model: ModelFile,
+    targets: Floats,
+    *,
+    policy: Policy = "nearest",
+    initial: str | None = None,
+    continue_memory: bool = False,
 ) -> InvertedTargets:
     """Invert a model for a sequence of targets.
 
@@ -320,15 +333,16 @@ def invert_targets(
         Output units, finite.
     policy : {"nearest", "paper"}
         Which answer is taken where there are several.
-    continue_memory : bool
-        Start from the memory that the model file keeps rather than from the model's initial state.
+    initial, continue_memory
+        The state before the first target, as for `starting_state`.
 
     Raises
     ------
     DataError
         If it is a model of several inputs.
     """
-    found = model.operator.inverse(policy).follow(targets, model.memory if continue_memory else None)
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    found = model.operator.inverse(policy).follow(targets, start.state)
     flags = tuple(
         (Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
         for met, target, output in zip(found.met.tolist(), targets.tolist(), found.outputs.tolist(), strict=True)
@@ -391,18 +405,26 @@ class ComparedModels:
         By the model file's name.
     unit : str
         Unit of the output.
+    skip : int
+        Number of first rows left out of the errors.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
     """
 
     comparisons: Mapping[str, Comparison]
     unit: str
+    skip: int = 0
     assumptions: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the comparison for programs: `raw` and `rezeroed` errors and the `offset` of each model."""
+        """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
         return {
-            name: {"raw": errors_json(entry.raw), "rezeroed": errors_json(entry.rezeroed), "offset": entry.offset}
+            name: {
+                "raw": errors_json(entry.raw),
+                "rezeroed": errors_json(entry.rezeroed),
+                "offset": entry.offset,
+                "skipped": self.skip,
+            }
             for name, entry in self.comparisons.items()
         }
 
@@ -413,7 +435,8 @@ def compare_models(
     input_column: str | None,
     output_column: str | None,
     *,
-    skip: int = 0,
+    skip: int | None = None,
+    initial: str | None = None,
     time_column: str | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
@@ -427,8 +450,9 @@ def compare_models(
         A file that `read_columns` reads, or a run.
     input_column, output_column : str or None
         Columns; those that the first model was identified from if None.
-    skip : int
-        First rows that drive the memory but do not count.
+    skip, initial
+        First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
+        the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
     time_column : str or None
         Column of times, for models with time; that of the first such model if None.
     reading : ReadingOptions, optional
@@ -439,7 +463,7 @@ def compare_models(
     DataError
         If a file cannot be used, or units do not fit.
     ConfigurationError
-        If `skip` leaves nothing.
+        If `skip` leaves nothing, or there is no such initial state.
     """
     files = [load_model(path) for path in paths]
     names = [
@@ -452,16 +476,18 @@ def compare_models(
     columns = read_columns(data, [*names, *([time_column] if time_column else [])], options=reading)
     inputs, outputs = (columns.values[name] for name in names)
     times = read_times(columns, time_column) if time_column else None
-    if not 0 <= skip < inputs.size:
-        raise ConfigurationError(f"--skip {skip}: {data} has {inputs.size} rows")
     operators: dict[str, Operator[Any] | TimedSequence] = {}
+    starts: dict[str, StartingState] = {}
     for path, file in zip(paths, files, strict=True):
         check_unit(file.response.input_unit, columns.units[names[0]], names[0])
         check_unit(file.response.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
         operators[name] = bind_times(file, times)
-    comparisons = compare(operators, inputs, outputs, skip=skip)
-    return ComparedModels(comparisons, files[0].response.output_unit, columns.assumptions)
+        starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
+    states = {name: start.state for name, start in starts.items()}
+    most = max(start.skip for start in starts.values())
+    comparisons = compare(operators, inputs, outputs, states=states, skip=most)
+    return ComparedModels(comparisons, files[0].response.output_unit, most, columns.assumptions)
 
 
 def assess_designs(

@@ -27,7 +27,8 @@ from bench.results.figures import (
     plot_loops,
     plot_signals,
 )
-from bench.results.models import ComparedModels, IdentifiedFile, errors_json, predict
+from bench.results.models import ComparedModels, IdentifiedFile, errors_json
+from bench.results.starting_state import StartingState, starting_state
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
 from bench.units import format_numbers, header_with_unit, with_unit
@@ -133,7 +134,7 @@ def draw_comparison(result: ComparedModels, out: Path) -> Path:
     """Draw the residuals of compared models; return the file."""
     path = _make_folder(out) / "residuals.png"
     residuals = {name: entry.residuals for name, entry in result.comparisons.items()}
-    plot_errors(path, residuals, error_label=with_unit("error", result.unit))
+    plot_errors(path, residuals, error_label=with_unit("error", result.unit), skip=result.skip)
     return path
 
 
@@ -165,7 +166,8 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
         input_label=with_unit(found.file.provenance["input"], operator.input_unit),
         output_label=with_unit(found.file.provenance["output"], operator.output_unit),
     )
-    plot_errors(errors, {name: found.identification.residuals}, error_label=with_unit("error", operator.output_unit))
+    residuals, skip = {name: found.identification.residuals}, found.identification.skip
+    plot_errors(errors, residuals, error_label=with_unit("error", operator.output_unit), skip=skip)
     paths = [loops, errors]
     for density in operator.densities():
         paths.append(folder / f"{name}-density.png")
@@ -241,6 +243,7 @@ def _compare(
 ) -> tuple[dict[str, dict[str, Any]], list[Path]]:
     comparison: dict[str, dict[str, Any]] = {}
     residuals: dict[str, Any] = {}
+    pairs: list[tuple[ModelFile, StartingState, list[str]]] = []
     for model in models:
         columns = [str(model.provenance.get(end, "")) for end in ("input", "output")]
         missing = [name for name in columns if name not in steps.columns]
@@ -248,17 +251,22 @@ def _compare(
             raise DataError(
                 f"model {model.name} was identified with {' and '.join(missing)}, which {record.path} lacks"
             )
-        measured, predicted = steps[columns[1]], predict(model, steps[columns[0]])
+        pairs.append((model, starting_state(model, steps[columns[0]]), columns))
+    # Errors of the same rows for all.
+    skip = max((start.skip for _, start, _ in pairs), default=0)
+    for model, start, (driven, response) in pairs:
+        measured, predicted = steps[response], model.operator.evaluate(steps[driven], start.state)
         comparison[model.name] = {
-            **errors_json(measure_errors(measured, predicted)),
-            "unit": model.operator.output_unit or record.unit(columns[1]),
+            **errors_json(measure_errors(measured[skip:], predicted[skip:])),
+            "unit": model.operator.output_unit or record.unit(response),
+            "skipped": skip,
         }
         residuals[model.name] = measured - predicted
     if not residuals:
         return comparison, []
     unit = next(iter(comparison.values()))["unit"]
     path = folder / "errors.png"
-    plot_errors(path, residuals, error_label=with_unit("error", unit))
+    plot_errors(path, residuals, error_label=with_unit("error", unit), skip=skip)
     return comparison, [path]
 
 

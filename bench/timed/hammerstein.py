@@ -80,6 +80,7 @@ class Hammerstein(TimedModel[HammersteinState]):
     """
 
     kind: ClassVar[str] = "hammerstein"
+    starts: ClassVar[tuple[str, ...]] = ("negative", "positive", "skip")
     parts: ClassVar[Parts] = {"static": operator_from_json, "linear": LinearPart.from_json}
 
     static: Operator[Any]
@@ -117,7 +118,7 @@ class Hammerstein(TimedModel[HammersteinState]):
     ) -> tuple[Floats, HammersteinState]:
         """Return the outputs of a sequence, shape (N,), and the state after it; see `TimedModel.run`."""
         clock, sequence = check_sequence(times, inputs=inputs)
-        state = HammersteinState(self.static.initial_state()) if state is None else state
+        state = self.initial_state() if state is None else state
         values = self.static.evaluate(sequence, state.memory) - self.static.bias
         knots = state.knots
         elapsed, filters, known = clock - clock[0], None, 0
@@ -136,6 +137,18 @@ class Hammerstein(TimedModel[HammersteinState]):
         _, (value, rate, crept) = self.linear.respond(times[: first + 1], values[: first + 1, None], filters)
         at_first = FilterState(float(value[0]), float(rate[0]), tuple(crept[:, 0].tolist()))
         return Knots(tuple(times[first:].tolist()), tuple(values[first:].tolist()), at_first)
+
+    def initial_state(self) -> HammersteinState:
+        """Return the initial state of the operator."""
+        return HammersteinState(self.static.initial_state())
+
+    def start(self, word: str) -> HammersteinState:
+        """Return a saturated state of the operator: "negative" or "positive"."""
+        return HammersteinState(self.static.saturated_state({"negative": -1, "positive": 1}[word]))
+
+    def unknown_until(self, inputs: ArrayLike) -> int:
+        """Return what the operator does."""
+        return self.static.unknown_until(inputs)
 
     def drift_after(self, elapsed: Floats) -> Floats:
         """Return the drift at times since the start of the record, s; output units, same shape."""

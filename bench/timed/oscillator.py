@@ -58,8 +58,12 @@ class OscillatorState(NamedTuple):
     force: float
 
 
+State: TypeAlias = OscillatorState | Start
+"""After a sample, or before the first one: at rest, or the steady state of a sequence that repeats itself."""
+
+
 @dataclass(frozen=True, eq=False)
-class BoucWenOscillator(TimedModel[OscillatorState]):
+class BoucWenOscillator(TimedModel[State]):
     """A mass on a spring, a damper and a Bouc-Wen force; equations at the head of this module.
 
     Parameters
@@ -76,8 +80,6 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
         Range of the inputs from which it was identified, input units.
     interpolation : {"smooth", "linear", "held"}
         The input between samples: band-limited (a cubic spline on uneven times), a straight line, or held.
-    start : {"rest", "periodic"}
-        Before the first sample: at rest with y = y' = z = 0, or the steady state of a sequence that repeats itself.
     input_unit, output_unit : str
         Units, for labels.
 
@@ -88,6 +90,7 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
     """
 
     kind: ClassVar[str] = "bouc-wen-oscillator"
+    starts: ClassVar[tuple[str, ...]] = get_args(Start)
 
     mass: float
     damping: float
@@ -98,7 +101,6 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
     offset: float
     input_range: tuple[float, float]
     interpolation: Interpolation = "smooth"
-    start: Start = "rest"
     input_unit: str = ""
     output_unit: str = ""
 
@@ -109,18 +111,16 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
             raise ValueError("mass: expected a number other than 0")
         low, high = (_checks.number("input_range", value) for value in self.input_range)
         object.__setattr__(self, "input_range", (low, high))
-        for name, words in (("interpolation", get_args(Interpolation)), ("start", get_args(Start))):
-            if getattr(self, name) not in words:
-                raise ValueError(f"{name}: expected one of {', '.join(words)}, got {getattr(self, name)!r}")
+        words = get_args(Interpolation)
+        if self.interpolation not in words:
+            raise ValueError(f"interpolation: expected one of {', '.join(words)}, got {self.interpolation!r}")
 
     @property
     def vector(self) -> Floats:
         """m, c, k, a, b and d, shape (6,)."""
         return np.array([getattr(self, name) for name in _NAMES])
 
-    def run(
-        self, times: ArrayLike, inputs: ArrayLike, state: OscillatorState | None = None
-    ) -> tuple[Floats, OscillatorState]:
+    def run(self, times: ArrayLike, inputs: ArrayLike, state: State | None = None) -> tuple[Floats, OscillatorState]:
         """Return the outputs of a sequence, shape (N,), and the state after it; see `TimedModel.run`.
 
         Raises ValueError also if the response grows without bounds, or a periodic start meets uneven times.
@@ -128,13 +128,12 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
         clock, sequence = check_sequence(times, inputs=inputs)
         substeps = substeps_for(self.vector, clock)
         at = np.zeros(3)
-        if state is not None:
+        if isinstance(state, OscillatorState):
             gap = clock[0] - state.clock if clock[0] > state.clock else clock[1] - clock[0]
             between = np.linspace(state.input, sequence[0], 2 * substeps + 1)[None]
             at = np.array([state.position, state.velocity, state.force])
             integrate(self.vector, between, np.array([gap]), at)
-        periodic = state is None and self.start == "periodic"
-        driven = Drive.of(clock, sequence, self.interpolation, substeps, periodic=periodic)
+        driven = Drive.of(clock, sequence, self.interpolation, substeps, periodic=state == "periodic")
         outputs, finite = driven.respond(self.vector, at)
         if not finite:
             raise ValueError(f"inputs: the response of this {self.kind} grows without bounds")
@@ -142,6 +141,14 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
         return outputs + self.offset, OscillatorState(
             float(clock[-1]), float(sequence[-1]), position, velocity, force
         )
+
+    def initial_state(self) -> State:
+        """Return "rest": y = y' = z = 0."""
+        return "rest"
+
+    def start(self, word: str) -> State:
+        """Return the word itself: "rest" or "periodic"."""
+        return "periodic" if word == "periodic" else "rest"
 
     def parameters(self) -> Mapping[str, tuple[float, str]]:
         """Return the parameters, and frequency and damping of small oscillations."""
@@ -162,12 +169,14 @@ class BoucWenOscillator(TimedModel[OscillatorState]):
             found["damping ratio"] = abs(self.damping) / (2.0 * math.sqrt(stiffness * self.mass)), ""
         return found
 
-    def state_to_json(self, state: OscillatorState) -> Any:  # noqa: ANN401
-        """Return a state as a list of numbers."""
-        return list(state)
+    def state_to_json(self, state: State) -> Any:  # noqa: ANN401
+        """Return a state as a list of numbers, or the word of a start."""
+        return list(state) if isinstance(state, OscillatorState) else state
 
-    def state_from_json(self, document: Any) -> OscillatorState:  # noqa: ANN401
+    def state_from_json(self, document: Any) -> State:  # noqa: ANN401
         """Return the state that `state_to_json` wrote; ValueError if it is none."""
+        if document in self.starts:
+            return self.start(document)
         if not isinstance(document, list) or len(document) != len(OscillatorState._fields):
             raise ValueError(f"memory: expected {len(OscillatorState._fields)} numbers, got {document!r}")
         return OscillatorState(*(_checks.number("memory", value) for value in document))

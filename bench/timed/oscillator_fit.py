@@ -144,15 +144,26 @@ def identify_bouc_wen_oscillator(
     start = min(ends, key=lambda each: ends[each][1].cost)
     simulation, end = ends[start]
     offset, _ = simulation.offset(end.x)
-    found = (end.x * simulation.scales).tolist()
+    found: list[float] = (end.x * simulation.scales).tolist()
+    mass, damping, stiffness, hysteretic, rate, shape = found
     model = BoucWenOscillator(
-        *found, offset, (float(u.min()), float(u.max())), interpolation, start, input_unit, output_unit
+        mass=mass,
+        damping=damping,
+        stiffness=stiffness,
+        hysteretic_stiffness=hysteretic,
+        loop_rate=rate,
+        loop_shape=shape,
+        offset=offset,
+        input_range=(float(u.min()), float(u.max())),
+        interpolation=interpolation,
+        input_unit=input_unit,
+        output_unit=output_unit,
     )
-    predicted = model.evaluate(clock, u)
+    predicted = model.evaluate(clock, u, start)
     jacobian = np.asarray(end.jac)
     norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     scaled = jacobian / norms
-    variance = 2.0 * float(end.cost) / max(np.count_nonzero(roots) - 7, 1)
+    variance: float = 2.0 * float(end.cost) / max(int(np.count_nonzero(roots)) - 7, 1)
     deviations = np.sqrt(variance * np.diag(np.linalg.pinv(scaled.T @ scaled))) / norms * np.abs(simulation.scales)
     length = float(np.linalg.norm(end.fun))
     poor = [
@@ -183,6 +194,7 @@ def identify_bouc_wen_oscillator(
             converged=bool(end.success),
         ),
         skip=skip,
+        initial_state=start,
         warnings=tuple(warnings),
     )
 

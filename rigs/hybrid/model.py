@@ -86,7 +86,7 @@ class HybridModel(Model):
     Raises
     ------
     ValueError
-        If the range of the polynomial does not contain 0 K, or the reference is not a number.
+        If the range of the polynomial does not contain 0 K, the hysteresis falls, or the reference is not a number.
     """
 
     kind: ClassVar[str] = "hybrid"
@@ -105,6 +105,8 @@ class HybridModel(Model):
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference", _checks.number("reference", self.reference))
         _check_contains_rest(self.polynomial)
+        if not self.hysteresis.rises():
+            raise ValueError("hysteresis: expected weights >= 0, as the deflection rises with the voltage")
 
     def simulate(
         self, currents: ArrayLike, voltages: ArrayLike, dt: float, ambient: ArrayLike = 22.0

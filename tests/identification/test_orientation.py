@@ -185,7 +185,7 @@ class OnlyRising(PrandtlIshlinskii):
 
 
 def test_a_model_that_cannot_fall_is_taken_to_rise():
-    spec = ModelSpec("", OnlyRising, lambda inputs: OnlyRising([0.0, 1.0], [0.0, 0.0]))
+    spec = ModelSpec("", OnlyRising, lambda _: OnlyRising([0.0, 1.0], [0.0, 0.0]))
     rest = spec, spec.template(INPUTS), INPUTS, measured() * np.sin(INPUTS), np.ones(INPUTS.size)
     assert possible_signs("auto", "plays", *rest) == (1,)
     assert possible_signs("rising", "plays", *rest) == (1,)
