@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +42,8 @@ _ROUNDS, _GAIN = 6, 1e-7
 _STARTS, _EVALUATIONS = 3, 40
 # Evaluations of a search that only chooses among elements.
 _FEW = 8
+# Principal columns of the operator in a first search, and in the grid that it starts from.
+_FREE, _COARSE = 30, 6
 _STEP = 1e-5
 
 
@@ -63,12 +65,18 @@ class _Search:
     static: FitProblem
     columns: Floats
     roots: Floats
+    signs: tuple[Literal[1, -1], ...]
     elapsed: Floats = field(init=False)
+    principal: Floats = field(init=False)
     step: float = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elapsed", self.times - self.times[0])
         object.__setattr__(self, "step", float(np.median(np.diff(self.times))))
+        centred = self.columns - self.columns.mean(axis=0)
+        strengths, directions = np.linalg.eigh(centred.T @ centred)
+        kept = strengths > 1e-10 * strengths[-1]
+        object.__setattr__(self, "principal", np.ascontiguousarray(self.columns @ directions[:, kept][:, ::-1]))
 
     @property
     def span(self) -> float:
@@ -90,7 +98,7 @@ class _Search:
             elif element == "resonance":
                 low, high = math.log(2.0 * math.pi) - longest, math.log(20.0 * math.pi) - shortest
                 top = math.log(math.pi) - shortest
-                starts = tuple(np.linspace(max(low, top - 6.0), top, 13))
+                starts = (*np.linspace(max(low, top - 6.0), top, 13), high - 0.5)
                 found.append(_Parameter("frequency", starts, low, high))
                 found.append(_Parameter("damping", tuple(map(math.log, (0.03, 0.3, 1.0))), math.log(1e-3), 3.4))
             elif element == "delay":
@@ -128,21 +136,27 @@ class _Search:
         return shape[:, None]
 
     def fit(self, elements: Sequence[str], values: Floats) -> Fit:
-        """Return the coefficients of operator and drift for given parameters."""
+        """Return the coefficients of operator and drift for given parameters, of the sign that fits better."""
         part, time = self.linear(self.parameters(elements), values)
         drifts = self.drifts(elements, time)
-        sign = self.static.orientation
-        columns = sign * part.respond(self.times, self.columns)[0]
-        regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
-        problem = self.static
+        columns, problem = part.respond(self.times, self.columns)[0], self.static
         if not problem.spec.constrained:
-            found = fit_minimum_norm(regressor, problem.outputs, weights=problem.weights, skip=problem.skip)
-        else:
-            signs = np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)])
-            found = fit(regressor, problem.outputs, nonnegative=signs, weights=problem.weights, skip=problem.skip)
-        turned = found.coefficients.copy()
-        turned[: columns.shape[1]] *= sign
-        return replace(found, coefficients=turned)
+            regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
+            return fit_minimum_norm(regressor, problem.outputs, weights=problem.weights, skip=problem.skip)
+        constrained = np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)])
+        fits = []
+        for sign in self.signs:
+            found = fit(
+                Regressor.of_columns(np.column_stack([sign * columns, drifts])),
+                problem.outputs,
+                nonnegative=constrained,
+                weights=problem.weights,
+                skip=problem.skip,
+            )
+            turned = found.coefficients.copy()
+            turned[: columns.shape[1]] *= sign
+            fits.append(replace(found, coefficients=turned))
+        return min(fits, key=lambda each: self.cost(elements, values, each))
 
     def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
         """Return the weighted sum of squares of a fit."""
@@ -157,9 +171,7 @@ class _Search:
         if self.static.spec.constrained:
             used = found.coefficients[: self.columns.shape[1]] != 0.0
             return self.columns[:, used]
-        left, singular, _ = np.linalg.svd(self.columns - self.columns.mean(axis=0), full_matrices=False)
-        kept = singular > 1e-4 * singular[0]
-        return np.asarray(left[:, kept][:, :100])
+        return self.principal[:, :100]
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +329,9 @@ def identify_hammerstein(
         raise ValueError(
             f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer levels, or every nth row"
         )
-    search = _set_up(moments, problem)
+    # The output of a lag may fall while the operator rises: the sign is found with the linear part.
+    oriented = has_orientation(problem.spec, problem.template)
+    search = _set_up(moments, problem, (1, -1) if oriented and orientation == "auto" else (problem.orientation,))
     warnings = list(problem.warnings())
     with _one_thread():
         found = _choose(search) if chosen is None else _best(search, chosen)
@@ -336,6 +350,7 @@ def identify_hammerstein(
     drift = float(found.fit.coefficients[count]) if found.fit.coefficients.size > count else 0.0
     operator = problem.template.with_coefficients(found.fit.coefficients[:count], found.fit.bias)
     model = Hammerstein(operator, part, drift, time)
+    sign: Literal[1, -1] = -1 if (found.fit.coefficients[:count][problem.template.nonnegative()] < 0.0).any() else 1
     state = HammersteinState(problem.state)
     predicted = model.evaluate(moments, sequence, state)
     return Identification(
@@ -348,7 +363,7 @@ def identify_hammerstein(
         skip=problem.skip,
         initial_state=state,
         warnings=tuple(warnings),
-        orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
+        orientation=NAMES[sign] if oriented else None,
     )
 
 
@@ -366,10 +381,10 @@ def _elements(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _set_up(times: Floats, problem: FitProblem) -> _Search:
+def _set_up(times: Floats, problem: FitProblem, signs: tuple[Literal[1, -1], ...]) -> _Search:
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    return _Search(times, problem, problem.regressor.dense(), roots)
+    return _Search(times, problem, problem.regressor.dense(), roots, signs)
 
 
 def _choose(search: _Search) -> _Found:
@@ -378,14 +393,14 @@ def _choose(search: _Search) -> _Found:
     used = max(int(np.count_nonzero(search.roots)), 1)
     shortest, longest = search.creep_span
     while found.cost > 0.0:
-        basis, trials = search.basis(found.fit), []
+        basis, trials = search.principal[:, :_FREE], []
         for element in _CHOICE:
             kept = tuple(name for name in found.elements if not any({name, element} <= group for group in _EXCLUSIVE))
             if element in found.elements or (element == "lag" and "resonance" in found.elements):
                 continue
             if element == "creep" and longest < 10.0 * shortest:
                 continue
-            trials.append(_first(search, (*kept, element), found, basis, starts=1, evaluations=_FEW))
+            trials += _ends(search, (*kept, element), found, basis, starts=1, evaluations=_FEW)
         least = min(trials, key=lambda trial: trial.cost, default=found)
         best = _best(search, least.elements, found, rounds=1) if least.elements else least
         added = set(best.elements) - set(found.elements)
@@ -405,10 +420,14 @@ def _best(search: _Search, elements: tuple[str, ...], before: _Found | None = No
         found = search.fit(elements, np.empty(0))
         return _Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
     first = _best(search, ()) if before is None else before
-    trial = _first(search, elements, first, search.basis(first.fit))
-    values, deviations = trial.values, trial.deviations
-    found = search.fit(elements, values)
-    cost = search.cost(elements, values, found)
+    trials = [
+        replace(
+            trial, fit=(refit := search.fit(elements, trial.values)), cost=search.cost(elements, trial.values, refit)
+        )
+        for trial in _ends(search, elements, first, search.principal[:, :_FREE])
+    ]
+    best = min(trials, key=lambda trial: trial.cost)
+    values, deviations, found, cost = best.values, best.deviations, best.fit, best.cost
     for _ in range(rounds):
         moved, wider, _ = _search(search, elements, parameters, values, search.basis(found))
         refit = search.fit(elements, moved)
@@ -421,37 +440,37 @@ def _best(search: _Search, elements: tuple[str, ...], before: _Found | None = No
     return _Found(elements, values, found, cost, deviations)
 
 
-def _first(
+def _ends(
     search: _Search,
     elements: tuple[str, ...],
     before: _Found,
     basis: Floats,
     starts: int = _STARTS,
     evaluations: int = _EVALUATIONS,
-) -> _Found:
-    """Return the best of several searches over the coefficients that a smaller model leaves free, with its fit."""
+) -> list[_Found]:
+    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit."""
     parameters = search.parameters(elements)
     if not parameters:
         none = np.empty(0)
         cost = float(np.sum(_Projection(search, elements, basis).residuals(none) ** 2))
-        return _Found(elements, none, before.fit, cost, none)
+        return [_Found(elements, none, before.fit, cost, none)]
     names = [p.name for p in search.parameters(before.elements)]
     known = dict(zip(names, before.values.tolist(), strict=True))
-    ends = [
-        _search(search, elements, parameters, start, basis, evaluations)
-        for start in _starts(search, elements, parameters, known, before.fit)[:starts]
-    ]
-    values, deviations, cost = min(ends, key=lambda end: end[2])
-    return _Found(elements, values, before.fit, cost, deviations)
+    found = []
+    for start in _starts(search, elements, parameters, known, before.fit)[:starts]:
+        values, deviations, cost = _search(search, elements, parameters, start, basis, evaluations)
+        found.append(_Found(elements, values, before.fit, cost, deviations))
+    return found
 
 
 def _starts(
     search: _Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
 ) -> list[Floats]:
-    """Return the best few of a grid, judged with the fit of the smaller model as the signal."""
+    """Return the best few of a grid, judged with the fit of the smaller model and the principal columns."""
     grids = [(known[p.name],) if p.name in known else p.starts for p in parameters]
     signal = search.columns @ before.coefficients[: search.columns.shape[1]]
-    projection = _Projection(search, elements, signal[:, None])
+    basis = np.column_stack([signal, search.principal[:, :_COARSE]])
+    projection = _Projection(search, elements, basis)
     grid = [np.array(values) for values in product(*grids)]
     costs = [float(np.sum(projection.residuals(values) ** 2)) for values in grid]
     order = np.argsort(costs, kind="stable")

@@ -33,7 +33,7 @@ _HALF, _WINDOW = 32, 10.0
 # Relative difference of time steps that count as even.
 _EVEN = 1e-6
 # Time constants of the linear part after which a periodic response counts as steady, and most periods for it.
-_SETTLED, _MOST_PERIODS = 30.0, 20
+_SETTLED, _MOST_PERIODS = 18.0, 20
 
 
 class OscillatorState(NamedTuple):

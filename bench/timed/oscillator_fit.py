@@ -7,6 +7,7 @@ section 7.4). The search starts without outside help: mass, damping and stiffnes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -25,6 +26,8 @@ from bench.timed.oscillator import BoucWenOscillator, Drive, Interpolation, Star
 # Shares of the small-amplitude stiffness that is hysteretic, and loop rate and shape in 1 / (3 RMS output).
 _SHARES, _RATES, _SHAPES = (0.3, 0.6, 0.9), (0.3, 1.0, 3.0), (-1.2, 0.0, 1.2)
 _TRIED = 4
+# Substeps of the integration in the end beside those of the first searches.
+_COARSER = 4
 # Least part of the greatest input amplitude that a frequency needs to count in the start.
 _EXCITED = 0.02
 _STEP = 1e-6
@@ -135,12 +138,15 @@ def identify_bouc_wen_oscillator(
     starts: tuple[Start, ...] = ("rest", "periodic") if initial is None else (initial,)  # type: ignore[assignment]
     for start in starts:
         try:
-            drive = Drive.of(clock, u, interpolation, substeps, periodic=start == "periodic")
+            drives = [
+                Drive.of(clock, u, interpolation, number, periodic=start == "periodic")
+                for number in (max(substeps // _COARSER, 1), substeps)
+            ]
         except ValueError:
             if initial is not None:
                 raise
             continue
-        ends[start] = _fit(drive, y, roots, linear)
+        ends[start] = _fit(drives, y, roots, linear)
     start = min(ends, key=lambda each: ends[each][1].cost)
     simulation, end = ends[start]
     offset, _ = simulation.offset(end.x)
@@ -199,21 +205,22 @@ def identify_bouc_wen_oscillator(
     )
 
 
-def _fit(drive: Drive, outputs: Floats, roots: Floats, linear: Floats) -> tuple[_Simulation, Any]:
-    """Return the simulation and the end of the best search."""
+def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats) -> tuple[_Simulation, Any]:
+    """Return the finer simulation and the end of the best search, which starts with the coarser one."""
     size = 3.0 * float(outputs.std())
     mass, damping, stiffness = linear.tolist()
     scales = np.array([mass, damping, stiffness, stiffness, 1.0 / size, 1.0 / size])
-    simulation = _Simulation(drive, outputs, roots, scales)
+    coarse, fine = (_Simulation(drive, outputs, roots, scales) for drive in drives)
     grid = [
-        np.array([1.0, loss, 1.0 - share, share, rate, shape])
-        for loss, share, rate, shape in product((0.3, 1.0), _SHARES, _RATES, _SHAPES)
+        # What the hysteresis dissipates is no longer the damper's.
+        np.array([1.0, 0.5, 1.0 - share, share, rate, shape])
+        for share, rate, shape in product(_SHARES, _RATES, _SHAPES)
     ]
-    costs = [float(np.sum(simulation.residuals(values) ** 2)) for values in grid]
+    costs = [float(np.sum(coarse.residuals(values) ** 2)) for values in grid]
     order = np.argsort(costs, kind="stable")[:_TRIED]
-    tries = [simulation.search(grid[place], 12) for place in order.tolist()]
+    tries = [coarse.search(grid[place], 12) for place in order.tolist()]
     best = min(tries, key=lambda each: float(each.cost))
-    return simulation, simulation.search(np.asarray(best.x), 100)
+    return fine, fine.search(np.asarray(best.x), 100)
 
 
 def _linear_start(times: Floats, inputs: Floats, outputs: Floats) -> Floats:
