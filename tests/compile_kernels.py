@@ -8,10 +8,11 @@ import numpy as np
 
 import bench
 from bench.control.adaptation import Adapter
-from bench.hysteresis import Preisach, uniform_levels
+from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
 from bench.identification.least_squares import fit
+from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
 from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
@@ -58,6 +59,14 @@ def twin() -> None:
     Specimen((operator,), Dynamics(0.02, ActuatorDynamics(frequency=1.0), response), 0.0).advance(np.ones(4))
 
 
+def timed() -> None:
+    """Evaluate models with time."""
+    times, inputs = np.arange(4.0), np.array([0.0, 1.0, 0.2, 0.8])
+    plays = PrandtlIshlinskii(np.array([0.0, 0.2]), np.ones(2))
+    Hammerstein(plays, LinearPart(0.5, (0.1, 0.1))).evaluate(times, inputs)
+    BoucWenOscillator(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
+
+
 def laboratories() -> None:
     """Open each: it compiles its loops."""
     for rig in ("vo2", "sma", "mckibben", "coiled-polymer", "hybrid"):
@@ -69,4 +78,5 @@ if __name__ == "__main__":
     operators()
     hybrid_estimate()
     twin()
+    timed()
     laboratories()

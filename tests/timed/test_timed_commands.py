@@ -59,7 +59,7 @@ def test_prediction_of_the_same_file_has_the_errors_of_the_identification(bench,
         assert predicted[key] == pytest.approx(fit[key], rel=1e-9)
         assert compared["model"]["raw"][key] == pytest.approx(fit[key], rel=1e-9)
     assert fit["output_unit"] == "µm"
-    assert fit["rms_percent"] < (0.3 if "lag" in options else 25.0)
+    assert fit["rms_percent"] < (0.6 if "lag" in options and "positive" not in options else 25.0)
 
 
 def test_times_are_read_in_their_unit(bench, tmp_path):
