@@ -16,6 +16,7 @@ from typing import Any
 
 from bench import fixed_rate
 from bench.clock import Pace, PacedClock
+from bench.control.convergence import LimitCycleWatch
 from bench.control.estimators import DriftEstimator, agility_for
 from bench.control.tracking import Command
 from bench.description import RigDescription
@@ -23,6 +24,7 @@ from bench.errors import (
     AbortError,
     BenchError,
     ConfigurationError,
+    ConvergenceError,
     DeviceError,
     InterlockError,
     LimitError,
@@ -211,6 +213,7 @@ class Engine:
         started = self._clock.now()
         latest = started + message.timeout
         command: Command | None = None
+        watch = LimitCycleWatch(low, high)
         seen: list[float] = []
         try:
             while True:
@@ -233,6 +236,14 @@ class Engine:
                 if not low <= command.setpoint <= high:
                     raise LimitError(
                         message.actuator, f"the controller asked for {command.setpoint:g}, beyond {low:g} to {high:g}"
+                    )
+                if watch.note(command.setpoint, trace.reference):
+                    raise ConvergenceError(
+                        f"the controller of {message.response} does not converge: within {now - started:.1f} s it "
+                        f"sent {message.actuator} {watch.swings} times from one end of its range ({low:g} to "
+                        f"{high:g} {limits.unit}) to the other, with a reference that stands at {trace.reference:g} "
+                        f"{self._station.description.unit(message.response)}; tune it for "
+                        "this specimen, or use another controller"
                     )
                 if command.setpoint != self._station.setpoint(message.actuator):
                     self._station.apply({message.actuator: command.setpoint})

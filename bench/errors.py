@@ -107,6 +107,12 @@ class AgreementError(BenchError):
     exit_code = 9
 
 
+class ConvergenceError(BenchError):
+    """A controller drove its actuator to and fro without end; the run was ended in the safe state."""
+
+    exit_code = 10
+
+
 class AbortError(BenchError):
     """The operator, or the operating system, ended the run; the safe state was reached."""
 

@@ -2,6 +2,7 @@ import math
 import sqlite3
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from bench.engine import Engine, check_before_moving
 from bench.errors import (
     AbortError,
     ConfigurationError,
+    ConvergenceError,
     DeviceError,
     InterlockError,
     LimitError,
@@ -618,6 +620,20 @@ class TestControl:
         assert isinstance(outcome.error, SettleTimeoutError)
         assert "within 100 s" in outcome.reason
         assert outcome.laboratory_seconds <= 100.0
+        b.assert_safe()
+
+    def test_one_that_does_not_converge_is_stopped(self, bench):
+        class Cycling(Integrator):
+            def update(self, t, measured_input, output):
+                command = super().update(t, measured_input, output)
+                return replace(command, setpoint=80.0 if measured_input < 47.5 else 15.0, done=False)
+
+        b = bench()
+        outcome = b.run(control(Cycling(50.0, wait=20.0), timeout=10000.0))
+        assert isinstance(outcome.error, ConvergenceError)
+        assert outcome.error.exit_code == 10
+        assert "from one end of its range (15 to 80 °C) to the other" in outcome.reason
+        assert "stands at 50 °C" in outcome.reason
         b.assert_safe()
 
     @pytest.mark.timeout(60)
