@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from bench.errors import ConfigurationError
 from bench.hysteresis import Preisach, uniform_levels
 from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
 
@@ -60,6 +61,19 @@ def test_prediction_of_the_same_file_has_the_errors_of_the_identification(bench,
         assert compared["model"]["raw"][key] == pytest.approx(fit[key], rel=1e-9)
     assert fit["output_unit"] == "µm"
     assert fit["rms_percent"] < (0.6 if "lag" in options and "positive" not in options else 25.0)
+
+
+def test_the_functions_of_the_package_take_times(tmp_path):
+    import bench
+
+    data = hammerstein(tmp_path)
+    options = {"time_column": "time", "levels": 5, "dynamics": "lag"}
+    found = bench.identify(data, "hammerstein", input="drive", output="response", **options)
+    table = np.loadtxt(data, delimiter=",", skiprows=1)
+    predicted = bench.predict(found, table[:, 1], times=1e-3 * table[:, 0])
+    np.testing.assert_allclose(table[:, 2] - predicted, found.identification.residuals, atol=1e-12)
+    with pytest.raises(ConfigurationError, match="give --time COLUMN"):
+        bench.predict(found, table[:, 1])
 
 
 def test_times_are_read_in_their_unit(bench, tmp_path):
