@@ -90,7 +90,8 @@ class OpenLoopFollower(_Follower):
         parameters: FollowingParameters | None = None,
     ) -> None:
         super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
-        self._inverse = inverse
+        self._answers = inverse.stream(self.state)
+        self._memory, self._move = self._answers, self._answers.move
         self._parameters = p = parameters or FollowingParameters.scaled(Spans.of(inverse.operator))
         if self._corrects:
             self._estimator = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
@@ -101,12 +102,15 @@ class OpenLoopFollower(_Follower):
     def _inverted(self, step: float, disturbance: float) -> float:
         target = self._reference - disturbance
         wished = target + self._parameters.lead * step
-        found = self._inverse.invert(self._state, wished)
-        if found.reach is not Reach.MET or len(found.setpoints) > 1:
+        answers = self._answers
+        setpoint = answers.find(wished)
+        if answers.reach is not Reach.MET or not math.isnan(answers.saturating):
             # Not for the sake of an extrapolation: a passage through saturation is far, and may be needless.
             wished = target
-            found = self._inverse.invert(self._state, wished)
-        return self._answer(found, wished)[0]
+            setpoint = answers.find(wished)
+        passing = answers.saturating
+        setpoints = (setpoint,) if math.isnan(passing) else (passing, setpoint)
+        return self._within(setpoints, answers.reach, wished)[0]
 
 
 class ClosedLoopFollower(OpenLoopFollower):

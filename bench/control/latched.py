@@ -265,7 +265,7 @@ class Latched(Correcting):
 
     def _ahead(self, target: float) -> float | None:
         """Return the input of the model's output `target` in the present direction, None beyond the limits."""
-        found = walk(self._operator, self._state, self._direction, target)
+        found = walk(self._operator, self.state, self._direction, target)
         return found if found is not None and self._low < found < self._high else None
 
 

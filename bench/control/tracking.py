@@ -31,6 +31,8 @@ from typing import Any, NamedTuple, Protocol
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
+from bench.hysteresis.inverse_stream import InverseStream
+from bench.hysteresis.stream import Stream
 
 # Part of the output at stake within which a clipped answer still counts as met.
 _CLOSE = 1e-9
@@ -221,11 +223,13 @@ class ControllerBase:
                 raise ValueError(f"limits: expected an overlap with the range {input_range}, got {limits}")
         self._low, self._high = float(low), float(high)
         self._model, self._state = model, state
+        self._memory: Stream[Any] | InverseStream[Any] | None = None
         self._plausible_input = self._plausible_output = (-math.inf, math.inf)
         present = 0.5 * (low + high)
         if model is not None:
-            self._state = model.initial_state() if state is None else state
-            present = model.present_input(self._state)
+            stream = model.stream(state)
+            self._memory, self._move = stream, stream.step
+            present = model.present_input(stream.state)
             self._plausible_input = widened(*model.input_range)
             self._plausible_output = widened(*model.output_range())
         self._setpoint = self._clip(present)
@@ -244,7 +248,7 @@ class ControllerBase:
     @property
     def state(self) -> Any:  # noqa: ANN401
         """Memory of the actuator as the controller knows it; None if it keeps none."""
-        return self._state
+        return self._state if self._memory is None else self._memory.state
 
     @property
     def reach(self) -> Reach:
@@ -264,8 +268,8 @@ class ControllerBase:
         low, high = self._plausible_input
         if not (math.isfinite(measured_input) and low <= measured_input <= high):
             return False
-        if self._model is not None:
-            self._state, _ = self._model.step(self._state, measured_input)
+        if self._memory is not None:
+            self._move(measured_input)
         if not self._started:
             # Without a memory, the first reading says where the actuator is.
             self._setpoint, self._started = self._clip(measured_input), True
@@ -278,14 +282,18 @@ class ControllerBase:
 
     def _modelled(self) -> float:
         """Return the model's output after what the actuator did; nan without a model."""
-        return math.nan if self._model is None else self._model.value(self._state)
+        return math.nan if self._memory is None else self._memory.value
 
     def _answer(self, found: Inversion[Any], target: float) -> tuple[float, ...]:
         """Return the set-points of an inversion within the limits, and note whether they meet the target."""
-        setpoints = tuple(self._clip(value) for value in found.setpoints)
-        self._reach = found.reach
-        if setpoints != found.setpoints and self._model is not None:
-            short = target - float(self._model.evaluate(setpoints, self._state)[-1])
+        return self._within(found.setpoints, found.reach, target)
+
+    def _within(self, found: tuple[float, ...], reach: Reach, target: float) -> tuple[float, ...]:
+        """Return the set-points of an answer within the limits, and note whether they meet the target."""
+        setpoints = tuple(self._clip(value) for value in found)
+        self._reach = reach
+        if setpoints != found and self._model is not None:
+            short = target - float(self._model.evaluate(setpoints, self.state)[-1])
             if abs(short) > _CLOSE * (abs(target) + 1.0):
                 self._reach = Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
         return setpoints
@@ -413,10 +421,10 @@ class OpenLoopInverse(Scripted):
         self._wait = wait
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
-        first, *rest = self._answer(self._inverse.invert(self._state, target), target)
+        first, *rest = self._answer(self._inverse.invert(self.state, target), target)
         yield self._command(first, self._wait)
         if rest:
-            (second,) = self._answer(self._inverse.invert(self._state, target), target)[-1:]
+            (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
             yield self._command(second, self._wait)
         yield from self._hold(self._poll)
 
@@ -481,10 +489,10 @@ class Correcting(Scripted):
     def _towards(self, target: float) -> Move:
         """Go where the model's output is `target`, through saturation if necessary."""
         arrival = self._correction.arrival
-        first, *rest = self._answer(self._inverse.invert(self._state, target), target)
+        first, *rest = self._answer(self._inverse.invert(self.state, target), target)
         reading = yield from self._arrive(first, arrival)
         if rest:
-            (second,) = self._answer(self._inverse.invert(self._state, target), target)[-1:]
+            (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
             reading = yield from self._arrive(second, arrival)
         return reading
 

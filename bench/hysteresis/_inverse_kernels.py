@@ -14,6 +14,11 @@ Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, an
 # Ends of the operating range, outputs at negative and positive saturation (at the ends of the plane), tolerance,
 # whether the nearest answer is wanted, whether the operator is monotone.
 Ends = tuple[float, float, float, float, float, bool, bool]
+Place = tuple[int, float, int, float]  # number of pieces, input within the plane, its cell, and the mass up to it
+
+_ALL = 2**62
+# Segments that are walked before a leap: a smooth reference needs one or two.
+_NEAR = 4
 
 
 @njit(cache=True, forceinline=True)
@@ -55,21 +60,22 @@ def walk(
     tolerance: float,
     direction: int,
     reach: float,
+    most: int,
+    edge: float,
 ) -> tuple[float, float, int]:
     """Walk from input u in one direction until the output meets the target.
 
-    The pieces are only read: what a monotone move wipes out is passed over. Returns the input where the
-    output met the target, or else came closest to it, the error there (output - target), and the number
-    of segments. Gives up beyond the distance `reach`.
+    The pieces are only read: what a monotone move wipes out is passed over. Upwards, `edge` is the left edge of what
+    rises, and the pieces are those to the left of it. Returns the input where the output met the target, or else
+    came closest to it, the error there (output - target), and the number of segments. Gives up beyond the distance
+    `reach`, and after the number of segments `most`.
     """
     left, height, n = corners
     start = u
     best, error = u, value - target
-    edge, border = u, 0.0
-    if direction > 0:
-        n, edge, border = memory.rising_piece(plane[0], left, height, n, u)
+    border = height[n - 1] if n > 0 else np.inf
     steps = 0
-    while abs(error) > tolerance and (u - start) * direction <= reach:
+    while abs(error) > tolerance and steps < most and (u - start) * direction <= reach:
         if direction > 0:
             stop, a, b = memory.segment_up(plane, terms, end, edge, border, u)
             length = stop - u
@@ -103,24 +109,178 @@ def walk(
 
 
 @njit(cache=True, forceinline=True)
+def _walk_on(
+    plane: memory.Plane,
+    terms: memory.Terms,
+    end: float,
+    corners: Corners,
+    u: float,
+    value: float,
+    target: float,
+    tolerance: float,
+    direction: int,
+    reach: float,
+    most: int,
+) -> tuple[float, float, int]:
+    """Walk from a state; see `walk`."""
+    left, height, n = corners
+    edge = u
+    if direction > 0:
+        n, edge, _ = memory.rising_piece(plane[0], left, height, n, u)
+    return walk(plane, terms, end, (left, height, n), u, value, target, tolerance, direction, reach, most, edge)
+
+
+@njit(cache=True, forceinline=True)
+def _risen(
+    plane: memory.Plane,
+    below: Floats,
+    offset: float,
+    terms: memory.Terms,
+    piece: tuple[float, int, float],
+    x: float,
+) -> float:
+    """Return the output after a rise to x within the plane; by left edge of what rises, its column and mass left."""
+    levels, inverse_step, table = plane
+    edge, column, mass = piece
+    k = memory.locate(levels, inverse_step, x)
+    mass = memory.row_mass(levels, table, edge, column, x, k, x, k, mass)
+    return memory.output_at(plane, below, offset, terms, x, x, k, mass)
+
+
+@njit(cache=True, forceinline=True)
+def _fallen(
+    plane: memory.Plane,
+    below: Floats,
+    offset: float,
+    terms: memory.Terms,
+    pieces: memory.Pieces,
+    p: int,
+    x: float,
+) -> float:
+    """Return the output after a fall to x within the plane, into piece p; -1 for below all pieces."""
+    levels, inverse_step, table = plane
+    left, height, mass_left, column, row = pieces
+    k = memory.locate(levels, inverse_step, x)
+    mass = 0.0
+    if p >= 0:
+        mass = memory.row_mass(levels, table, left[p], column[p], x, k, height[p], row[p], mass_left[p])
+    return memory.output_at(plane, below, offset, terms, x, x, k, mass)
+
+
+@njit(cache=True)
+def _leap(
+    plane: memory.Plane,
+    below: Floats,
+    offset: float,
+    terms: memory.Terms,
+    end: float,
+    pieces: memory.Pieces,
+    place: Place,
+    target: float,
+    tolerance: float,
+    direction: int,
+) -> tuple[float, float, int]:
+    """Return what `walk` does, of a monotone operator, from within the plane.
+
+    By bisection over the corners of the memory curve, and then over the levels between two of them: the output at
+    each follows from the mass to the left of one piece.
+    """
+    levels, inverse_step, _ = plane
+    left, height, mass_left, column, _ = pieces
+    n, present, k, mass = place
+    u, edge = present, present
+    # Of the pieces from `last` on, each is wiped out before the target.
+    first, last = 0, n
+    if direction > 0:
+        while first < last:
+            p = (first + last) // 2
+            if _risen(plane, below, offset, terms, (left[p], column[p], mass_left[p]), height[p]) < target:
+                last = p
+            else:
+                first = p + 1
+        rising = present, k, mass
+        if last < n:
+            rising = left[last], column[last], mass_left[last]
+            u, edge = height[last], left[last]
+        top = height[last - 1] if last > 0 else levels[-1]
+        # The last level between that is still too low.
+        i = memory.locate(levels, inverse_step, u)
+        j = levels.size - 1 if top >= levels[-1] else memory.locate(levels, inverse_step, top)
+        while i < j:
+            middle = (i + j + 1) // 2
+            if _risen(plane, below, offset, terms, rising, levels[middle]) < target:
+                i = middle
+            else:
+                j = middle - 1
+        u = max(u, levels[i])
+        value = _risen(plane, below, offset, terms, rising, u)
+    else:
+        while first < last:
+            p = (first + last) // 2
+            if _fallen(plane, below, offset, terms, pieces, p - 1, left[p]) > target:
+                last = p
+            else:
+                first = p + 1
+        if last < n:
+            u = left[last]
+        # The first level between that is still too high.
+        j = memory.locate(levels, inverse_step, u) + 1
+        i = memory.locate(levels, inverse_step, left[last - 1]) + 1 if last > 0 else 0
+        while i < j:
+            middle = (i + j) // 2
+            if _fallen(plane, below, offset, terms, pieces, last - 1, levels[middle]) > target:
+                j = middle
+            else:
+                i = middle + 1
+        if levels[i] < u:
+            u = levels[i]
+        value = _fallen(plane, below, offset, terms, pieces, last - 1, u)
+    corners = left, height, last
+    return walk(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _ALL, edge)
+
+
+@njit(cache=True, forceinline=True)
 def invert(
-    plane: memory.Plane, terms: memory.Terms, ends: Ends, corners: Corners, u: float, value: float, target: float
+    plane: memory.Plane,
+    below: Floats,
+    offset: float,
+    terms: memory.Terms,
+    ends: Ends,
+    pieces: memory.Pieces,
+    place: Place,
+    u: float,
+    value: float,
+    target: float,
 ) -> tuple[int, float, float, float, int]:
     """Return number of set-points, the first, the last, the error at the last, and the segments walked.
 
     Of a `monotone` operator the output rises with the input for every memory: one walk finds all solutions.
     """
     low, high, minus, plus, tolerance, nearest, monotone = ends
-    # A monotone operator finds the target this way; the other way then is walked no further than that.
+    corners = pieces[0], pieces[1], place[0]
+    if monotone:
+        direction = 1 if target > value else -1
+        end = high if direction > 0 else low
+        x, e, steps = _walk_on(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _NEAR)
+        if abs(e) > tolerance and steps == _NEAR:
+            if plane[0][0] <= u <= plane[0][-1]:
+                x, e, further = _leap(plane, below, offset, terms, end, pieces, place, target, tolerance, direction)
+                steps += further
+            else:
+                x, e, steps = _walk_on(
+                    plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _ALL
+                )
+        return 1, x, x, e, steps
+    # The other way is walked no further than the way on which the target is met first.
     first = 1 if target > value else -1
     ahead, behind = (high, low) if first > 0 else (low, high)
-    x1, e1, steps = walk(plane, terms, ahead, corners, u, value, target, tolerance, first, np.inf)
+    x1, e1, steps = _walk_on(plane, terms, ahead, corners, u, value, target, tolerance, first, np.inf, _ALL)
     met = abs(e1) <= tolerance
     preferred = not nearest and ((first > 0 and target <= plus) or (first < 0 and target >= minus))
-    if monotone or (met and (x1 == u or preferred)):
+    if met and (x1 == u or preferred):
         return 1, x1, x1, e1, steps
     reach = abs(x1 - u) if met else np.inf
-    x2, e2, k2 = walk(plane, terms, behind, corners, u, value, target, tolerance, -first, reach)
+    x2, e2, k2 = _walk_on(plane, terms, behind, corners, u, value, target, tolerance, -first, reach, _ALL)
     steps += k2
     met2 = abs(e2) <= tolerance
     if met2 and not (met and abs(x2 - u) >= abs(x1 - u)):
@@ -138,7 +298,7 @@ def invert(
     for direction in (-1, 1):
         turn, end, output = (levels[-1], low, plus) if direction < 0 else (levels[0], high, minus)
         branch = full, crest, (1 if direction < 0 else 0)
-        x, e, k = walk(plane, terms, end, branch, turn, output, target, tolerance, direction, np.inf)
+        x, e, k = _walk_on(plane, terms, end, branch, turn, output, target, tolerance, direction, np.inf, _ALL)
         steps += k
         distance = abs(turn - u) + abs(x - turn)
         better = abs(e) < abs(error) - tolerance
@@ -160,10 +320,12 @@ def invert_state(
     target: float,
 ) -> tuple[int, float, float, float, int]:
     """Return what `invert` does, from a state whose output is not known yet."""
-    here = np.empty(1)
-    here[0] = u
-    value = memory.evaluate(here, plane, below, offset, terms, start)[0]
-    return invert(plane, terms, ends, (start[0], start[1], start[0].size), u, value, target)
+    left, height, present = start
+    n = left.size
+    pieces = left, height, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    k, mass = memory.load(plane, pieces, n, present)
+    value = memory.output_at(plane, below, offset, terms, u, present, k, mass)
+    return invert(plane, below, offset, terms, ends, pieces, (n, present, k, mass), u, value, target)
 
 
 @njit(cache=True)
@@ -196,7 +358,10 @@ def follow(
     k, mass = memory.load(plane, pieces, n, present)
     for t in range(targets.size):
         value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)
-        count, s1, s2, error, steps[t] = invert(plane, terms, ends, (pieces[0], pieces[1], n), raw, value, targets[t])
+        place = n, present, k, mass
+        count, s1, s2, error, steps[t] = invert(
+            plane, below, offset, terms, ends, pieces, place, raw, value, targets[t]
+        )
         found[0, t] = s1 if count == 2 else np.nan
         found[1, t] = s2
         found[2, t] = error

@@ -123,7 +123,7 @@ def borrow(plane: Plane, terms: Terms, stack: Floats, indices: Integers) -> tupl
 
 
 @njit(cache=True, forceinline=True)
-def _row_mass(
+def row_mass(
     levels: Floats,
     table: Floats,
     left: float,
@@ -155,7 +155,7 @@ def load(plane: Plane, pieces: Pieces, n: int, u: float) -> tuple[int, float]:
         mass_left[p] = mass
         right = left[p + 1] if p + 1 < n else u
         k = locate(levels, inverse_step, right)
-        mass = _row_mass(levels, table, left[p], column[p], right, k, height[p], row[p], mass)
+        mass = row_mass(levels, table, left[p], column[p], right, k, height[p], row[p], mass)
     return locate(levels, inverse_step, u), mass
 
 
@@ -187,7 +187,7 @@ def move(
     mass = 0.0
     if n > 0:
         p = n - 1
-        mass = _row_mass(levels, table, left[p], column[p], u, k, height[p], row[p], mass_left[p])
+        mass = row_mass(levels, table, left[p], column[p], u, k, height[p], row[p], mass_left[p])
     return n, k, mass
 
 

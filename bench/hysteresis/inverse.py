@@ -22,9 +22,11 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.memory import MemoryCurve
 
 if TYPE_CHECKING:
+    from bench.hysteresis.inverse_stream import InverseStream, PlayInverseStream, PreisachInverseStream
     from bench.hysteresis.operator import Operator
     from bench.hysteresis.prandtl_ishlinskii import PlayState, PrandtlIshlinskii
     from bench.hysteresis.preisach import Preisach
+    from bench.hysteresis.stream import Stream
 
 S = TypeVar("S")
 Policy: TypeAlias = Literal["nearest", "paper"]
@@ -146,6 +148,12 @@ class Inverse(ABC, Generic[S]):
         For operators that rise with their input, or fall. The bounds replace the operating range; a saturated
         operator may disregard them.
         """
+
+    def stream(self, state: S | None = None) -> InverseStream[S]:
+        """Return the inverse with a memory of its own, for one target at a time, from a state (default: initial)."""
+        from bench.hysteresis.inverse_stream import InverseStream
+
+        return InverseStream(self, self.operator.initial_state() if state is None else state)
 
     def follow(self, targets: ArrayLike, state: S | None = None) -> Following[S]:
         """Return the set-points that bring the output to one target after another.
@@ -318,6 +326,16 @@ class PlayInverse(NumericalInverse["PlayState"]):
         reach = Reach.MET if found.met[0] else Reach.TOO_HIGH if target > found.outputs[0] else Reach.TOO_LOW
         return Inversion((float(found.setpoints[0]),), (float(found.outputs[0]),), reach, 1, found.state)
 
+    def stream(self, state: PlayState | None = None) -> PlayInverseStream:
+        """Return the inverse with a memory of its own, compiled; see `Inverse.stream`."""
+        from bench.hysteresis.inverse_stream import PlayInverseStream
+
+        return PlayInverseStream(self, self.operator.initial_state() if state is None else state)
+
+    def _backward(self, state: PlayState) -> Stream[PlayState]:
+        """Return the stream of the inverse operator that belongs to a state of the operator."""
+        return self._inverse.stream(self.operator.inverse_state(state))
+
     def follow(self, targets: ArrayLike, state: PlayState | None = None) -> Following[PlayState]:
         """Return the set-points that bring the output to one target after another; see `Inverse.follow`."""
         wanted = _checks.samples("targets", targets)
@@ -417,6 +435,12 @@ class PreisachInverse(Inverse[MemoryCurve]):
         turned = plus if first > last else minus
         final = state.step(first).step(last)
         return Inversion((first, last), (turned, target + error), reach, iterations, final)
+
+    def stream(self, state: MemoryCurve | None = None) -> PreisachInverseStream:
+        """Return the inverse with a memory of its own, compiled; see `Inverse.stream`."""
+        from bench.hysteresis.inverse_stream import PreisachInverseStream
+
+        return PreisachInverseStream(self, self.operator.initial_state() if state is None else state)
 
     def follow(self, targets: ArrayLike, state: MemoryCurve | None = None) -> Following[MemoryCurve]:
         """Return the set-points that bring the output to one target after another; see `Inverse.follow`."""

@@ -101,7 +101,7 @@ class MemoryCurve:
         else:
             while end >= 2 and extrema[end - 2] >= value:
                 end -= 2
-        return _trusted(extrema[:end] if end < len(extrema) else extrema, float(value), self.saturation)
+        return trusted_curve(extrema[:end] if end < len(extrema) else extrema, float(value), self.saturation)
 
     def advance(self, inputs: ArrayLike) -> MemoryCurve:
         """Return the memory after a whole sequence of inputs, shape (N,).
@@ -116,7 +116,7 @@ class MemoryCurve:
         count = _kernels.advance_extrema(
             sequence, stack, len(self.extrema), self.input, -1 if self.saturation < 0 else 1
         )
-        return _trusted(tuple(stack[:count].tolist()), float(sequence[-1]), self.saturation)
+        return trusted_curve(tuple(stack[:count].tolist()), float(sequence[-1]), self.saturation)
 
     def staircase(self, low: float, high: float) -> tuple[list[float], list[float], float]:
         """Return the curve clipped to the plane [low, high]: left edges, heights, clipped input.
@@ -209,7 +209,7 @@ class MemoryCurve:
         )
 
 
-def _trusted(extrema: tuple[float, ...], present: float, saturation: Literal[-1, 1]) -> MemoryCurve:
+def trusted_curve(extrema: tuple[float, ...], present: float, saturation: Literal[-1, 1]) -> MemoryCurve:
     """Return a curve known to be nested: stepping must not pay for the check."""
     curve = object.__new__(MemoryCurve)
     object.__setattr__(curve, "extrema", extrema)

@@ -14,6 +14,7 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.coverage import Coverage
 from bench.hysteresis.documents import Model
 from bench.hysteresis.regressor import Regressor
+from bench.hysteresis.stream import Stream
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse import Inverse, Policy
@@ -108,6 +109,10 @@ class Operator(Model, ABC, Generic[S]):
     def value(self, state: S) -> float:
         """Return the output of a state."""
         return self.step(state, self.present_input(state))[1]
+
+    def stream(self, state: S | None = None) -> Stream[S]:
+        """Return the operator with a memory of its own, for one sample at a time, from a state (default: initial)."""
+        return Stream(self, self.initial_state() if state is None else state)
 
     def saturated_state(self, direction: int, value: float | None = None) -> S:
         """Return the state at an input that was reached from far beyond the other end of the operating range.

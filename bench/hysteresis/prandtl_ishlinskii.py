@@ -16,6 +16,7 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.documents import Parts
 from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
+from bench.hysteresis.stream import PlayStream
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse import Inverse, Policy
@@ -73,24 +74,31 @@ class DeadZones:
 
     def __call__(self, values: ArrayLike) -> Floats:
         """Return the map of each value, shape (N,)."""
-        return np.asarray(self.columns(values) @ self.slopes)
+        x = np.asarray(values, dtype=np.float64)
+        thresholds, intercepts, slopes = self.lines
+        interval = np.searchsorted(thresholds, x)
+        return np.asarray(intercepts[interval] + slopes[interval] * x)
 
     def value(self, x: float) -> float:
         """Return the map of one value."""
-        thresholds, intercepts, slopes = self._lines
+        thresholds, intercepts, slopes = self._lists
         k = 0
         while k < len(thresholds) and x > thresholds[k]:
             k += 1
         return intercepts[k] + slopes[k] * x
 
     @cached_property
-    def _lines(self) -> tuple[list[float], list[float], list[float]]:
-        """Thresholds, and intercept and slope of the line on each interval."""
+    def _lists(self) -> tuple[list[float], list[float], list[float]]:
+        thresholds, intercepts, slopes = self.lines
+        return thresholds.tolist(), intercepts.tolist(), slopes.tolist()
+
+    @cached_property
+    def lines(self) -> tuple[Floats, Floats, Floats]:
+        """Thresholds, and intercept and slope of the line on each interval, shapes (m,), (m + 1,), (m + 1,)."""
         # A point inside or at the border of each interval, the nearest to zero: there rounding is least.
         low = np.append(-np.inf, self.thresholds)
         points = np.clip(0.0, low, np.append(self.thresholds, np.inf))
-        intercepts = self(points) - self.slopes * points
-        return self.thresholds.tolist(), intercepts.tolist(), self.slopes.tolist()
+        return self.thresholds, self.columns(points) @ self.slopes - self.slopes * points, self.slopes
 
     def inverse(self) -> DeadZones:
         """Return the inverse map.
@@ -297,6 +305,13 @@ class PrandtlIshlinskii(Operator[PlayState]):
         Raises ValueError if the state has the wrong length or is not finite.
         """
         return self._output(tuple(self._checked(state).tolist()))
+
+    def stream(self, state: PlayState | None = None) -> PlayStream:
+        """Return the operator with a memory of its own, compiled; see `Operator.stream`.
+
+        Raises ValueError if the state has the wrong length or is not finite.
+        """
+        return PlayStream(self, tuple(self._checked(state).tolist()))
 
     def _output(self, state: PlayState) -> float:
         total = 0.0

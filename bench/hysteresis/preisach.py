@@ -20,6 +20,7 @@ from bench.hysteresis.memory import MemoryCurve
 from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
 from bench.hysteresis.reversible import Reversible, reversible_from_json
+from bench.hysteresis.stream import PreisachStream
 
 if TYPE_CHECKING:
     from bench.hysteresis.inverse import Inverse, Policy
@@ -255,6 +256,10 @@ class Preisach(Operator[MemoryCurve]):
         """
         after = state.step(value)
         return after, self.value(after)
+
+    def stream(self, state: MemoryCurve | None = None) -> PreisachStream:
+        """Return the operator with a memory of its own, compiled; see `Operator.stream`."""
+        return PreisachStream(self, self.initial_state() if state is None else state)
 
     def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
         """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.coupled_stream import CoupledStream, TwoStageStream
 from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Model, Parts
 from bench.hysteresis.operator import Operator, operator_from_json
@@ -75,6 +76,10 @@ class Coupled(Model, ABC, Generic[S]):
 
         Raises ValueError if a number is not finite.
         """
+
+    def stream(self, state: S | None = None) -> CoupledStream[S]:
+        """Return the model with a memory of its own, for one sample at a time, from a state (default: initial)."""
+        return CoupledStream(self, self.initial_state() if state is None else state)
 
     @abstractmethod
     def evaluate(self, voltages: ArrayLike, forces: ArrayLike, state: S | None = None) -> Floats:
@@ -202,6 +207,10 @@ class TwoStage(Coupled[TwoStageState]):
             second, _ = self.second.step(second, tension - state.blocked)
         first, blocked = self._driven(state, voltage)
         return self._arrived(voltage, tension, first, second, blocked, tension - blocked)
+
+    def stream(self, state: TwoStageState | None = None) -> TwoStageStream:
+        """Return the model with a memory of its own, of streams of its stages; see `Coupled.stream`."""
+        return TwoStageStream(self, self.initial_state() if state is None else state)
 
     def move(self, state: TwoStageState, voltage: float, argument: float) -> tuple[TwoStageState, float]:
         """Return state and length after the voltage and the argument u moved to new values; the force follows.

@@ -65,11 +65,12 @@ def fit_shape(
     smoothing : float
         Weight of the roughness penalty.
     """
-    from scipy.optimize import least_squares
-
     shape = template.shape_parameters()
     if not shape.names:
         return template
+    # Here, as few operators have a shape and it takes a third of a second to load.
+    from scipy.optimize import least_squares
+
     low, high = np.array(shape.low), np.array(shape.high)
     roots = np.sqrt(weights[skip:])
 
