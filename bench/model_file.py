@@ -15,6 +15,8 @@ A file of version 2 is an object with these keys:
     a model without memory or of several inputs.
 `initial`
     Its state before the first row of these data, written alike; may be missing: the model's own initial state.
+`band`
+    The prediction band (`Band` of `bench.identification.bands`); left out if there is none.
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped` (first rows that did not count), `initial` (what was asked for),
     `input_sha256` (of the input column), `orientation`, errors and certificate of the fit, `bench` (version).
@@ -31,10 +33,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.errors import DataError
 from bench.hysteresis import Operator, TimedModel, model_class, model_from_json
+
+if TYPE_CHECKING:
+    from bench.identification.bands import Band
 
 FORMAT = "bench-model"
 VERSION = 2
@@ -60,6 +65,8 @@ class ModelFile:
     initial : object
         State of an operator before the first row of these data, from which it predicts unless told otherwise; None
         for the operator's own initial state, and for other models.
+    band : Band or None
+        How far predictions may be from what is measured, if that was calibrated.
     """
 
     name: str
@@ -67,6 +74,7 @@ class ModelFile:
     memory: Any = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     initial: Any = None
+    band: Band | None = None
 
     @property
     def operator(self) -> Operator[Any]:
@@ -97,6 +105,7 @@ class ModelFile:
             "model": self.model.to_json(),
             "memory": None if self.memory is None else self.response.state_to_json(self.memory),
             "initial": None if self.initial is None else self.response.state_to_json(self.initial),
+            **({} if self.band is None else {"band": self.band.to_json()}),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -119,7 +128,7 @@ class ModelFile:
                 f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
             )
         again = parse_model(json.loads(text), str(path)).to_json()
-        if any(again[key] != content[key] for key in ("kind", "model", "memory", "initial")):
+        if any(again.get(key) != content.get(key) for key in ("kind", "model", "memory", "initial", "band")):
             raise DataError(
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
@@ -204,8 +213,16 @@ def parse_model(content: object, source: str) -> ModelFile:
             initial = None if initial is None else model.state_from_json(initial)
         elif memory is not None or initial is not None:
             raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory or initial!r}")
-        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial)
+        band = None if content.get("band") is None else _read_band(content["band"])
+        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial, band)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None
+
+
+def _read_band(content: Mapping[str, Any]) -> Band:
+    # Here, as a model without a band needs no identification.
+    from bench.identification.bands import Band
+
+    return Band.from_json(content)

@@ -13,18 +13,13 @@ from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
-from protocols.preparation import (
-    DRIVE_AND_RESPONSE,
-    LOAD,
-    ControlledParameters,
-    load_checked_model,
-    reset_unknown_memory,
-)
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
+from protocols.session import SessionParameters, begin_session, session_kinds
 
 _DRIVE = unit_of("drive")
 
 
-class Parameters(ControlledParameters):
+class Parameters(SessionParameters):
     """What can be set."""
 
     controller: str = parameter(
@@ -47,10 +42,13 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
 
     The reference is a sine of varying amplitude between `low` and `high`, or that of a file, between whose rows
     it is straight. One that asks the drive for more than `fastest` is refused before anything moves. The memory
-    of the specimen is unknown at the start, so it is reset first, by negative saturation at `reset`.
+    of the specimen is unknown at the start, so it is reset first, by negative saturation at `reset`. With
+    `recalibrate` known set-points are visited before, by which the model is corrected for what moved since it was
+    identified.
     """
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
+    kinds = session_kinds(parameters)
     times, values = _reference(parameters)
     if not model.operator.memoryless:
         slope = fastest_slope(model.operator.inverse(), times, values)
@@ -62,7 +60,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     limits = (parameters.reset, parameters.hottest)
     duration = float(times[-1])
 
-    reading = yield from reset_unknown_memory(parameters, slots)
+    reading, model = yield from begin_session(parameters, slots, model, kinds)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     options = parameters.tuning.get(parameters.controller, {})
     setup = ControllerSetup(model=model, limits=limits, state=state, options=options)

@@ -13,16 +13,11 @@ from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import (
-    DRIVE_AND_RESPONSE,
-    LOAD,
-    ControlledParameters,
-    load_checked_model,
-    reset_unknown_memory,
-)
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
+from protocols.session import SessionParameters, begin_session, session_kinds
 
 
-class Parameters(ControlledParameters):
+class Parameters(SessionParameters):
     """What can be set."""
 
     controller: str = parameter(
@@ -49,10 +44,12 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     The targets are a decaying oscillation and a random part between `low` and `high`, or those of a file. When
     the controller has done what it can, `readings` readings are taken, 0.1 s apart: their mean less the target
     is the error that counts. The memory of the specimen is unknown at the start, so it is reset first, by
-    negative saturation at `reset`.
+    negative saturation at `reset`. With `recalibrate` known set-points are visited before, by which the model is
+    corrected for what moved since it was identified.
     """
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
+    kinds = session_kinds(parameters)
     if parameters.targets:
         targets = read_columns(Path(parameters.targets), ["target"], at_least=1).values["target"]
     else:
@@ -60,7 +57,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         targets = tracking_targets(rng, parameters.low, parameters.high, parameters.count)
     limits = (parameters.reset, parameters.hottest)
 
-    reading = yield from reset_unknown_memory(parameters, slots)
+    reading, model = yield from begin_session(parameters, slots, model, kinds)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     options = parameters.tuning.get(parameters.controller, {})
     setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state, options=options)

@@ -11,6 +11,7 @@ from bench.control.adaptation import Adapter
 from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
+from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
 from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
 from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
@@ -34,6 +35,10 @@ def operators() -> None:
     regressor.dense()
     regressor.product(np.ones(regressor.shape[1]))
     fit(regressor, outputs)
+    # Equal columns: one of them depends on the other.
+    fit(operator.regressor([0.0, 1.0, 0.0, 1.0]), [0.0, 1.0, 0.0, 1.0])
+    slow = np.interp(np.linspace(0.0, 3.0, 400), np.arange(4.0), [0.0, 1.0, 0.1, 0.8])
+    collapse(operator.regressor(slow), operator.evaluate(slow), np.ones(400))
     inverse = PreisachInverse(operator)
     inverse.invert(state, 0.1)
     inverse.follow([0.1, 0.2])

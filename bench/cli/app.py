@@ -20,6 +20,7 @@ from bench import registry
 from bench.cli import (
     campaign,
     comparisons,
+    designs,
     journals,
     models,
     records,
@@ -62,6 +63,7 @@ for group in (
     run_list.app,
     upkeep.app,
     models.app,
+    designs.app,
     comparisons.app,
     records.app,
     journals.app,

@@ -9,9 +9,12 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
 from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
-from bench.cli.data_options import layout_options, print_assumptions, show_patience
+from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.models import InitialOption
+from bench.cli.patience import show_patience
+from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -53,6 +56,13 @@ def compare_(
         ),
     ] = None,
     initial: InitialOption = None,
+    bands: BandsOption = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
+    ] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -61,24 +71,30 @@ def compare_(
     """Compare models on measurements that they may not have seen; or, without `--data`, two runs with each other.
 
     `bench compare A.json B.json --data FILE` shows each model's errors raw, and after re-zeroing the sensor: between
-    sessions a sensor's offset moves, and what a model is worth then is another number.
+    sessions a sensor's offset moves, and what a model is worth then is another number. `--out` writes input, measured
+    output and by model `predicted` and `residual` (measured minus predicted) of every row.
 
     `bench compare RUN RUN` shows what differs in parameters, rig, instruments, versions and files, how both ended,
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        models_only = (input_column, output_column, time_column, skip, initial, figures)
-        if any(models_only) or reading != ReadingOptions():
+        of_models = (
+            input_column, output_column, time_column, skip, initial, bands, recalibrate, recalibrate_rows, out,
+            figures,
+        )  # fmt: skip
+        if any(of_models) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --time, --skip, --initial, --figures and how a file is read are for models, "
-                "with --data FILE"
+                "--input, --output, --time, --skip, --initial, --bands, --recalibrate, --out, --figures and how a "
+                "file is read are for models, with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
         return
     from bench.results.models import compare_models
+    from bench.results.recalibrations import Session
 
-    check_outputs(figures=figures, json_file=json_file)
+    session = Session.parse(recalibrate, recalibrate_rows)
+    check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
     with show_patience(f"reading {data.name}"):
         result = compare_models(
             compared,
@@ -88,6 +104,7 @@ def compare_(
             skip=skip,
             initial=initial,
             time_column=time_column,
+            session=session,
             reading=reading,
         )
     print_assumptions(data, result.assumptions)
@@ -104,10 +121,14 @@ def compare_(
             f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
         )  # fmt: skip
     console.print(table)
+    for name, examined in result.examined.items():
+        print_examined(examined, name, bands=bands)
+    if out is not None:
+        write_rows(out, result.predictions)
     if figures is not None:
         from bench.results.report import draw_comparison
 
-        console.print(f"figure: {draw_comparison(result, figures)}", highlight=False, markup=False, soft_wrap=True)
+        print_figures(draw_comparison(result, figures))
     write_json(json_file, result.to_json())
 
 

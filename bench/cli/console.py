@@ -103,12 +103,24 @@ def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
     return numbers
 
 
-def check_outputs(*, out: Path | None = None, figures: Path | None = None, json_file: Path | None = None) -> None:
+def check_outputs(
+    *,
+    out: Path | None = None,
+    card: Path | None = None,
+    figures: Path | None = None,
+    json_file: Path | None = None,
+    read: Sequence[Path] = (),
+) -> None:
     """Check, before any computing, that the files and figures that are asked for can be written.
 
-    Raises ConfigurationError for `--json`, DataError for the others: names the option and the folder.
+    A file needs its folder to be there; the folder of the figures is made. No output may be one of the files that
+    are `read`, or another output. Raises ConfigurationError for `--json`, DataError for the others: names the option
+    and the folder.
     """
-    for path, option, kind in ((out, "--out", DataError), (json_file, "--json", ConfigurationError)):
+    taken = {path.resolve(): "it is read" for path in read}
+    for path, option, kind in (
+        (out, "--out", DataError), (card, "--card", DataError), (json_file, "--json", ConfigurationError)
+    ):  # fmt: skip
         if path is None:
             continue
         if path.is_dir():
@@ -117,6 +129,9 @@ def check_outputs(*, out: Path | None = None, figures: Path | None = None, json_
             raise kind(f"{option} {path} cannot be written: there is no folder {path.parent}")
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise kind(f"{option} {path} cannot be written: permission denied")
+        if (why := taken.get(path.resolve())) is not None:
+            raise kind(f"{option} {path} cannot be written: {why}; choose another name")
+        taken[path.resolve()] = f"it is that of {option}"
     if figures is not None:
         from bench.results.figures import check_matplotlib
 

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from threading import Event, Thread
 from typing import Annotated, Any
 
 import typer
 
 from bench.cli.console import console
 from bench.results.reading.options import ReadingOptions
-
-PATIENCE = 2.0
-"""Seconds of work after which a terminal shows that it goes on."""
 
 
 def _layout(
@@ -57,24 +52,3 @@ def print_assumptions(file: Path, assumptions: str) -> None:
     """Print in a line what was assumed about the layout of a file; nothing for a run."""
     if assumptions:
         console.print(f"read {file.name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)
-
-
-@contextmanager
-def show_patience(text: str) -> Iterator[None]:
-    """Show on a terminal that work goes on, once it has taken more than two seconds."""
-    if not console.is_terminal:
-        yield
-        return
-    done = Event()
-
-    def tell() -> None:
-        if not done.wait(PATIENCE):
-            console.print(f"{text} …", highlight=False, markup=False, soft_wrap=True)
-
-    thread = Thread(target=tell, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()

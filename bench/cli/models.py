@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
+from bench.cli.band_options import BandOption, RecalibrateOption, RecalibrateRowsOption, print_band, print_examined
 from bench.cli.console import (
     JsonOption,
     check_outputs,
@@ -19,8 +19,9 @@ from bench.cli.console import (
     warn,
     write_json,
 )
-from bench.cli.data_options import layout_options, print_assumptions, show_patience
-from bench.errors import ConfigurationError
+from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.patience import show_patience
+from bench.cli.written import print_figures, write_fit, write_rows
 from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
@@ -59,6 +60,7 @@ TimeColumn = Annotated[
 @layout_options
 @show_compilation()
 def identify_(
+    context: typer.Context,
     file: DataArgument,
     input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
     output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
@@ -81,7 +83,18 @@ def identify_(
         str | None,
         typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
     ] = None,
-    smoothing: Annotated[float, typer.Option(min=0.0, help="Weight of the roughness penalty on the density.")] = 0.0,
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None,
     skip: Annotated[
         int,
         typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
@@ -121,7 +134,12 @@ def identify_(
     cross_validate: Annotated[
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False,
+    band: BandOption = False,
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
+    card: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
+    ] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
@@ -134,9 +152,10 @@ def identify_(
     printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings are
     taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`.
     """
+    from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file
 
-    check_outputs(out=out, figures=figures, json_file=json_file)
+    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=(file,))
     with show_patience(f"reading and fitting {file.name}"):
         found = identify_file(
             file,
@@ -148,6 +167,7 @@ def identify_(
             plane=plane,
             reversible=reversible,
             smoothing=smoothing,
+            ridge=ridge,
             skip=skip,
             initial=initial,
             time_column=time_column,
@@ -156,6 +176,7 @@ def identify_(
             orientation=orientation,
             **parse_numbers("--option", options or ()),
             cross_validated=cross_validate,
+            band=band,
             reading=reading,
         )
     print_assumptions(file, found.assumptions)
@@ -165,14 +186,12 @@ def identify_(
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {file.name}", certificate_lines(found))
+    if (banded := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+        print_band(banded)
     if out is not None:
         found.file.save(out)
         console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
-    if figures is not None:
-        from bench.results.report import draw_identification
-
-        for path in draw_identification(found, figures):
-            console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
+    write_fit(found, file, context=context, out=out, card=card, figures=figures)
     write_json(json_file, found.summary())
 
 
@@ -199,23 +218,32 @@ def predict_(
     ] = None,
     initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
     *,
     reading: ReadingOptions,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
-    Writes a CSV file with the input column and `predicted`. The model starts from the memory that it had at the start
-    of its own data, so that on these data the errors are those of `bench identify`.
+    Writes a CSV file with the input column and `predicted`; with `--output` also `measured` and `residual` (measured
+    minus predicted), and if the model has a prediction band `predicted lower` and `predicted upper`. Heads have the
+    units. The model starts from the memory that it had at the start of its own data, so that on these data the errors
+    are those of `bench identify`. With `--recalibrate` the predictions are those for the session of the measured
+    output.
     """
-    from bench.identification import measure_errors
     from bench.model_file import load_model
-    from bench.results.data import read_columns, write_csv
+    from bench.results.data import read_columns
+    from bench.results.examined import examine
     from bench.results.models import check_unit, errors_json, outside_of_range
+    from bench.results.predictions import Predictions, Quantity
+    from bench.results.recalibrations import Session
     from bench.results.starting_state import starting_state
-    from bench.results.times import bind_times, read_times
+    from bench.results.times import read_times
 
-    check_outputs(out=out, json_file=json_file)
+    check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
+    session = Session.parse(recalibrate, recalibrate_rows)
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         names = [name for name in (input_column, output_column, time_column) if name]
@@ -223,84 +251,42 @@ def predict_(
     print_assumptions(file, columns.assumptions)
     inputs = columns.values[input_column]
     check_unit(model.response.input_unit, columns.units[input_column], input_column)
+    if output_column:
+        check_unit(model.response.output_unit, columns.units[output_column], output_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
+    measured = columns.values[output_column] if output_column else None
     times = read_times(columns, time_column) if time_column else None
-    predicted = bind_times(model, times).evaluate(inputs, start.state)
-    write_csv(out, [input_column, "predicted"], [inputs, predicted])
-    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out)}
+    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip, times=times)
+    unit = model.response.output_unit
+    rows = Predictions(
+        Quantity(input_column, columns.units[input_column] or model.response.input_unit, inputs),
+        unit,
+        {model.name: found.predicted},
+        Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
+        skip=found.first,
+        further=found.band.columns(found.predicted) if found.band else (),
+    )
+    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
+    print_examined(found)
     if output_column:
-        errors = measure_errors(columns.values[output_column][start.skip :], predicted[start.skip :])
-        result |= {**errors_json(errors), "skipped": start.skip}
-        unit = model.response.output_unit
+        errors = rows.errors()[model.name]
+        result |= {**errors_json(errors), "skipped": found.first}
         print_rows(
             f"{model.name} on {file.name}",
             (
-                ("samples", f"{inputs.size - start.skip} (skipped: {start.skip})"),
+                ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
                 ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
                 ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
             ),
         )
-    console.print(f"{inputs.size} rows: {out}", highlight=False, markup=False, soft_wrap=True)
+    write_rows(out, rows)
+    if figures is not None:
+        from bench.results.report import draw_predicted
+
+        print_figures(draw_predicted(rows, figures))
     write_json(json_file, result)
-
-
-@app.command()
-@show_compilation()
-def design(
-    rig: Annotated[
-        str | None, typer.Option("--rig", metavar="RIG", help="Rig whose range, plane and dwell are taken.")
-    ] = None,
-    plane: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Ends of the Preisach plane; the rig's if not given."),
-    ] = None,
-    operating: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            "--range", metavar="LOW HIGH", help="Operating range, which contains the plane; the rig's if not given."
-        ),
-    ] = None,
-    levels: Annotated[int, typer.Option(min=2, max=60, help="Discretization levels of the plane.")] = 20,
-    dwell: Annotated[
-        float | None, typer.Option(min=0.0, help="Settling time at each set-point, s; the rig's if not given.")
-    ] = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
-
-    The damped oscillation of the papers, first-order reversal curves, the shortest sequence that covers every cell,
-    and the same twice as fine with two set-points a level, which averages noise. Each is a protocol:
-    damped-oscillation, first-order-reversals, covering.
-    """
-    from bench.results.models import assess_designs
-
-    if rig is not None:
-        from bench.rig_file import load_rig
-
-        file = load_rig(rig)
-        drive = file.roles.get("drive")
-        operating = operating or (drive.range if drive else None)
-        dwell = dwell if dwell is not None else (drive.dwell if drive else None)
-        plane = plane or (file.dashboard.plane if file.dashboard else None)
-    if plane is None or operating is None or dwell is None:
-        raise ConfigurationError("give --rig RIG, or --plane, --range and --dwell")
-    result = assess_designs(plane, operating, levels, dwell)
-    table = Table("sequence", title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
-    for column in ("set-points", "cells covered", "rank / coefficients", "condition", "laboratory time"):
-        table.add_column(column, justify="right")
-    for name, entry in result.items():
-        table.add_row(
-            name,
-            str(entry.setpoints),
-            f"{entry.covered} of {entry.cells}",
-            f"{entry.rank} of {entry.coefficients}",
-            f"{entry.condition:.2g}",
-            f"{entry.time / 3600:.2f} h",
-        )
-    console.print(table)
-    write_json(json_file, {name: vars(entry) for name, entry in result.items()})
 
 
 class PolicyOption(Enum):
@@ -334,14 +320,17 @@ def invert(
 
     Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
-    `too low`; what cannot be met is clamped to the nearest reachable value).
+    `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
+    its ends for the set-point, by the local slope, and for the output there.
     """
     from bench.model_file import load_model
+    from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
     from bench.results.models import check_unit, invert_targets
+    from bench.results.starting_state import starting_state
     from bench.units import header_with_unit
 
-    check_outputs(out=out, json_file=json_file)
+    check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [column], options=reading)
@@ -351,6 +340,9 @@ def invert(
     found = invert_targets(
         model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
     )
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    banded = invert_band(model, found.setpoints, found.passing, start.state)
+    bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
     header = [
         header_with_unit(name, unit)
         for name, unit in (
@@ -358,7 +350,10 @@ def invert(
         )
     ]  # fmt: skip
     passing = ["" if value != value else value for value in found.passing.tolist()]
-    write_csv(out, header, [found.targets, passing, found.setpoints, found.predicted, list(found.flags)])
+    written: list[Any] = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
+    write_csv(out, [*header, *(head for head, _ in bands)], [*written, *(values for _, values in bands)])
+    if banded is not None:
+        print_band(banded.outputs)
     counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
     two = sum(value != "" for value in passing)
     console.print(
@@ -379,5 +374,6 @@ def invert(
             "through_saturation": two,
             "largest_residual": float(max(met)) if met else None,
             "out": str(out),
+            **({"band": banded.outputs.to_json()} if banded else {}),
         },
     )

@@ -26,7 +26,8 @@ class ModelSpec:
         Takes the inputs and the keyword options of `identify`; returns the operator before the fit. None for a
         model that `identify` cannot make of one input and one output.
     constrained : bool
-        Whether the signs of `Operator.nonnegative` are imposed; otherwise the least-norm solution is taken.
+        Whether the signs of `Operator.nonnegative` are imposed; otherwise the coefficients are free, with penalties
+        on the cells of a density (`identify` says which).
     refine : callable or None
         Takes template, inputs, outputs, weights, skip and initial state; returns a template that follows from the
         data, before the fit.

@@ -167,6 +167,13 @@ class Operator(Model, ABC, Generic[S]):
         """Return the shapes from which their fit starts; the best end is taken. By default the present one."""
         return [self.shape_parameters().values]
 
+    def shifted(self, offset: float) -> Self:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite, or such an operator cannot be shifted.
+        """
+        raise ValueError(f"the input of a {self.kind} operator cannot be shifted (by {offset:g} {self.input_unit})")
+
     def output_range(self) -> tuple[float, float]:
         """Return least and greatest output over all reachable states; by default those of the major loop."""
         low, high = self.input_range
@@ -197,6 +204,11 @@ class Operator(Model, ABC, Generic[S]):
         from bench.hysteresis.inverse import NumericalInverse
 
         return NumericalInverse(self, policy)
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """The units of the inputs that the model is for, the usual one first; none if it is for any."""
+        return ()
 
     @property
     def plane(self) -> tuple[float, float] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -92,6 +92,14 @@ class Polynomial(Operator[None]):
         sequence = _checks.samples("inputs", inputs)
         columns = np.asarray(chebyshev.chebvander(self._mapped(sequence), self.degree)[:, 1:], dtype=np.float64)
         return Regressor.of_columns(columns)
+
+    def shifted(self, offset: float) -> Polynomial:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite.
+        """
+        low, high = self.input_range
+        return replace(self, input_range=(low - offset, high - offset))
 
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest value on the range: ends and stationary points."""

@@ -330,6 +330,14 @@ class PrandtlIshlinskii(Operator[PlayState]):
             columns = self.after.columns(columns @ self.weights)
         return Regressor.of_columns(columns)
 
+    def shifted(self, offset: float) -> PrandtlIshlinskii:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite.
+        """
+        low, high = self.input_range
+        return replace(self, origin=self.origin - offset, input_range=(low - offset, high - offset))
+
     def output_range(self) -> tuple[float, float]:
         """Return the least and greatest output that the operating range can produce from the relaxed state.
 

@@ -398,6 +398,11 @@ class Preisach(Operator[MemoryCurve]):
         return FallingInverse(self, policy) if falling else PreisachInverse(self, policy)
 
     @property
+    def input_units(self) -> tuple[str, ...]:
+        """Those of the reversible part."""
+        return () if self.reversible is None else self.reversible.input_units
+
+    @property
     def plane(self) -> tuple[float, float]:
         """The range of the levels."""
         return float(self.levels[0]), float(self.levels[-1])
@@ -407,6 +412,21 @@ class Preisach(Operator[MemoryCurve]):
         signs = np.ones(self.coefficients.size, dtype=bool)
         signs[self.density.size :] = self.reversible is not None and self.reversible.nonnegative
         return signs
+
+    def shifted(self, offset: float) -> Preisach:
+        """Return the operator whose output at an input u is that of this one at u + offset, input units.
+
+        Raises ValueError if the offset is not finite.
+        """
+        moved = _checks.number("offset", offset)
+        low, high = self.input_range
+        return replace(
+            self,
+            levels=self.levels - moved,
+            reversible=None if self.reversible is None else self.reversible.shifted(moved),
+            # Not less than the plane by rounding.
+            input_range=(min(low - moved, self.levels[0] - moved), max(high - moved, self.levels[-1] - moved)),
+        )
 
     def densities(self) -> tuple[Density, ...]:
         """Return the density on its plane."""

@@ -49,6 +49,16 @@ class Regressor:
             extra=np.ascontiguousarray(columns),
         )
 
+    def merged(self, parents: NDArray[np.int64], count: int) -> Regressor:
+        """Return the regressor whose sparse column p, of `count`, is the sum of the columns c with parents[c] = p."""
+        return Regressor(
+            base=np.bincount(parents, self.base, minlength=count).astype(np.float64),
+            starts=self.starts,
+            cells=parents[self.cells].astype(np.int32),
+            changes=self.changes,
+            extra=self.extra,
+        )
+
     @property
     def shape(self) -> tuple[int, int]:
         """Samples and coefficients."""

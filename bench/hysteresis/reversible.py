@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -27,8 +27,17 @@ class Reversible(Protocol):
         """Whether physics demands coefficients >= 0."""
         ...
 
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """The units of the inputs that the term is for, the usual one first; none if it is for any."""
+        ...
+
     def with_coefficients(self, coefficients: Sequence[float]) -> Reversible:
         """Return the same term with other coefficients."""
+        ...
+
+    def shifted(self, offset: float) -> Reversible:
+        """Return the term whose value at an input u is that of this one at u + offset."""
         ...
 
     def columns(self, inputs: ArrayLike) -> Floats:
@@ -64,6 +73,7 @@ class QuadraticTerm(Document):
     """
 
     kind: ClassVar[str] = "quadratic"
+    input_units: ClassVar[tuple[str, ...]] = ()
     linear: float = 0.0
     quadratic: float | None = None
     origin: float = 0.0
@@ -90,6 +100,10 @@ class QuadraticTerm(Document):
         if values.size != self.coefficients.size:
             raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
         return QuadraticTerm(float(values[0]), None if self.quadratic is None else float(values[1]), self.origin)
+
+    def shifted(self, offset: float) -> QuadraticTerm:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        return replace(self, origin=self.origin - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return (u - origin) and, if present, (u - origin)², shape (N, 1) or (N, 2)."""
@@ -127,6 +141,7 @@ class PolynomialTerm(Document):
     """
 
     kind: ClassVar[str] = "polynomial"
+    input_units: ClassVar[tuple[str, ...]] = ()
     series: tuple[float, ...]
     low: float
     high: float
@@ -154,6 +169,10 @@ class PolynomialTerm(Document):
         if values.size != len(self.series):
             raise ValueError(f"coefficients: expected {len(self.series)} values, got {values.size}")
         return PolynomialTerm(tuple(values.tolist()), self.low, self.high, self.knots)
+
+    def shifted(self, offset: float) -> PolynomialTerm:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        return replace(self, low=self.low - offset, high=self.high - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return the interpolants of T_1, T_2, ... at the inputs, shape (N, n)."""
@@ -211,6 +230,7 @@ class ThermalExpansion(Document):
     """
 
     kind: ClassVar[str] = "thermal-expansion"
+    input_units: ClassVar[tuple[str, ...]] = ("°C", "degC", "C", "℃", "K")
     k0: float
     k1: float
     low: float
@@ -239,6 +259,11 @@ class ThermalExpansion(Document):
         if values.size != 2:
             raise ValueError(f"coefficients: expected k0 and k1, got {values.size} values")
         return ThermalExpansion(float(values[0]), float(values[1]), self.low, self.high, self.reference)
+
+    def shifted(self, offset: float) -> ThermalExpansion:
+        """Return the term whose value at an input u is that of this one at u + offset."""
+        low, high, reference = (value - offset for value in (self.low, self.high, self.reference))
+        return replace(self, low=low, high=high, reference=reference)
 
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return -(1 - θ)(T - T0) and -θ (T - T0), shape (N, 2)."""

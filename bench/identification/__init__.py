@@ -15,6 +15,7 @@ from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, fit, fit_minimum_norm
 from bench.identification.measures import Comparison, Errors, compare, measure_errors
 from bench.identification.orientation import Orientation
+from bench.identification.regularization import Regularization, choose_regularization
 from bench.identification.two_stage import (
     CoupledIdentification,
     Series,
@@ -38,10 +39,12 @@ __all__ = [
     "Initial",
     "Orientation",
     "Regressor",
+    "Regularization",
     "Series",
     "Trial",
     "assess",
     "check_data",
+    "choose_regularization",
     "compare",
     "covering_sequence",
     "cross_validate",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Rows = NDArray[np.int32]
+Flags = NDArray[np.bool_]
 Columns = tuple[Integers, Rows, Floats]
 
 # Columns that `gram_rows` forms at a time.
@@ -47,18 +48,34 @@ def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, F
 
 
 @njit(cache=True)
-def gradient(sparse: Columns, tail: Floats) -> Floats:
-    """Return the product of each column with the vector whose reverse running sum is `tail`.
+def products(
+    sparse: Columns, norms: Floats, extra: Floats, weights: Floats, total: float, residual: Floats
+) -> Floats:
+    """Return the product of each scaled, centred column with the weighted residual.
 
-    That vector must add up to zero: the columns' starting values then drop out.
+    `total` is the sum of the weights. The residual is taken about its mean, so that the columns' starting values drop
+    out.
     """
     starts, rows, values = sparse
-    result = np.empty(starts.size - 1)
-    for c in range(result.size):
-        total = 0.0
+    samples, sparse_columns = weights.size, starts.size - 1
+    mean = 0.0
+    for n in range(samples):
+        mean += weights[n] * residual[n]
+    mean /= total
+    result = np.zeros(norms.size)
+    tail = np.empty(samples)
+    running = 0.0
+    for n in range(samples - 1, -1, -1):
+        value = weights[n] * (residual[n] - mean)
+        running += value
+        tail[n] = running
+        for q in range(extra.shape[1]):
+            result[sparse_columns + q] += value * extra[n, q]
+    for c in range(sparse_columns):
+        product = 0.0
         for e in range(starts[c], starts[c + 1]):
-            total += values[e] * tail[rows[e]]
-        result[c] = total
+            product += values[e] * tail[rows[e]]
+        result[c] = product / norms[c]
     return result
 
 
@@ -146,6 +163,50 @@ def gram_rows(
                     products[k] /= norms[a]
             for k in range(count):
                 result[first + k, m] = products[k]
+
+
+@njit(cache=True)
+def factor_independent(lower: Floats, least: Floats, good: Flags) -> None:
+    """Replace the lower half of a symmetric matrix by its Cholesky factor, without columns of too small a pivot.
+
+    `good` becomes False for columns whose pivot is below `least`; rows and columns of these mean nothing.
+    """
+    for k in range(least.size):
+        row = lower[k]
+        for j in range(k):
+            if good[j]:
+                other = lower[j]
+                total = row[j]
+                for i in range(j):
+                    if good[i]:
+                        total -= row[i] * other[i]
+                row[j] = total / other[j]
+        pivot = row[k]
+        for i in range(k):
+            if good[i]:
+                pivot -= row[i] * row[i]
+        # Not a number counts as too small.
+        good[k] = pivot > 0.0 and pivot >= least[k]
+        row[k] = np.sqrt(pivot) if good[k] else 0.0
+
+
+@njit(cache=True)
+def crests(g: Floats, threshold: float, neighbours: Integers) -> Flags:
+    """Return which values are at least a threshold and not below any of their neighbours.
+
+    Row c of `neighbours`, shape (columns, 4), lists those of column c; -1 stands for none.
+    """
+    result = np.zeros(g.size, np.bool_)
+    for c in range(g.size):
+        value = g[c]
+        if value >= threshold:
+            found = True
+            for k in range(4):
+                n = neighbours[c, k]
+                if n >= 0 and g[n] > value:
+                    found = False
+            result[c] = found
+    return result
 
 
 @njit(cache=True)

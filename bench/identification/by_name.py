@@ -21,7 +21,9 @@ from bench.identification.orientation import (
     has_orientation,
     possible_signs,
 )
+from bench.identification.regularization import Regularization, choose_regularization
 from bench.identification.shape import fit_operator, fit_shape
+from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
@@ -51,7 +53,9 @@ class Identification(Generic[M]):
     initial_state : object
         State before the first sample from which the model was fitted.
     warnings : tuple of str
-        What is odd about the data or not covered by them.
+        What is odd about the data or not covered by them, and why the fit should not be trusted; see `judge_fit`.
+    regularization : Regularization or None
+        The penalties of a density of either sign; None for other models, and without penalties.
     orientation : {"rising", "falling"} or None
         Whether the output rises or falls with the input; None for a model whose coefficients have either sign.
     """
@@ -65,6 +69,7 @@ class Identification(Generic[M]):
     skip: int
     initial_state: Any = None
     warnings: tuple[str, ...] = ()
+    regularization: Regularization | None = None
     orientation: Orientation | None = None
 
 
@@ -75,7 +80,8 @@ def identify(
     *,
     weights: ArrayLike | None = None,
     skip: int = 0,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     initial: Initial | None = None,
     orientation: Orientation = "auto",
     **options: Any,  # noqa: ANN401 - each template names and types its own
@@ -86,7 +92,7 @@ def identify(
     `preisach`                  nonnegative density; options `levels` (20), `plane` (range of the inputs),
                                 `reversible` ("none", "linear", "quadratic", or "polynomial" of `degree` 5 unless
                                 given), `input_range`
-    `preisach-signed`           density of either sign, least norm; options as `preisach`
+    `preisach-signed`           density of either sign; options as `preisach`
     `preisach-nonmonotonic`     nonnegative density and thermal term (Zhang et al. 2013, eq. 12); options
                                 `levels` (20), `plane` (range of the inputs), `reference` (low end of the
                                 operating range: where the term is zero), `input_range`
@@ -121,8 +127,10 @@ def identify(
         Weight per sample, >= 0; default 1.
     skip : int
         Number of first samples left out of the cost because their memory is unknown.
-    smoothing : float
-        Weight of the roughness penalty of `fit`; only for nonnegative densities.
+    smoothing, ridge : float or None
+        Weights of the penalties of `fit` on the roughness and the size of a density. None is 0 for a nonnegative
+        density; for one of either sign it is chosen by cross-validation, see `choose_regularization`. With both
+        at 0 a density of either sign is the one of the least norm, which may be far off for other inputs.
     initial : {"negative", "positive", "skip", "estimate"} or None
         The memory before the first sample, as above.
     orientation : {"auto", "rising", "falling"}
@@ -136,21 +144,28 @@ def identify(
         If the name is unknown, an option does not belong to it, or the data are unfit; see `fit`.
     """
     problem = set_up_problem(
-        model_name, inputs, outputs, weights, skip, smoothing, initial, options, orientation=orientation
+        model_name, inputs, outputs, weights, skip, smoothing or 0.0, initial, options, orientation=orientation
     )
-    solution = problem.fit(smoothing)
+    penalties = problem.regularization(smoothing, ridge)
+    solution = problem.fit(penalties.smoothing, ridge=penalties.ridge)
+    is_penalised = not problem.spec.constrained and (penalties.smoothing > 0.0 or penalties.ridge > 0.0)
+    if initial == "skip":
+        check_interpolation(problem, solution)
     model = problem.template.with_coefficients(solution.coefficients, solution.bias)
     predicted = model.evaluate(problem.inputs, problem.state)
+    residuals = problem.outputs - predicted
+    doubts = judge_fit(problem, solution, residuals, initial=initial, smoothing=penalties.smoothing)
     return Identification(
         model_name=model_name,
         model=model,
-        residuals=problem.outputs - predicted,
+        residuals=residuals,
         errors=measure_errors(problem.outputs[problem.skip :], predicted[problem.skip :]),
         uncertainties=solution.uncertainties,
         certificate=solution.certificate,
         skip=problem.skip,
         initial_state=problem.state,
-        warnings=problem.warnings(),
+        warnings=(*problem.warnings(), *doubts),
+        regularization=penalties if is_penalised else None,
         orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
     )
 
@@ -174,13 +189,24 @@ class FitProblem:
     orientation: Sign = 1
     known: tuple[float, Fit] | None = None
 
-    def fit(self, smoothing: float, weights: Floats | None = None) -> Fit:
+    def regularization(self, smoothing: float | None, ridge: float | None) -> Regularization:
+        """Return the weights of the penalties, those chosen by cross-validation that are None.
+
+        They are 0 for models with signs, and for those without cells.
+        """
+        if not self.spec.constrained and not self.regressor.base.size and (smoothing or ridge):
+            raise ValueError(f"{'smoothing' if smoothing else 'ridge'}: this model has no cells of a density")
+        if self.spec.constrained or not self.regressor.base.size or (smoothing is not None and ridge is not None):
+            return Regularization(smoothing or 0.0, ridge or 0.0)
+        return choose_regularization(self.regressor, self.outputs, self.weights, self.skip, smoothing, ridge)
+
+    def fit(self, smoothing: float, weights: Floats | None = None, ridge: float = 0.0) -> Fit:
         """Return the coefficients for the problem's weights or others."""
-        if self.known is not None and weights is None and self.known[0] == smoothing:
+        if self.known is not None and weights is None and self.known[0] == smoothing and not ridge:
             return self.known[1]
         w = self.weights if weights is None else weights
         y = self.outputs if self.orientation > 0 else -self.outputs
-        found = fit_operator(self.spec.constrained, self.template, self.regressor, y, w, self.skip, smoothing)
+        found = fit_operator(self.spec.constrained, self.template, self.regressor, y, w, self.skip, smoothing, ridge)
         if self.orientation > 0:
             return found
         return replace(found, coefficients=0.0 - found.coefficients, bias=0.0 - found.bias)
@@ -223,15 +249,15 @@ def set_up_problem(
         raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
     if initial == "estimate" and spec.estimate_state is None:
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
-    if smoothing and not spec.constrained:
-        raise ValueError(f"smoothing: {model_name} takes the least-norm solution instead")
     try:
         template: Operator[Any] = spec.template(sequence, **options)
     except TypeError as error:
         raise ValueError(f"options of {model_name}: {error}") from None
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
+        check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)
     counted = counted_weights(sequence.size, w, skip)
+    check_record(sequence, measured, skip)
     signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
     problems = {
         sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial) for sign in signs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,18 +38,13 @@ class CellLayout:
     layers: Indices
 
     @classmethod
+    @lru_cache(maxsize=8)
     def of(cls, columns: int) -> CellLayout:
         """Return the layout of one column a cell, if their number is that of a plane."""
         order = (round((8 * columns + 1) ** 0.5) - 1) // 2
         if order * (order + 1) // 2 != columns:
             order = 0
         return cls(order, np.arange(columns), np.zeros(columns, dtype=np.int64))
-
-    def grid(self, values: Floats) -> Floats:
-        """Return values by layer, row and column of the plane, with a border; -inf where there is no column."""
-        result = np.full((2, self.order + 2, self.order + 2), -np.inf)
-        result[self._places()] = values
-        return result
 
     def _places(self) -> tuple[Indices, Indices, Indices]:
         rows, columns = np.tril_indices(self.order)
@@ -61,13 +57,18 @@ class CellLayout:
         """
         if not self.order:
             return np.flatnonzero(g >= threshold)
-        plane = self.grid(g)
-        inner = plane[:, 1:-1, 1:-1]
-        crest = inner >= threshold
-        for neighbour in (plane[:, :-2, 1:-1], plane[:, 2:, 1:-1], plane[:, 1:-1, :-2], plane[:, 1:-1, 2:]):
-            crest &= inner >= neighbour
+        from bench.identification import _kernels
+
+        return np.flatnonzero(_kernels.crests(g, threshold, self.neighbours))
+
+    @cached_property
+    def neighbours(self) -> Indices:
+        """The columns of the four neighbouring cells of each column, of its layer, shape (columns, 4); -1: none."""
+        index = np.full((2, self.order + 2, self.order + 2), -1, dtype=np.int64)
         layer, row, column = self._places()
-        return np.flatnonzero(crest[layer, row - 1, column - 1])
+        index[layer, row, column] = np.arange(self.cells.size)
+        beside = ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))
+        return np.stack([index[layer, i, j] for i, j in beside], axis=1)
 
     def coarser(self) -> tuple[CellLayout, Indices]:
         """Return the layout of the plane with cells merged two by two, and the column of each column there."""
@@ -75,16 +76,6 @@ class CellLayout:
         i, j = rows[self.cells] // 2, columns[self.cells] // 2
         merged, parents = np.unique(np.column_stack([self.layers, i * (i + 1) // 2 + j]), axis=0, return_inverse=True)
         return CellLayout((self.order + 1) // 2, merged[:, 1], merged[:, 0]), parents.ravel()
-
-    def around(self, chosen: Flags) -> Flags:
-        """Return the chosen columns and their neighbours in the plane."""
-        plane = self.grid(chosen.astype(np.float64)) > 0.0
-        wide = plane.copy()
-        wide[:, 1:] |= plane[:, :-1]
-        wide[:, :-1] |= plane[:, 1:]
-        wide[:, :, 1:] |= plane[:, :, :-1]
-        wide[:, :, :-1] |= plane[:, :, 1:]
-        return wide[self._places()]
 
     def roughness(self) -> csr_array:
         """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""

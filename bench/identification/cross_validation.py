@@ -76,6 +76,7 @@ def cross_validate(
     blocks: int = 20,
     weights: ArrayLike | None = None,
     skip: int = 0,
+    ridge: float = 0.0,
     initial: Initial | None = None,
     orientation: Orientation = "auto",
     **options: Any,  # noqa: ANN401 - those of `identify`
@@ -93,6 +94,8 @@ def cross_validate(
         As `identify`.
     smoothing : sequence of float
         Weights to try.
+    ridge : float
+        Weight of the penalty on the size of the density.
     levels : sequence of int or None
         Numbers of intervals to try, for Preisach models; None keeps that of the model or the options.
     folds : int
@@ -129,7 +132,7 @@ def cross_validate(
             squares, training = np.zeros(problem.outputs.size), []
             for k in range(folds):
                 left_out = fold == k
-                found = problem.fit(weight, np.where(left_out, 0.0, problem.weights))
+                found = problem.fit(weight, np.where(left_out, 0.0, problem.weights), ridge)
                 error = problem.outputs - found.bias - problem.regressor.product(found.coefficients)
                 squares[left_out] = error[left_out] ** 2
                 training.append(_rms(error**2, np.where(left_out | (fold < 0), 0.0, problem.weights)))

@@ -11,6 +11,13 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import MemoryCurve, Preisach, _checks
 from bench.hysteresis._checks import Floats
+from bench.identification.information import (
+    Scaling,
+    covariance,
+    log_determinant,
+    mean_variance,
+    random_reversals,
+)
 
 
 def first_order_reversals(
@@ -160,6 +167,13 @@ class Assessment:
         Condition number of the regressor within that rank, columns centred and scaled to unit norm.
     time : float
         Laboratory time, s.
+    log_determinant : float
+        log10 det of the information that one hour of the sequence, repeated, gives, in decades per coefficient;
+        see `information`. It comes closest to the order of the errors that are left on other inputs, which the
+        condition number does not say; infinite if the sequence takes no time.
+    prediction_variance : float
+        Mean variance of predictions over random reversals after the sequence, in variances of the noise, if the signs
+        of the coefficients are not constrained.
     """
 
     setpoints: int
@@ -169,12 +183,15 @@ class Assessment:
     rank: int
     condition: float
     time: float
+    log_determinant: float
+    prediction_variance: float
 
     def summary(self) -> str:
         """Return the assessment in one line."""
         return (
             f"{self.setpoints} set-points, {self.time / 3600.0:.2f} h: {self.covered} of {self.cells} cells covered, "
-            f"rank {self.rank} of {self.coefficients}, condition {self.condition:.3g}"
+            f"rank {self.rank} of {self.coefficients}, condition {self.condition:.3g}, "
+            f"log10 det per hour {self.log_determinant:.3f}, prediction variance {self.prediction_variance:.3g}"
         )
 
 
@@ -211,6 +228,10 @@ def assess(
     time = laboratory_time(inputs, dwell, rate)
     coverage = operator.coverage(inputs, state)
     matrix = operator.regressor(inputs, state).dense()
+    scaling = Scaling.of(operator)
+    rows = scaling.scaled(matrix)
+    reversals = random_reversals(operator.input_range, float(np.diff(operator.levels).mean()))
+    judged = scaling.rows(operator, reversals, operator.saturated_state(-1))
     matrix -= matrix.mean(axis=0)
     norms = np.linalg.norm(matrix, axis=0)
     # A column never swept has but rounding left.
@@ -227,4 +248,6 @@ def assess(
         rank=rank,
         condition=float(singular[0] / singular[rank - 1]) if rank else math.inf,
         time=time,
+        log_determinant=log_determinant(rows, 3600.0 / time if time else math.inf),
+        prediction_variance=mean_variance(judged, covariance(rows)),
     )

@@ -12,15 +12,16 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
+from bench.identification.cholesky_factor import DEPENDENT, MANY, CholeskyFactor
+from bench.identification.collapse import LONG, collapse
+from bench.identification.fit_progress import say_fit_progress
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# A column whose squared distance from the span of the passive ones falls below this part of its squared norm
-# counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
-# all that is left to enter, the threshold is lowered step by step.
-_DEPENDENT = (1e-12, 1e-13, 1e-14)
 _TOLERANCE = 1e-12
+# A gradient that is zero but for rounding.
+_LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.5
 # A smooth fit of at least this order starts from one of half the order.
@@ -40,7 +41,11 @@ class Certificate:
         the weighted norm of the centred outputs. 0 is exact optimality; for a minimum-norm solution |g| over
         all columns.
     passive, active : int
-        Number of coefficients that are free to move, and held at zero.
+        Number of coefficients that are free to move, and held at zero. For a minimum-norm solution the dimensions
+        of the range and of the null space.
+    exchangeable : int
+        Number of coefficients held at zero that could replace others without changing the fit: the minimiser is
+        not unique if there are any. For a minimum-norm solution the swept columns above the rank.
     condition : float
         Estimated condition number of the scaled passive columns (for a minimum-norm fit: of the range kept).
     swept : ndarray of bool, shape (K + q,)
@@ -56,6 +61,7 @@ class Certificate:
     kkt_residual: float
     passive: int
     active: int
+    exchangeable: int
     condition: float
     swept: Flags
     iterations: int
@@ -102,6 +108,7 @@ def fit(
     weights: ArrayLike | None = None,
     skip: int = 0,
     smoothing: float = 0.0,
+    ridge: float = 0.0,
 ) -> Fit:
     """Return bias b and coefficients x that minimise the sum of weight * (outputs - b - R x)².
 
@@ -125,13 +132,16 @@ def fit(
         Weight >= 0 of a roughness penalty: smoothing * (mean squared column norm) * |discrete Laplacian of
         the density on the plane|². Cells never swept then follow their neighbours. The fit starts from that on
         a plane of half the order. See `cross_validate` for a choice of the weight.
+    ridge : float
+        Weight >= 0 of a penalty on the size: ridge * (mean squared column norm) * |density|².
 
     Raises
     ------
     ValueError
         If a length does not fit, a number is not finite, a weight is negative, or nothing is left to fit.
     """
-    return fit_cells(CellLayout.of(regressor.base.size), regressor, outputs, nonnegative, weights, skip, smoothing)
+    layout = CellLayout.of(regressor.base.size)
+    return fit_cells(layout, regressor, outputs, nonnegative, weights, skip, smoothing, ridge)
 
 
 def fit_cells(
@@ -142,14 +152,17 @@ def fit_cells(
     weights: ArrayLike | None = None,
     skip: int = 0,
     smoothing: float = 0.0,
+    ridge: float = 0.0,
 ) -> Fit:
     """Return what `fit` does, for sparse columns whose places in the plane `layout` gives."""
     y, w = _cost(regressor, outputs, weights, skip)
     constrained = np.broadcast_to(np.asarray(nonnegative, dtype=bool), (regressor.shape[1],))
-    if not smoothing >= 0.0 or not np.isfinite(smoothing):
-        raise ValueError(f"smoothing: expected a finite number >= 0, got {smoothing}")
-    with _one_thread():
-        return _ActiveSet(regressor, y, w, constrained, layout, smoothing).solve()
+    check_penalties(smoothing, ridge)
+    samples, left = int(np.count_nonzero(w)), 0.0
+    if y.size >= LONG and (short := collapse(regressor, y, w)) is not None:
+        regressor, y, w, left = short.regressor, short.outputs, short.weights, short.left
+    with one_thread():
+        return _ActiveSet(regressor, y, w, constrained, layout, smoothing, ridge).solve(samples, left)
 
 
 def fit_minimum_norm(
@@ -180,7 +193,7 @@ def fit_minimum_norm(
     matrix *= root[:, None]
     mean = float(w @ y / w.sum())
     target = root * (y[skip:] - mean)
-    with _one_thread():
+    with one_thread():
         # Sums of row differences carry rounding errors that must not count as rank.
         cutoff = max(matrix.shape) * np.finfo(np.float64).eps
         x, _, rank, singular = lstsq(matrix, target, cond=cutoff, lapack_driver="gelsd")
@@ -193,12 +206,33 @@ def fit_minimum_norm(
         kkt_residual=kkt,
         passive=int(rank),
         active=x.size - int(rank),
+        exchangeable=max(int(swept.sum()) - int(rank), 0),
         condition=float(singular[0] / singular[rank - 1]) if rank else 1.0,
         swept=swept,
         iterations=1,
         converged=kkt <= 1e-8,
     )
     return Fit(x, mean - float(means @ x), np.full(x.size, np.nan), certificate)
+
+
+def check_penalties(smoothing: float, ridge: float) -> None:
+    """Raise ValueError if a weight is negative or not finite."""
+    for name, weight in (("smoothing", smoothing), ("ridge", ridge)):
+        if not weight >= 0.0 or not np.isfinite(weight):
+            raise ValueError(f"{name}: expected a finite number >= 0, got {weight}")
+
+
+def changing(norms: Floats, scale: Floats, total: float) -> Flags:
+    """Return which columns vary by more than the rounding of their means, given norms about these and a total weight.
+
+    `scale` is the size of each column.
+    """
+    return np.asarray(norms > 1e-11 * np.sqrt(total) * np.maximum(scale, 1e-300))
+
+
+def mean_square(norms: Floats) -> float:
+    """Return the unit of the penalties' weights, from the norms of the cells' columns that change."""
+    return float((norms**2).mean()) if norms.size else 1.0
 
 
 def _cost(regressor: Regressor, outputs: ArrayLike, weights: ArrayLike | None, skip: int) -> tuple[Floats, Floats]:
@@ -232,95 +266,11 @@ def _blas() -> Any:  # noqa: ANN401
     return ThreadpoolController()
 
 
-def _one_thread() -> Any:  # noqa: ANN401
+def one_thread() -> Any:  # noqa: ANN401
     """Return a context in which BLAS uses one thread: its short vectors gain nothing from more."""
     import scipy.linalg  # noqa: F401 - the controller sees only libraries already loaded
 
     return _blas().limit(limits=1, user_api="blas")
-
-
-class _Factor:
-    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go."""
-
-    def __init__(self) -> None:
-        self.upper = np.zeros((0, 0))
-        self.size = 0
-        self.threshold = _DEPENDENT[0]
-
-    @property
-    def compact(self) -> Floats:
-        """Lower factor, a copy as LAPACK wants it."""
-        return np.array(self.upper[: self.size, : self.size], order="C").T
-
-    def append(self, cross: Floats, square: Floats) -> int | None:
-        """Add columns, given their products with the present ones, shape (size, p), and with each other.
-
-        Return None, or the first that depends on those before it; the ones before that are added then.
-        """
-        from scipy.linalg.blas import dsyrk, dtrsm
-        from scipy.linalg.lapack import dpotrf
-
-        old, more = cross.shape
-        if not more:
-            return None
-        if old + more > self.upper.shape[0]:
-            room = max(64, old + more + (old + more) // 2)
-            grown = np.zeros((room, room))
-            grown[:old, :old] = self.upper[:old, :old]
-            self.upper = grown
-        rest = np.asfortranarray(square)
-        if old:
-            side = dtrsm(1.0, self.compact, np.asfortranarray(cross), lower=1, overwrite_b=1)
-            rest = dsyrk(-1.0, side, beta=1.0, c=rest, trans=1, lower=1)
-            self.upper[:old, old : old + more] = side
-        block, info = dpotrf(rest, lower=1, clean=1)
-        good = more if info == 0 else info - 1
-        # Pivots below the threshold would pass as rounding noise.
-        small = np.flatnonzero(np.diag(block)[:good] ** 2 < self.threshold * np.diag(square)[:good])
-        if small.size:
-            good = int(small[0])
-        self.upper[old : old + good, old : old + good] = block[:good, :good].T
-        self.size = old + good
-        return None if good == more else good
-
-    def truncate(self, size: int) -> None:
-        """Keep the first columns only."""
-        self.size = size
-
-    def delete(self, places: Indices) -> None:
-        """Remove the columns at increasing places."""
-        from bench.identification import _kernels
-
-        for place in places[::-1]:
-            _kernels.delete_column(self.upper, self.size, place)
-            self.size -= 1
-
-    def solve(self, right: Floats) -> Floats:
-        from bench.identification import _kernels
-
-        return np.asarray(_kernels.solve_factored(self.upper, self.size, right))
-
-    def lengths(self, first: Floats, second: Floats) -> tuple[float, float]:
-        """Return the norms of two steps in the outputs they cause."""
-        from bench.identification import _kernels
-
-        one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
-        return float(one), float(two)
-
-    def inverse(self) -> Floats:
-        """Return the lower half of the inverse of the Gram block."""
-        from scipy.linalg.lapack import dpotri
-
-        lower, _ = dpotri(self.compact, lower=1)
-        return np.asarray(lower)
-
-    def condition(self, gram: Floats) -> float:
-        from scipy.linalg.lapack import dpocon
-
-        if not gram.size:
-            return 1.0
-        reciprocal, _ = dpocon(self.compact, np.abs(gram).sum(axis=0).max(), uplo="L")
-        return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))
 
 
 class _ActiveSet:
@@ -349,6 +299,7 @@ class _ActiveSet:
         constrained: Flags,
         layout: CellLayout,
         smoothing: float,
+        ridge: float,
         *,
         absolute: bool = False,
     ) -> None:
@@ -367,21 +318,23 @@ class _ActiveSet:
         centred = extra - self.means[self.cells :]
         norms = np.concatenate([cell_norms, np.sqrt(w @ centred**2)])
         scale = np.concatenate([np.abs(regressor.base), np.abs(extra).max(axis=0, initial=0.0)])
-        # Below this a column's variation is the rounding of its mean.
-        self.swept: Flags = norms > 1e-11 * np.sqrt(self.total) * np.maximum(scale, 1e-300)
-        swept_norms = cell_norms[self.swept[: self.cells]]
-        mean_square = float((swept_norms**2).mean()) if swept_norms.size else 1.0
-        self.norms = np.where(self.swept, norms, np.sqrt(mean_square))
+        self.swept: Flags = changing(norms, scale, self.total)
+        unit = mean_square(cell_norms[self.swept[: self.cells]])
+        self.norms = np.where(self.swept, norms, np.sqrt(unit))
         self.extra = np.ascontiguousarray(centred / self.norms[self.cells :])
         self.usable = self.swept.copy()
         self.penalty: csr_array | None = None
-        self.smoothing = smoothing if absolute else smoothing * mean_square
-        if self.smoothing > 0.0 and layout.order:
-            from scipy.sparse import csr_array, diags_array
+        self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
+        rough = self.smoothing > 0.0 and layout.order > 0
+        if rough or (self.ridge > 0.0 and self.cells):
+            from scipy.sparse import csr_array, diags_array, eye_array
 
             scaling = diags_array(1.0 / self.norms[: self.cells])
-            self.penalty = csr_array(self.smoothing * (scaling @ layout.roughness() @ scaling))
-            self.usable[: self.cells] |= layout.layers == 0
+            matrix = self.ridge * eye_array(self.cells)
+            if rough:
+                matrix = matrix + self.smoothing * layout.roughness()
+                self.usable[: self.cells] |= layout.layers == 0
+            self.penalty = csr_array(scaling @ matrix @ scaling)
 
         self.mean = float(w @ y / self.total)
         self.centred = y - self.mean
@@ -391,7 +344,7 @@ class _ActiveSet:
         self.known = np.empty(0, dtype=np.int64)
         self.place = np.full(count, -1, dtype=np.int64)
         self.gram = np.zeros((0, 0))
-        self.factor = _Factor()
+        self.factor = CholeskyFactor()
         self.passive = np.empty(0, dtype=np.int64)
         self.iterations = 0
 
@@ -399,12 +352,7 @@ class _ActiveSet:
         """Return the scaled columns' products with the weighted residual."""
         from bench.identification import _kernels
 
-        v = self.w * residual
-        v -= self.w * (v.sum() / self.total)
-        result = np.empty(self.regressor.shape[1])
-        result[: self.cells] = _kernels.gradient(self.columns, v[::-1].cumsum()[::-1].copy())
-        result[: self.cells] /= self.norms[: self.cells]
-        result[self.cells :] = self.extra.T @ v
+        result = np.asarray(_kernels.products(self.columns, self.norms, self.extra, self.w, self.total, residual))
         result[~self.usable] = 0.0
         return result
 
@@ -435,45 +383,53 @@ class _ActiveSet:
         size = self.known.size
         self.place[new] = np.arange(old, size)
         if size > self.gram.shape[0]:
-            grown = np.zeros((2 * size, 2 * size))
+            room = size + size // 2
+            grown = np.zeros((room, room))
             grown[:old, :old] = self.gram[:old, :old]
             self.gram = grown
-        rows = np.empty((new.size, size))
-        _kernels.gram_rows(
-            self.columns,
-            self.regressor.base,
-            self.cell_means,
-            self.norms[: self.cells],
-            self.w,
-            self.extra,
-            new,
-            self.known,
-            rows,
-        )
-        if self.penalty is not None:
-            r, c = np.flatnonzero(new < self.cells), np.flatnonzero(self.known < self.cells)
-            rows[np.ix_(r, c)] += self.penalty[new[r]][:, self.known[c]].toarray()
-        self.gram[old:size, :size] = rows
-        self.gram[:size, old:size] = rows.T
+        for first in range(0, new.size, MANY):
+            block = new[first : first + MANY]
+            rows = np.empty((block.size, size))
+            _kernels.gram_rows(
+                self.columns,
+                self.regressor.base,
+                self.cell_means,
+                self.norms[: self.cells],
+                self.w,
+                self.extra,
+                block,
+                self.known,
+                rows,
+            )
+            if self.penalty is not None:
+                r, c = np.flatnonzero(block < self.cells), np.flatnonzero(self.known < self.cells)
+                rows[np.ix_(r, c)] += self.penalty[block[r]][:, self.known[c]].toarray()
+            place = slice(old + first, old + first + block.size)
+            self.gram[place, :size] = rows
+            self.gram[:size, place] = rows.T
 
     def products_of(self, first: Indices, second: Indices) -> Floats:
         """Return the Gram entries of two sets of known columns."""
         return np.asarray(self.gram[self.place[first][:, None], self.place[second]])
 
+    def largest_row(self, columns: Indices) -> float:
+        """Return the greatest sum of magnitudes of a row of the Gram block of known columns."""
+        blocks = (columns[k : k + MANY] for k in range(0, columns.size, MANY))
+        return max((float(np.abs(self.products_of(b, columns)).sum(axis=1).max()) for b in blocks), default=0.0)
+
     def enter(self, columns: Indices) -> Indices:
         """Add columns to the passive set; return those left out because they depend on it."""
-        dropped: list[int] = []
-        while columns.size:
-            self.iterations += 1
-            bad = self.factor.append(self.products_of(self.passive, columns), self.products_of(columns, columns))
-            good = columns.size if bad is None else bad
-            self.passive = np.concatenate([self.passive, columns[:good]])
-            if bad is None:
-                break
-            dropped.append(int(columns[bad]))
-            self.x[columns[bad]] = 0.0
-            columns = columns[bad + 1 :]
-        return np.array(dropped, dtype=np.int64)
+        if not columns.size:
+            return columns
+        self.iterations += 1
+        # Transposed, as LAPACK wants them.
+        good = self.factor.append(self.products_of(columns, self.passive).T, self.products_of(columns, columns).T)
+        if good is None:
+            half = columns.size // 2
+            return np.concatenate([self.enter(columns[:half]), self.enter(columns[half:])])
+        self.passive = np.concatenate([self.passive, columns[good]])
+        self.x[columns[~good]] = 0.0
+        return columns[~good]
 
     def leave(self, gone: Flags) -> Indices:
         """Take columns out of the passive set; return those that turn out dependent on the way."""
@@ -522,9 +478,10 @@ class _ActiveSet:
             self.x[passive] = moved
             barred.append(self.leave(leave))
 
-    def solve(self) -> Fit:
+    def solve(self, samples: int, left: float) -> Fit:
+        """Return the solution, of so many samples, with so much left of the outputs beside the residual sum."""
         self.minimise()
-        return self.result()
+        return self.result(samples, left)
 
     def minimise(self) -> None:
         """Find the passive set and the coefficients."""
@@ -539,13 +496,14 @@ class _ActiveSet:
             barred[self.enter(first)] = True
             barred[self.settle(bold=True)] = True
         bold, gain = True, self.gain()
-        stricter = iter(_DEPENDENT[1:])
+        stricter = iter(DEPENDENT[1:])
         for _ in range(100 + 3 * self.x.size):
             g = self.refine()
             g[self.passive] = 0.0
             g[~self.constrained] = 0.0
             if g.max(initial=0.0) <= tolerance:
                 break
+            say_fit_progress(float(g.max()) / self.size)
             if g[~barred].max(initial=0.0) <= tolerance:
                 threshold = next(stricter, None)
                 if threshold is None:
@@ -589,23 +547,18 @@ class _ActiveSet:
         if self.layout.order < _COARSEST:
             return np.flatnonzero(signed)
         layout, parents = self.layout.coarser()
-        count, r = layout.cells.size, self.regressor
-        merged = Regressor(
-            base=np.bincount(parents, r.base, minlength=count).astype(np.float64),
-            starts=r.starts,
-            cells=parents[r.cells].astype(np.int32),
-            changes=r.changes,
-            extra=r.extra,
-        )
-        constrained = np.ones(count + r.extra.shape[1], dtype=bool)
+        count = layout.cells.size
+        merged = self.regressor.merged(parents, count)
+        constrained = np.ones(merged.shape[1], dtype=bool)
         constrained[parents[~self.constrained[: self.cells]]] = False
         constrained[count:] = self.constrained[self.cells :]
         # A Laplacian of twice the step is four times as great, on a quarter of the cells.
-        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, 0.25 * self.smoothing, absolute=True)
+        weights = 0.25 * self.smoothing, 4.0 * self.ridge
+        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, *weights, absolute=True)
         coarse.minimise()
         values = (coarse.x / coarse.norms)[:count]
         chosen = signed.copy()
-        chosen[: self.cells] &= self.layout.around(values[parents] > 0.0)
+        chosen[: self.cells] &= values[parents] > 0.0
         self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
         self.x *= self.norms
         return np.flatnonzero(chosen)
@@ -640,26 +593,28 @@ class _ActiveSet:
         rows, columns = inside[block.row], inside[block.col]
         return float(self.passive.size - block.data @ inverse[np.maximum(rows, columns), np.minimum(rows, columns)])
 
-    def result(self) -> Fit:
+    def result(self, samples: int, left: float) -> Fit:
         passive = self.passive
         g = self.slope()
-        held = self.constrained.copy()
+        held = np.ones(self.x.size, dtype=bool)
         held[passive] = False
-        violation = np.where(held, np.maximum(g, 0.0), np.abs(g))
+        violation = np.where(held & self.constrained, np.maximum(g, 0.0), np.abs(g))
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
         inverse = self.factor.inverse() if passive.size else np.zeros((0, 0))
-        spare = np.count_nonzero(self.w) - 1.0 - self.effective(inverse)
+        spare = samples - 1.0 - self.effective(inverse)
         if spare > 0.5:
-            variance = float(self.w @ self.residual() ** 2) / spare
+            variance = (float(self.w @ self.residual() ** 2) + left) / spare
             uncertainties[:] = 0.0
             uncertainties[passive] = np.sqrt(variance * np.diag(inverse)) / self.norms[passive]
         certificate = Certificate(
             kkt_residual=kkt,
             passive=passive.size,
             active=self.x.size - passive.size,
-            condition=self.factor.condition(self.products_of(passive, passive)),
+            # A column that could enter without a gain depends on the passive ones, all of which can give way.
+            exchangeable=int(np.count_nonzero(held & self.usable & (np.abs(g) <= _LEVEL * self.size))),
+            condition=self.factor.condition(self.largest_row(passive)),
             swept=self.swept,
             iterations=self.iterations,
             converged=kkt <= 1e-10,

@@ -20,6 +20,8 @@ from bench.identification.least_squares import Fit, fit, fit_minimum_norm
 _TOLERANCE = 1e-10
 # Relative step of the differences: a constrained linear fit is exact to about 1e-12.
 _STEP = 1e-6
+# Cells of a dense normal matrix: 0.5 GB.
+_MOST_CELLS = 8001
 
 
 def fit_operator(
@@ -30,12 +32,22 @@ def fit_operator(
     weights: Floats,
     skip: int,
     smoothing: float,
+    ridge: float = 0.0,
 ) -> Fit:
-    """Return the coefficients of an operator: with its signs if constrained, else of the least norm."""
-    if not constrained:
+    """Return the coefficients of an operator: with its signs if constrained, else free.
+
+    Free coefficients without a penalty are those of the least norm.
+    """
+    if not constrained and not smoothing and not ridge:
         return fit_minimum_norm(regressor, outputs, weights=weights, skip=skip)
-    signs = operator.nonnegative()
-    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, smoothing=smoothing)
+    if not constrained and regressor.base.size > _MOST_CELLS:
+        raise ValueError(
+            f"levels: penalties on a density of either sign take at most {_MOST_CELLS} cells (126 levels), got "
+            f"{regressor.base.size}; give fewer levels, or smoothing 0 and ridge 0"
+        )
+    signs = operator.nonnegative() if constrained else False
+    penalties = {"smoothing": smoothing, "ridge": ridge}
+    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, **penalties)
 
 
 def fit_shape(

@@ -102,12 +102,8 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
     DataError
         If it is constant.
     """
+    check_variation(columns, name)
     values = columns.values[name]
-    if np.ptp(values) == 0.0:
-        raise DataError(
-            f"{columns.source}: column {name} is {values[0]:g} in all {values.size} rows, so "
-            "nothing can be identified"
-        )
     repeated = int(np.count_nonzero(np.diff(values) == 0.0))
     if repeated > _LONGEST_PLATEAU * values.size:
         return [
@@ -115,6 +111,19 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
             "plateaus add weight but no information"
         ]
     return []
+
+
+def check_variation(columns: Columns, name: str) -> None:
+    """Check that a column varies.
+
+    Raises DataError if it is constant.
+    """
+    values = columns.values[name]
+    if np.ptp(values) == 0.0:
+        raise DataError(
+            f"{columns.source}: column {name} is {values[0]:g} in all {values.size} rows, so "
+            "nothing can be identified"
+        )
 
 
 def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequence[object]]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.errors import DataError
 from bench.extras import needed_for
 from bench.hysteresis import Density, MemoryCurve
 from bench.hysteresis.density import density_unit
@@ -33,8 +34,13 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "figure.dpi": 150.0,
     "savefig.bbox": "tight",
+    # A line of a million points in one piece is more than the renderer takes.
+    "agg.path.chunksize": 20000,
 }
 _COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#30638e", "#00798c")
+
+_SKIPPED = "#a0a0a0"
+"""Colour of what counts in no error."""
 
 _MARKED = 200
 """Most samples of a curve that are marked one by one."""
@@ -51,7 +57,7 @@ def check_matplotlib() -> None:
 
 @contextmanager
 def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and save it."""
+    """Give an empty figure of a size in inches, and save it; raise DataError if it cannot be written."""
     check_matplotlib()
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -59,7 +65,10 @@ def _figure(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iter
     with mpl.rc_context({**_STYLE, "axes.grid": grid}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
-        figure.savefig(path)
+        try:
+            figure.savefig(path)
+        except OSError as error:
+            raise DataError(f"figure {path} cannot be written: {error.strerror or error}") from None
 
 
 class Curve(NamedTuple):
@@ -93,11 +102,63 @@ def plot_errors(path: Path, errors: Mapping[str, Floats], *, error_label: str, s
         for i, (title, error) in enumerate(errors.items()):
             panels[i].plot(np.arange(skip, error.size), error[skip:], color=_COLORS[i % len(_COLORS)], linewidth=0.7)
             if skip:
-                panels[i].plot(error[: skip + 1], color="0.7", linewidth=0.7)
+                panels[i].plot(error[: skip + 1], color=_SKIPPED, linewidth=0.7)
             panels[i].set_ylabel(error_label)
             most, rms = np.max(np.abs(error[skip:])), float(np.sqrt(np.mean(error[skip:] ** 2)))
             panels[i].set_title(f"{title}: max {most:.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
+
+
+def plot_fit(
+    path: Path,
+    horizontal: Floats,
+    measured: Floats,
+    modelled: Mapping[str, Floats],
+    *,
+    horizontal_label: str,
+    output_label: str,
+    error_label: str,
+    titles: Mapping[str, str],
+    skip: int = 0,
+) -> None:
+    """Draw measured and modelled outputs, and below them what is left, over the samples, time or input.
+
+    Parameters
+    ----------
+    horizontal, measured : ndarray, shape (N,)
+        Where each sample is drawn, and its output.
+    modelled : mapping of str to ndarray
+        Outputs by the name of the model, shape (N,) each.
+    titles : mapping of str to str
+        What the legend says of the error of each model.
+    skip : int
+        First samples, which count in no error: drawn in grey.
+    """
+    with _figure(path, (6.0, 5.5)) as figure:
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        top.plot(horizontal[skip:], measured[skip:], "-", color=_COLORS[0], linewidth=0.8, label="measured")
+        for i, (name, values) in enumerate(modelled.items()):
+            color = _COLORS[(i + 1) % len(_COLORS)]
+            top.plot(horizontal[skip:], values[skip:], "--", color=color, linewidth=0.7, label=name)
+            residuals = measured - values
+            if skip:
+                # One sample more, so that the curve does not break.
+                early = slice(0, skip + 1)
+                bottom.plot(horizontal[early], residuals[early], color=_SKIPPED, linewidth=0.7, label="_")
+                top.plot(horizontal[early], values[early], "--", color=_SKIPPED, linewidth=0.7, label="_")
+            bottom.plot(horizontal[skip:], residuals[skip:], color=color, linewidth=0.7, label=titles[name])
+        if skip:
+            rows = f"first {skip} samples, not in the errors"
+            top.plot(horizontal[: skip + 1], measured[: skip + 1], color=_SKIPPED, linewidth=0.8, label=rows)
+        bottom.axhline(0.0, color="black", linewidth=0.5)
+        # Of what counts; the samples before may be far off.
+        counted = np.concatenate([(measured - values)[skip:] for values in modelled.values()])
+        margin = 0.05 * float(np.ptp(counted)) or 1e-12
+        bottom.set_ylim(min(float(counted.min()), 0.0) - margin, max(float(counted.max()), 0.0) + margin)
+        top.set_ylabel(output_label)
+        bottom.set(xlabel=horizontal_label, ylabel=error_label)
+        for axes, columns in ((top, 3), (bottom, 1)):
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize=7.5)
 
 
 def plot_sequence_and_errors(
@@ -178,8 +239,11 @@ def plot_panels(
             axes.set_ylabel(vertical_label)
 
 
-def plot_densities(path: Path, densities: Sequence[Density]) -> None:
-    """Draw Preisach densities on their planes, side by side, under their titles; cells without density are white."""
+def plot_densities(path: Path, densities: Sequence[Density], swept: npt.NDArray[np.bool_] | None = None) -> None:
+    """Draw Preisach densities on their planes, side by side, under their titles; cells without density are white.
+
+    Cells that `swept`, shape (K,) as in `Preisach`, leaves out are grey: the excitation says nothing of them.
+    """
     with _figure(path, (5.2 * len(densities), 4.2), grid=False) as figure:
         panels = figure.subplots(1, len(densities), squeeze=False)[0]
         for axes, density in zip(panels, densities, strict=True):
@@ -193,26 +257,43 @@ def plot_densities(path: Path, densities: Sequence[Density]) -> None:
                 vmin=-largest if signed else 0.0,
                 vmax=largest,
             )
+            title = density.title
+            if swept is not None and not swept.all():
+                cells = np.full(density.values.shape, np.nan)
+                cells[np.tril_indices(len(cells))] = np.where(swept, np.nan, 1.0)
+                unknown = np.ma.masked_invalid(cells)
+                axes.pcolormesh(density.levels, density.levels, unknown, cmap="Greys", vmin=0.0, vmax=3.0, alpha=0.8)
+                title = f"{title} grey: never swept ({np.mean(~swept):.0%} of the cells)".lstrip()
             _frame_plane(axes, density)
             figure.colorbar(image, ax=axes, label=f"density / {density_unit(density.output_unit, density.unit)}")
-            axes.set_title(density.title, fontsize=9, loc="left")
+            axes.set_title(title, fontsize=9, loc="left")
 
 
-def plot_coverage(path: Path, density: Density, swept: npt.NDArray[np.bool_], memory: MemoryCurve) -> None:
+def plot_coverage(
+    path: Path,
+    density: Density,
+    swept: npt.NDArray[np.bool_],
+    memory: MemoryCurve,
+    resolution: Floats | None = None,
+) -> None:
     """Draw which cells of a plane were swept, shape (K,) as in `Preisach`, and the memory curve at the end over them.
 
-    Of the density only the levels and units count.
+    With the resolution, shape (K,), from 0 to 1, it is drawn instead. Of the density only the levels and units count.
     """
     cells = np.full(density.values.shape, np.nan)
-    cells[np.tril_indices(len(cells))] = swept
+    cells[np.tril_indices(len(cells))] = swept if resolution is None else resolution
     corners = memory.corners(float(density.levels[0]), float(density.levels[-1]))
     with _figure(path, (4.6, 4.2), grid=False) as figure:
         axes = figure.subplots()
         image = np.ma.masked_invalid(cells)
-        axes.pcolormesh(density.levels, density.levels, image, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
+        mesh = axes.pcolormesh(density.levels, density.levels, image, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.5)
         axes.plot(corners[:, 0], corners[:, 1], color=_COLORS[0], linewidth=1.5, label="memory curve")
         _frame_plane(axes, density)
-        axes.set_title(f"green: swept ({np.mean(swept):.0%} of the cells)")
+        if resolution is None:
+            axes.set_title(f"green: swept ({np.mean(swept):.0%} of the cells)")
+        else:
+            figure.colorbar(mesh, ax=axes, label="resolution (1: determined by the data)")
+            axes.set_title(f"swept: {np.mean(swept):.0%} of the cells", fontsize=9, loc="left")
         axes.legend(loc="lower right")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,31 +17,29 @@ from bench.hysteresis import (
     Coverage,
     Operator,
     Policy,
-    Preisach,
     Reach,
-    ThermalExpansion,
     TimedModel,
     find_model,
-    uniform_levels,
 )
 from bench.hysteresis.timed import TimedSequence
 from bench.identification import (
-    Assessment,
     Comparison,
     CrossValidation,
     Errors,
     Identification,
-    assess,
     compare,
-    covering_sequence,
     cross_validate,
-    damped_oscillation,
-    first_order_reversals,
     identify,
 )
+from bench.identification.regularization import Regularization
+from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
-from bench.results.data import FEWEST_ROWS, check_excitation, read_columns
+from bench.results.bands import band_json, calibrate
+from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
+from bench.results.examined import Examined, band_columns, examine
+from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
+from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
 from bench.results.times import bind_times, check_model_name, read_times
 from bench.timed import identify_in_time
@@ -69,6 +67,8 @@ class IdentifiedFile:
         The measurements.
     coverage : Coverage or None
         Which cells of the Preisach plane the input has swept; None for a model without one.
+    resolution : Resolution or None
+        What the data say of each coefficient; None for a model without a plane, or with one too fine for it.
     trials : CrossValidation or None
         The table by which smoothing was chosen, if it was.
     assumptions : str
@@ -81,6 +81,7 @@ class IdentifiedFile:
     inputs: Floats
     outputs: Floats
     coverage: Coverage | None = None
+    resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
 
@@ -88,11 +89,23 @@ class IdentifiedFile:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
 
+    def predictions(self) -> Predictions:
+        """Return the outputs of the model beside the measurements, as the fit has them."""
+        operator, names = self.file.response, self.file.provenance
+        return Predictions(
+            Quantity(names["input"], operator.input_unit, self.inputs),
+            operator.output_unit,
+            {self.file.name: self.outputs - self.identification.residuals},
+            Quantity(names["output"], operator.output_unit, self.outputs),
+            skip=self.identification.skip,
+        )
+
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""
         found = self.identification
         certificate = found.certificate
         operator = self.file.response
+        penalties = found.regularization
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
@@ -102,14 +115,19 @@ class IdentifiedFile:
             "converged": certificate.converged,
             "passive": certificate.passive,
             "active": certificate.active,
+            "rank": self.resolution.rank if self.resolution else None,
+            "exchangeable": certificate.exchangeable,
             "condition": certificate.condition,
             "coverage": self.coverage.fraction if self.coverage else certificate.coverage,
             "largest_uncertainty": _largest(found.uncertainties),
-            "smoothing": self.trials.best.smoothing if self.trials else None,
+            "smoothing": self.trials.best.smoothing if self.trials else penalties and penalties.smoothing,
+            "ridge": penalties and penalties.ridge,
+            "cross_validated_rms": penalties and penalties.rms,
             "orientation": found.orientation,
             "input_unit": operator.input_unit,
             "output_unit": operator.output_unit,
             "warnings": list(self.warnings),
+            **band_json(self.file, self.inputs, found.initial_state),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
@@ -120,7 +138,7 @@ def model_options(model: str) -> tuple[str, ...]:
     own = inspect.signature(template).parameters if template is not None else {}
     # The first takes the inputs; the units are those of the columns.
     names = [name for name in list(own)[1:] if not name.endswith("_unit")]
-    return (*names, "smoothing", "skip", "initial", "orientation", "cross_validated")
+    return (*names, "smoothing", "ridge", "skip", "initial", "orientation", "cross_validated", "band")
 
 
 def check_options(model: str, inputs: Floats, options: Mapping[str, Any]) -> None:
@@ -155,10 +173,12 @@ def identify_file(
     input_column: str,
     output_column: str,
     model: str,
-    smoothing: float = 0.0,
+    smoothing: float | None = None,
+    ridge: float | None = None,
     skip: int = 0,
     cross_validated: bool = False,
     time_column: str | None = None,
+    band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
@@ -172,14 +192,16 @@ def identify_file(
         Columns of the model's input and output, by name or by number from 1.
     model : str
         Name of an entry of `bench.models`.
-    smoothing : float
-        Weight of the roughness penalty.
+    smoothing, ridge : float, optional
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
         Whether smoothing is chosen by cross-validation among `SMOOTHING` (relative weights).
     time_column : str or None
         Column of times, for a model with time.
+    band : bool
+        Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
     **options
@@ -201,13 +223,14 @@ def identify_file(
     if inputs.size - skip < FEWEST_ROWS:
         raise DataError(f"{path}: --skip {skip} leaves {max(inputs.size - skip, 0)} of {inputs.size} rows; too few")
     warnings = tuple(check_excitation(columns, input_column))
+    check_variation(columns, output_column)
     options = {name: value for name, value in options.items() if value is not None}
     for key, column in (("input_unit", input_column), ("output_unit", output_column)):
         if columns.units[column]:
             options[key] = columns.units[column]
     trials: CrossValidation | None = None
-    if time_column is not None and (cross_validated or smoothing):
-        raise ConfigurationError(f"model {model} takes no --smoothing and no --cross-validate yet")
+    if time_column is not None and (cross_validated or smoothing or ridge or band):
+        raise ConfigurationError(f"model {model} takes no --smoothing, --ridge, --cross-validate or --band")
     try:
         if time_column is not None:
             times = read_times(columns, time_column)
@@ -217,16 +240,23 @@ def identify_file(
             if cross_validated:
                 others = {name: value for name, value in options.items() if name != "levels"}
                 orders = [options["levels"]] if "levels" in options else None
+                ridge = ridge or 0.0
                 trials = cross_validate(
-                    model, inputs, outputs, smoothing=SMOOTHING, levels=orders, skip=skip, **others
+                    model, inputs, outputs, smoothing=SMOOTHING, ridge=ridge, levels=orders, skip=skip, **others
                 )
                 smoothing = trials.best.smoothing
-            found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, **options)
+            found = identify(model, inputs, outputs, skip=skip, smoothing=smoothing, ridge=ridge, **options)
             memory = found.model.advance(found.initial_state, inputs)
             coverage = found.model.coverage(inputs, found.initial_state)
+        penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+        calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     warnings += found.warnings
+    resolution: Resolution | None = None
+    if coverage is not None:
+        regressor = found.model.regressor(inputs, found.initial_state)
+        resolution = resolve(regressor, np.ones(inputs.size), found.skip, penalties.smoothing, penalties.ridge)
     provenance = {
         "source": path.name,
         "input": input_column,
@@ -238,11 +268,21 @@ def identify_file(
         "input_sha256": digest(inputs),
         **errors_json(found.errors),
         "kkt": found.certificate.kkt_residual,
+        "smoothing": penalties.smoothing,
+        "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance, found.initial_state)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)
     return IdentifiedFile(
-        file, found, tuple(dict.fromkeys(warnings)), inputs, outputs, coverage, trials, columns.assumptions
+        file,
+        found,
+        tuple(dict.fromkeys(warnings)),
+        inputs,
+        outputs,
+        coverage,
+        resolution,
+        trials,
+        columns.assumptions,
     )
 
 
@@ -386,13 +426,37 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
-        ("coefficients", f"{certificate.passive} free, {certificate.active} held at zero"),
+        *_uniqueness(found, identified.resolution),
+        *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
     )
+
+
+def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
+    """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
+    certificate = found.certificate
+    signed = not isinstance(found.model, TimedModel) and not find_model(found.model_name).constrained
+    is_least_norm = signed and found.regularization is None
+    if is_least_norm:
+        text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
+    else:
+        text = f"{certificate.passive} free, {certificate.active} held at zero"
+    lines = [("coefficients", text)]
+    if resolution is not None and not is_least_norm:
+        lines.append(("determined by data", resolution.summary()))
+    if certificate.exchangeable:
+        lines.append(
+            (
+                "not unique",
+                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                "changing the fit; they are resolved by --smoothing",
+            )
+        )
+    return lines
 
 
 @dataclass(frozen=True)
@@ -403,18 +467,28 @@ class ComparedModels:
     ----------
     comparisons : mapping of str to Comparison
         By the model file's name.
-    unit : str
-        Unit of the output.
-    skip : int
-        Number of first rows left out of the errors.
+    predictions : Predictions
+        What each model gives, row by row.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
+    examined : mapping of str to Examined
+        The session recalibrated and the band of each model, by the same names.
     """
 
     comparisons: Mapping[str, Comparison]
-    unit: str
-    skip: int = 0
+    predictions: Predictions
     assumptions: str = ""
+    examined: Mapping[str, Examined] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
+
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
@@ -424,9 +498,16 @@ class ComparedModels:
                 "rezeroed": errors_json(entry.rezeroed),
                 "offset": entry.offset,
                 "skipped": self.skip,
+                **(self.examined[name].to_json() if name in self.examined else {}),
+                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
             }
             for name, entry in self.comparisons.items()
         }
+
+    def recalibrated(self, name: str) -> Errors | None:
+        """Return a model's errors after recalibration, over the same rows as the others; None without one."""
+        found = self.examined.get(name)
+        return None if found is None or found.recalibration is None else found.errors()
 
 
 def compare_models(
@@ -438,6 +519,7 @@ def compare_models(
     skip: int | None = None,
     initial: str | None = None,
     time_column: str | None = None,
+    session: Session | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
     """Compare model files on measurements.
@@ -455,6 +537,8 @@ def compare_models(
         the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
     time_column : str or None
         Column of times, for models with time; that of the first such model if None.
+    session : Session, optional
+        What is estimated of the session for each model; the rows that it uses do not count either.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
 
@@ -486,35 +570,18 @@ def compare_models(
         starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
     states = {name: start.state for name, start in starts.items()}
     most = max(start.skip for start in starts.values())
-    comparisons = compare(operators, inputs, outputs, states=states, skip=most)
-    return ComparedModels(comparisons, files[0].response.output_unit, most, columns.assumptions)
-
-
-def assess_designs(
-    plane: tuple[float, float], operating: tuple[float, float], levels: int, dwell: float
-) -> dict[str, Assessment]:
-    """Return what each excitation sequence tells about a plane of `levels` intervals, by the name of its protocol.
-
-    Plane and operating range are in input units, the settling time `dwell` at each set-point in s. Raises
-    ConfigurationError if the ranges do not fit.
-    """
-    low, high = operating
-    try:
-        grid = uniform_levels(*plane, levels)
-        # The term stands for any reversible part of two coefficients.
-        operator = Preisach(
-            grid,
-            np.zeros(levels * (levels + 1) // 2),
-            reversible=ThermalExpansion(0.0, 0.0, *plane, low),
-            input_range=operating,
-        )
-        span = high - low
-        sequences = {
-            "damped-oscillation": damped_oscillation(low, high, low + 0.524 * span, 36, span / 180.0),
-            "first-order-reversals": first_order_reversals(grid, operating),
-            "covering, fewest": covering_sequence(grid, operating),
-            "covering, fine": covering_sequence(uniform_levels(*plane, 2 * levels), operating, per_cell=2),
-        }
-        return {name: assess(operator, sequence, dwell=dwell) for name, sequence in sequences.items()}
-    except ValueError as error:
-        raise ConfigurationError(f"design: {error}") from None
+    examined = {
+        name: examine(file, inputs, outputs, state=states[name], session=session, skip=most, times=times)
+        for name, file in zip(operators, files, strict=True)
+    }
+    first = most if session is None else session.first_unused(inputs.size, most)
+    comparisons = compare(operators, inputs, outputs, states=states, skip=first)
+    predictions = Predictions(
+        Quantity(names[0], columns.units[names[0]] or files[0].response.input_unit, inputs),
+        files[0].response.output_unit,
+        {name: entry.predicted for name, entry in examined.items()},
+        Quantity(names[1], columns.units[names[1]], outputs),
+        skip=first,
+        further=band_columns(examined),
+    )
+    return ComparedModels(comparisons, predictions, columns.assumptions, examined)

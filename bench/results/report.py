@@ -28,6 +28,8 @@ from bench.results.figures import (
     plot_signals,
 )
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json
+from bench.results.prediction_figures import draw_predictions
+from bench.results.predictions import Predictions
 from bench.results.starting_state import StartingState, starting_state
 from bench.results.tracking import results_json
 from bench.runs import RECORDING_NAME
@@ -130,12 +132,22 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
     return paths
 
 
-def draw_comparison(result: ComparedModels, out: Path) -> Path:
-    """Draw the residuals of compared models; return the file."""
-    path = _make_folder(out) / "residuals.png"
-    residuals = {name: entry.residuals for name, entry in result.comparisons.items()}
-    plot_errors(path, residuals, error_label=with_unit("error", result.unit), skip=result.skip)
-    return path
+def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
+    """Draw the residuals of compared models, their outputs and loops; return the files."""
+    folder = _make_folder(out)
+    path = folder / "residuals.png"
+    plot_errors(
+        path,
+        result.predictions.residuals(),
+        error_label=with_unit("error", result.unit),
+        skip=result.skip,
+    )
+    return [path, *draw_predictions(result.predictions, folder, "models")]
+
+
+def draw_predicted(found: Predictions, out: Path) -> list[Path]:
+    """Draw the outputs of one model; return the files."""
+    return draw_predictions(found, _make_folder(out), next(iter(found.predicted)))
 
 
 def _picture(record: Record, folder: Path) -> Path:
@@ -157,24 +169,17 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     folder = _make_folder(out)
     operator = found.file.response
     name = found.file.name
-    loops, errors = folder / f"{name}-loops.png", folder / f"{name}-errors.png"
-    plot_loops(
-        loops,
-        found.inputs,
-        found.outputs,
-        found.outputs - found.identification.residuals,
-        input_label=with_unit(found.file.provenance["input"], operator.input_unit),
-        output_label=with_unit(found.file.provenance["output"], operator.output_unit),
-    )
-    residuals, skip = {name: found.identification.residuals}, found.identification.skip
-    plot_errors(errors, residuals, error_label=with_unit("error", operator.output_unit), skip=skip)
-    paths = [loops, errors]
+    paths = draw_predictions(found.predictions(), folder, name)
     for density in operator.densities():
         paths.append(folder / f"{name}-density.png")
-        plot_densities(paths[-1], [density])
+        # What the samples of the fit swept; the coverage is that of all.
+        swept = found.identification.certificate.swept[: found.coverage.swept.size] if found.coverage else None
+        plot_densities(paths[-1], [density], swept)
         if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
             paths.append(folder / f"{name}-coverage.png")
-            plot_coverage(paths[-1], density, found.coverage.swept, found.file.memory)
+            swept = found.coverage.swept
+            resolution = found.resolution.diagonal[: swept.size] if found.resolution else None
+            plot_coverage(paths[-1], density, swept, found.file.memory, resolution)
     return paths
 
 

@@ -21,7 +21,7 @@ from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.least_squares import Fit, _one_thread, fit, fit_minimum_norm
+from bench.identification.least_squares import Fit, fit, fit_minimum_norm, one_thread
 from bench.identification.measures import measure_errors
 from bench.identification.orientation import NAMES, Orientation, has_orientation
 from bench.timed.hammerstein import Hammerstein, HammersteinState
@@ -333,7 +333,7 @@ def identify_hammerstein(
     oriented = has_orientation(problem.spec, problem.template)
     search = _set_up(moments, problem, (1, -1) if oriented and orientation == "auto" else (problem.orientation,))
     warnings = list(problem.warnings())
-    with _one_thread():
+    with one_thread():
         found = _choose(search) if chosen is None else _best(search, chosen)
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):

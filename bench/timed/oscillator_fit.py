@@ -194,6 +194,7 @@ def identify_bouc_wen_oscillator(
             kkt_residual=float(np.abs(scaled.T @ end.fun).max() / length) if length else 0.0,
             passive=7,
             active=0,
+            exchangeable=0,
             condition=float(np.linalg.cond(scaled)),
             swept=np.ones(7, dtype=bool),
             iterations=int(end.nfev),

@@ -313,7 +313,8 @@ def _identify_model(recording: Recording, file: RigFile, units: Mapping[str, str
     if not trials:
         raise DataError(f"{recording.path}: no model can be identified from its readings; give one by --model FILE")
     _, name, options = min(trials, key=lambda each: each[0])
-    return name, identify(name, inputs, outputs, **options).model
+    # As it was tried.
+    return name, identify(name, inputs, outputs, smoothing=0.0, ridge=0.0, **options).model
 
 
 def _signals(

@@ -354,9 +354,9 @@ class TestIdentifyAndPredict:
         assert code == 0
         with (tmp_path / "out.csv").open() as file:
             rows = list(csv.DictReader(file))
-        assert list(rows[0]) == ["voltage", "predicted"]
-        predicted = np.array([float(row["predicted"]) for row in rows])
-        np.testing.assert_array_equal([float(row["voltage"]) for row in rows], inputs)
+        assert list(rows[0]) == ["voltage [V]", "measured [µm]", "predicted [µm]", "residual [µm]"]
+        predicted = np.array([float(row["predicted [µm]"]) for row in rows])
+        np.testing.assert_array_equal([float(row["voltage [V]"]) for row in rows], inputs)
         assert np.sqrt(np.mean((predicted - outputs)[70:] ** 2)) == pytest.approx(fit["rms"], rel=1e-9)
 
     def test_a_run_is_as_good_as_a_file(self, bench, tmp_path, finished_run):
@@ -541,7 +541,10 @@ class TestTheCoreOnTheCommandLine:
         assert set(designs) == {"damped-oscillation", "first-order-reversals", "covering, fewest", "covering, fine"}
         for design in designs.values():
             assert design["covered"] == design["cells"] == 36
+            assert 0.0 < design["prediction_variance"] < 2.0
         assert designs["covering, fine"]["time"] < 0.5 * designs["damped-oscillation"]["time"]
+        per_hour = {name: design["log_determinant"] for name, design in designs.items()}
+        assert per_hour["covering, fewest"] == max(per_hour.values()) > per_hour["damped-oscillation"]
         code, _, err = bench("design", "--rig", "vo2", "--plane", "30", "90")
         assert code == 2
         assert "design" in err

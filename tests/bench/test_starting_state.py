@@ -70,7 +70,7 @@ def test_a_model_has_the_errors_of_its_identification_on_its_data(tmp_path, data
 
 
 def printed_errors(out):
-    return [line.split(None, 2)[2] for line in out.splitlines() if "error" in line and "range" in line]
+    return [line.split(None, 2)[2].rstrip() for line in out.splitlines() if "error" in line and "range" in line]
 
 
 @pytest.mark.parametrize(
@@ -137,6 +137,7 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
 
 def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
     from bench.results import figures
+    from bench.results.prediction_figures import errors_text
     from bench.results.report import draw_identification
 
     titles = []
@@ -151,7 +152,8 @@ def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
                 return self.figure
 
             def __exit__(self, *error):
-                titles.extend(axes.get_title(loc="left") for axes in self.figure.axes)
+                legends = [axes.get_legend() for axes in self.figure.axes if axes.get_legend()]
+                titles.extend(text.get_text() for legend in legends for text in legend.get_texts())
                 return context.__exit__(*error)
 
         return Noted()
@@ -162,8 +164,8 @@ def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
     )
     assert found.identification.skip > 0
     draw_identification(found, tmp_path)
-    errors = found.identification.errors
-    assert f"preisach: max {errors.maximum:.3g}, RMS {errors.rms:.3g}" in titles
+    errors, unit = found.identification.errors, found.file.operator.output_unit
+    assert f"preisach: {errors_text(errors, unit)}" in titles
 
 
 class TestStartingState:

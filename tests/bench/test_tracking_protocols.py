@@ -97,6 +97,24 @@ class TestTracking:
         report = json.loads((tmp_path / "report.json").read_text())
         assert report["tracking"]["max"] == pytest.approx(float(np.max(np.abs(results.outputs - results.targets))))
 
+    def test_a_session_is_recalibrated_before_the_targets(self, bench, models, tmp_path):
+        file = write_table(tmp_path / "targets.csv", ["target"], [[400.0], [1400.0], [700.0], [1100.0]])
+        errors = {}
+        for kinds in ("", "input-offset"):
+            code, out, _ = bench(
+                "run", "tracking", *VO2, "--set", f"model={models['preisach']}", "--set", f"targets={file}",
+                "--set", "controller=open-loop-inverse", "--set", f"recalibrate={kinds}",
+                "--set", "recalibrate_readings=60", "--override", "emulation.session_offset=1.5", "--out", tmp_path,
+                "--json", tmp_path / "run.json",
+            )  # fmt: skip
+            assert code == 0
+            assert ("the model is corrected by it" in re.sub(r"\s+", " ", out)) == bool(kinds)
+            with Record(Path(json.loads((tmp_path / "run.json").read_text())["folder"])) as record:
+                labels = [step.label for step in record.step_records()]
+                errors[kinds] = target_results(record, "curvature").summary()["rms"]
+            assert labels.count("session") == (60 if kinds else 0)
+        assert errors["input-offset"] < 0.6 * errors[""]
+
     def test_set_points_stay_within_what_is_allowed(self, bench, models, tmp_path):
         # 1835 1/m and -90 1/m lie beyond saturation: the whole range is travelled for them.
         file = write_table(tmp_path / "targets.csv", ["target"], [[900.0], [1835.0], [-90.0], [5000.0]])
@@ -127,6 +145,8 @@ class TestTracking:
             (["model={preisach}", "targets={gap}"], 3, ["gap.csv", "row 2", "empty"]),
             (["model={preisach}", "targets={text}"], 3, ["text.csv", "row 1", "'high'"]),
             (["model={preisach}", "targets={wrong}"], 3, ["no column 'target'"]),
+            (["model={preisach}", "recalibrate=zero"], 2, ["recalibrate", "input-offset"]),
+            (["model={preisach}", "recalibrate=offset,drift"], 2, ["drift", "a controller has no rows"]),
         ],
     )
     def test_what_does_not_fit_is_refused_before_anything_moves(self, bench, models, tmp_path, settings, code, words):

@@ -97,18 +97,27 @@ from test_identification_speed import problem
 from bench.identification import fit
 operator, inputs, outputs = problem(5)
 fit(operator.regressor(inputs), outputs)
-operator, inputs, outputs = problem(200, 30_000, 300)
-start = time.perf_counter()
-found = fit(operator.regressor(inputs), outputs)
-seconds = time.perf_counter() - start
+operator, inputs, outputs = problem({order}, {samples}, {cycles})
+start = time.process_time()
+found = fit(operator.regressor(inputs), outputs, smoothing={smoothing})
+seconds = time.process_time() - start
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-print(f"{{seconds:.1f}} s, {{peak:.0f}} MB peak, {{found.certificate.passive}} passive, "
+print(f"{{seconds:.1f}} s of CPU time, {{peak:.0f}} MB peak, {{found.certificate.passive}} passive, "
       f"KKT {{found.certificate.kkt_residual:.0e}}")
 """
 
 
-def test_long_record(capsys, request):
-    script = LONG.format(folder=str(request.path.parent))
+@pytest.mark.parametrize(
+    ("order", "samples", "cycles", "smoothing"),
+    [(200, 30_000, 300, 0.0), (100, 1_000_000, 30, 0.0), (200, 3000, 30, 1e-3)],
+)
+def test_large_problem(capsys, request, order, samples, cycles, smoothing):
+    script = LONG.format(
+        folder=str(request.path.parent), order=order, samples=samples, cycles=cycles, smoothing=smoothing
+    )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     with capsys.disabled():
-        print(f"\nN=30000, M=200, regressor and fit in a process of its own: {run.stdout.strip()}")
+        print(
+            f"\nN={samples}, M={order}, smoothing {smoothing:g}, regressor and fit in a process of its own: "
+            f"{run.stdout.strip()}"
+        )

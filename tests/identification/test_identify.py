@@ -119,7 +119,9 @@ def test_given_levels_and_ranges():
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"reversible": "cubic"}, "reversible: expected one of none"),
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"levels": 0}, "intervals"),
         ("preisach", [0.0, 1.0], [0.0, 1.0], {"levels": [1.0, 0.0]}, "levels: expected strictly"),
-        ("preisach-signed", [0.0, 1.0], [0.0, 1.0], {"smoothing": 1.0}, "smoothing"),
+        ("preisach-signed", [0.0, 1.0], [0.0, 1.0], {"smoothing": -1.0}, "smoothing: expected a finite number >= 0"),
+        ("preisach-signed", [0.0, 1.0], [0.0, 1.0], {"ridge": -1.0}, "ridge: expected a finite number >= 0"),
+        ("polynomial", [0.0, 1.0], [0.0, 1.0], {"smoothing": 1.0}, "smoothing: this model has no cells"),
         ("polynomial", [0.0, 1.0], [0.0, 1.0], {"degree": 0}, "degree"),
     ],
 )

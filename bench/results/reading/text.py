@@ -14,6 +14,10 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from bench.errors import DataError
+from bench.shares import say_share
+
+_LINES = 20000
+"""Lines after which it is said how far the reading is."""
 
 _CHUNK = 1 << 20
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -48,7 +52,13 @@ class TextFile:
             _open(self.path, self.compressed) as file,
             io.TextIOWrapper(file, encoding=self.encoding) as wrapped,
         ):
-            yield from islice(wrapped, start, end)
+            size = max(self.path.stat().st_size, 1)
+            # The position in the file itself, which may be compressed.
+            place: BinaryIO = getattr(file, "fileobj", file)
+            rest = islice(wrapped, start, end)
+            while lines := list(islice(rest, _LINES)):
+                yield from lines
+                say_share("reading", place.tell() / size)
 
 
 @contextmanager

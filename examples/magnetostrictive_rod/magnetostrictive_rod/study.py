@@ -10,7 +10,10 @@ from bench.runs import RunResult
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from bench.workers import Pending
 
-MODELS: Mapping[str, Mapping[str, Any]] = {"quadratic-play": {}, "preisach-signed": {"plane": (-2.4, 2.4)}}
+MODELS: Mapping[str, Mapping[str, Any]] = {
+    "quadratic-play": {},
+    "preisach-signed": {"plane": (-2.4, 2.4), "smoothing": 0.0, "ridge": 0.0},
+}
 """Models and their options. The plane ends before the drive's range does, so that the reset saturates it."""
 
 CONTROLLERS = ("open-loop-inverse", "closed-loop-inverse")

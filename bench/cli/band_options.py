@@ -1,0 +1,68 @@
+"""What the commands share about prediction bands and the recalibration of a session."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bench.cli.console import console, print_rows, warn
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from bench.results.bands import BandedPrediction
+    from bench.results.examined import Examined
+
+BandOption = Annotated[
+    bool,
+    typer.Option(
+        "--band", help="Calibrate a 90 % prediction band on blocks left out, at ten fits' cost; kept with the model."
+    ),
+]
+BandsOption = Annotated[
+    bool, typer.Option("--bands", help="Show how many of the measured outputs each model's prediction band covers.")
+]
+RecalibrateOption = Annotated[
+    str | None,
+    typer.Option(
+        "--recalibrate",
+        metavar="KINDS",
+        help="What has moved since the model's data, estimated from the measured output: some of offset, gain, "
+        "drift, input-offset, with commas.",
+    ),
+]
+RecalibrateRowsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--recalibrate-rows",
+        min=1,
+        metavar="ROWS",
+        help="First rows by which that is estimated; errors are those of the others. All if not given.",
+    ),
+]
+
+
+def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | None = None, name: str = "") -> None:
+    """Print a band in a line, with its coverage if there are residuals, and warn where it may not hold."""
+    prefix = f"{name}: " if name else ""
+    console.print(prefix + found.text(residuals), highlight=False, markup=False, soft_wrap=True)
+    if warning := found.warning():
+        warn(prefix + warning)
+
+
+def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> None:
+    """Print what was estimated of a session, and the band unless it is unwanted; `name` is that of the model."""
+    from bench.results.recalibrations import session_rows
+
+    if found.recalibration is not None:
+        rows = session_rows(found.recalibration, found.predicted.size, found.units)
+        errors = found.errors()
+        after = f"max {errors.maximum:.4g}, RMS {errors.rms:.4g} {found.units[1]}".rstrip()
+        title = f"recalibration of {name}" if name else "recalibration"
+        print_rows(title, [*rows, ("errors after it", after)])
+    if bands and found.band is not None:
+        print_band(found.band, found.residuals, name)
+    elif bands and name:
+        warn(f"{name} has no prediction band; `bench identify --band` calibrates one")

@@ -1,0 +1,88 @@
+"""A line on the terminal about work that takes longer than a moment: for how long, and how much is left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from threading import Event, Thread
+
+from rich.console import Console
+from rich.errors import LiveError
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from bench.cli.console import console
+from bench.shares import shares_to
+
+PATIENCE = 2.0
+"""Seconds of work after which a terminal shows that it goes on."""
+
+
+class PatienceDisplay:
+    """A bar with the time that has passed and the time that is left, as far as what computes says its share.
+
+    Nothing is drawn if the console is no terminal, nor in the first seconds.
+
+    Parameters
+    ----------
+    text : str
+        What is done, where what computes says nothing.
+    console : Console
+        Console of the bar.
+    patience : float
+        Seconds after which it is drawn.
+    """
+
+    def __init__(self, text: str, console: Console, patience: float = PATIENCE) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left, about:"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+        )
+        self._text, self._patience, self._stage = text, patience, ""
+        self._task = self._progress.add_task(text, total=None)
+        self._done = Event()
+        self._thread = Thread(target=self._draw_later, daemon=True)
+
+    def start(self) -> None:
+        """Begin to wait."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Take the bar away."""
+        self._done.set()
+        self._thread.join()
+        self._progress.stop()
+
+    def say(self, stage: str, share: float) -> None:
+        """Show a stage of the work, and the share of it that is done, 0 to 1; a share never falls."""
+        if stage != self._stage:
+            self._stage = stage
+            self._progress.reset(self._task, total=1.0, description=f"{self._text}: {stage}")
+        done = self._progress.tasks[0].completed
+        self._progress.update(self._task, completed=max(share, done))
+
+    def _draw_later(self) -> None:
+        # Not while kernels are compiled, which is drawn on the same console.
+        while not self._done.wait(self._patience):
+            with suppress(LiveError):
+                self._progress.start()
+                return
+
+
+@contextmanager
+def show_patience(text: str) -> Iterator[None]:
+    """Show on a terminal that work goes on, once it has taken more than two seconds, and how much of it is left."""
+    if not console.is_terminal:
+        yield
+        return
+    display = PatienceDisplay(text, console)
+    display.start()
+    try:
+        with shares_to(display.say):
+            yield
+    finally:
+        display.stop()

@@ -1,0 +1,61 @@
+"""What the commands about models write beside what they print: rows as CSV, figures, model cards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from bench.cli.command_line import command_line
+from bench.cli.console import console
+
+if TYPE_CHECKING:
+    from bench.results.models import IdentifiedFile
+    from bench.results.predictions import Predictions
+
+
+def print_figures(paths: Iterable[Path]) -> None:
+    """Print where figures are."""
+    for path in paths:
+        console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_fit(
+    found: IdentifiedFile,
+    data: Path,
+    *,
+    context: typer.Context,
+    out: Path | None,
+    card: Path | None,
+    figures: Path | None,
+) -> None:
+    """Draw the figures of a fit in a folder and write its model card, if asked for, and print where they are.
+
+    The card names the command of `context`, and the model file `out` if there is one. Raises DataError if a file
+    cannot be written.
+    """
+    drawn: list[Path] = []
+    if figures is not None:
+        from bench.results.report import draw_identification
+
+        drawn = draw_identification(found, figures)
+        print_figures(drawn)
+    if card is not None:
+        from bench.results.model_card import write_card
+
+        write_card(card, found, data, command=command_line(context), model=out, figures=drawn)
+        console.print(f"card: {card}", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_rows(path: Path, found: Predictions) -> None:
+    """Write models beside measurements as CSV, and print where.
+
+    Raises DataError if the file cannot be written.
+    """
+    from bench.results.data import write_csv
+
+    table = found.table()
+    write_csv(path, [head for head, _ in table], [values for _, values in table])
+    console.print(f"{found.input.values.size} rows: {path}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,116 @@
+"""The Cholesky factor of a Gram matrix whose columns come and go."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.hysteresis._checks import Floats
+from bench.identification.cell_layout import Flags, Indices
+
+# A column whose squared distance from the span of the passive ones falls below this part of its squared norm
+# counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
+# all that is left to enter, the threshold is lowered step by step.
+DEPENDENT = (1e-12, 1e-13, 1e-14)
+MANY = 256
+"""Columns or rows of which a copy is cheap."""
+
+
+class CholeskyFactor:
+    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go."""
+
+    def __init__(self) -> None:
+        self.upper = np.zeros((0, 0))
+        self.size = 0
+        self.threshold = DEPENDENT[0]
+
+    @property
+    def compact(self) -> Floats:
+        """Lower factor, a copy as LAPACK wants it."""
+        return np.array(self.upper[: self.size, : self.size], order="C").T
+
+    def append(self, cross: Floats, square: Floats) -> Flags | None:
+        """Add columns, given their products with the present ones, shape (size, p), and with each other.
+
+        In Fortran's order both are overwritten.
+
+        Return which were added: the others depend on the present ones and those added before them. None if there
+        are others among many: nothing is added then, and fewer are to be tried.
+        """
+        from scipy.linalg.blas import dsyrk, dtrsm
+        from scipy.linalg.lapack import dpotrf
+
+        from bench.identification import _kernels
+
+        old, more = cross.shape
+        squares = np.diag(square).copy()
+        rest = np.asfortranarray(square)
+        side: Floats | None = None
+        if old and more:
+            side = dtrsm(1.0, self.compact, np.asfortranarray(cross), lower=1, overwrite_b=1)
+            rest = dsyrk(-1.0, side, beta=1.0, c=rest, trans=1, lower=1, overwrite_c=1)
+        # Kept for a second try only where that is cheap.
+        again = None if more > MANY else rest.copy(order="F")
+        block, info = dpotrf(rest, lower=1, clean=1, overwrite_a=1)
+        good = np.ones(more, dtype=bool)
+        # Pivots below the threshold would pass as rounding noise.
+        if info or (np.diag(block) ** 2 < self.threshold * squares).any():
+            if again is None:
+                return None
+            block = np.array(np.tril(again), order="C")
+            _kernels.factor_independent(block, self.threshold * squares, good)
+            block = block[np.ix_(good, good)]
+        added = int(np.count_nonzero(good))
+        self.size = old + added
+        if not old and added > self.upper.shape[0]:
+            self.upper = np.ascontiguousarray(block.T)
+            return good
+        if self.size > self.upper.shape[0]:
+            room = max(64, self.size + self.size // 2)
+            grown = np.zeros((room, room))
+            grown[:old, :old] = self.upper[:old, :old]
+            self.upper = grown
+        if side is not None:
+            self.upper[:old, old : self.size] = side if added == more else side[:, good]
+        self.upper[old : self.size, old : self.size] = block.T
+        return good
+
+    def truncate(self, size: int) -> None:
+        """Keep the first columns only."""
+        self.size = size
+
+    def delete(self, places: Indices) -> None:
+        """Remove the columns at increasing places."""
+        from bench.identification import _kernels
+
+        for place in places[::-1]:
+            _kernels.delete_column(self.upper, self.size, place)
+            self.size -= 1
+
+    def solve(self, right: Floats) -> Floats:
+        """Return the solution for a right side."""
+        from bench.identification import _kernels
+
+        return np.asarray(_kernels.solve_factored(self.upper, self.size, right))
+
+    def lengths(self, first: Floats, second: Floats) -> tuple[float, float]:
+        """Return the norms of two steps in the outputs they cause."""
+        from bench.identification import _kernels
+
+        one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
+        return float(one), float(two)
+
+    def inverse(self) -> Floats:
+        """Return the lower half of the inverse of the Gram block."""
+        from scipy.linalg.lapack import dpotri
+
+        lower, _ = dpotri(self.compact, lower=1, overwrite_c=1)
+        return np.asarray(lower)
+
+    def condition(self, norm: float) -> float:
+        """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""
+        from scipy.linalg.lapack import dpocon
+
+        if not self.size:
+            return 1.0
+        reciprocal, _ = dpocon(self.compact, norm, uplo="L")
+        return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))

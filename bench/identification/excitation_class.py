@@ -1,0 +1,215 @@
+"""The class of an excitation: what kind of input sequence it is, in a few numbers, and whether another is of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import _checks
+from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
+
+LEAST_SWING = 0.02
+"""A swing below this part of the range is noise of the measured input."""
+
+# Values this close, as part of the range, count as equal.
+_TOLERANCE = 0.03
+# A swing of at least this part of the range is one of the major loop.
+_MAJOR = 0.95
+# Share of the reversals that must follow a rule.
+_MOST = 0.8
+# Fewer reversals than this say nothing of a class.
+_FEWEST = 4
+_DECILES = np.linspace(0.0, 1.0, 11)
+# Factor of the two-sample Kolmogorov-Smirnov statistic that equal distributions exceed in 5 % of the cases.
+_SMIRNOV = 1.36
+
+DAMPED = "damped oscillations"
+GROWING = "growing oscillations"
+PERIODIC = "periodic cycles"
+FROM_ABOVE = "first-order reversals from above"
+FROM_BELOW = "first-order reversals from below"
+RANDOM = "random reversals"
+RAMPS = "single ramps"
+
+
+@dataclass(frozen=True)
+class ExcitationClass:
+    """What a sequence of inputs is like, as far as rate-independent memory can tell.
+
+    Parameters
+    ----------
+    kind : str
+        In words, such as `damped oscillations` or `random reversals`.
+    low, high : float
+        Range of the inputs, input units.
+    reversals : int
+        Number of turning points.
+    minor : float
+        Share of the swings from one turning point to the next that belong to minor loops, 0 to 1.
+    contracting : float
+        Share of the swings that are shorter than the one before, 0 to 1: near 1 for a damped oscillation.
+    swings : tuple of float
+        Deciles of the lengths of the swings, as parts of the range, 11 numbers; none without a swing.
+    highs, lows : tuple of float
+        Deciles of the upper and of the lower turning points, input units, 11 numbers each; none without one.
+    """
+
+    kind: str
+    low: float
+    high: float
+    reversals: int
+    minor: float
+    contracting: float
+    swings: tuple[float, ...]
+    highs: tuple[float, ...]
+    lows: tuple[float, ...]
+
+    @classmethod
+    def of(cls, inputs: ArrayLike) -> ExcitationClass:
+        """Return the class of a sequence of inputs, shape (N,).
+
+        Raises ValueError if it is empty or not finite.
+        """
+        values = _checks.samples("inputs", inputs)
+        low, high = float(values.min()), float(values.max())
+        points = _reversals(values)
+        lengths = np.abs(np.diff(points)) / max(high - low, 1e-300)
+        upper, lower = _turning(points)
+        shorter = lengths[1:] < lengths[:-1]
+        contracting = float(shorter.mean()) if shorter.size else 0.0
+        return cls(
+            kind=_kind(upper, lower, contracting, low, high),
+            low=low,
+            high=high,
+            reversals=upper.size + lower.size,
+            minor=float((lengths < _MAJOR).mean()) if lengths.size else 0.0,
+            contracting=contracting,
+            swings=_deciles(lengths),
+            highs=_deciles(upper),
+            lows=_deciles(lower),
+        )
+
+    @property
+    def center(self) -> float:
+        """Where the innermost swing lies, input units; the middle of the range without a swing."""
+        return 0.5 * (self.highs[0] + self.lows[-1] if self.highs and self.lows else self.low + self.high)
+
+    def departures(self, inputs: ArrayLike) -> tuple[str, ...]:
+        """Return in which ways other inputs, shape (N,), are not of this class; none if they are.
+
+        They are of the class if they stay in its range (to 3 % of it), are of its kind, die out at the same place (to
+        3 % of the range) if they are damped oscillations, and the distributions of the
+        swings and of the turning points differ by no more than two samples of one distribution do in 95 % of the
+        cases (two-sample Kolmogorov-Smirnov test on the deciles; the turning points of one sequence depend on each
+        other, so the level is nominal).
+
+        Raises ValueError if they are empty or not finite.
+        """
+        values = _checks.samples("inputs", inputs)
+        span = self.high - self.low
+        margin = _TOLERANCE * span
+        other = ExcitationClass.of(values)
+        found = []
+        if other.low < self.low - margin or other.high > self.high + margin:
+            found.append(f"it spans {other.low:g} to {other.high:g}, not {self.low:g} to {self.high:g}")
+        if other.reversals < _FEWEST <= self.reversals:
+            found.append(f"it has {other.reversals} reversals, too few to tell its class")
+        elif other.kind != self.kind:
+            found.append(f"it is of the kind {other.kind}")
+        elif self.kind == DAMPED and abs(other.center - self.center) > margin:
+            found.append(f"it dies out at {other.center:g}, not at {self.center:g}")
+        points = _reversals(values)
+        upper, lower = _turning(points)
+        swings = np.abs(np.diff(points)) / max(span, 1e-300)
+        # A turning point belongs to two swings: half of them are independent, at most.
+        limit = _SMIRNOV * float(np.sqrt(2.0 / max(self.reversals, 1) + 2.0 / max(other.reversals, 1)))
+        for name, deciles, sample, tolerance in (
+            ("swings", self.swings, swings, _TOLERANCE),
+            ("upper reversals", self.highs, upper, margin),
+            ("lower reversals", self.lows, lower, margin),
+        ):
+            if not deciles or not sample.size:
+                continue
+            distance = _distance(deciles, sample, tolerance)
+            if distance > limit:
+                found.append(f"its {name} are distributed otherwise (distance {distance:.2f}, allowed {limit:.2f})")
+        return tuple(found)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the class as a JSON object."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> ExcitationClass:
+        """Return the class that `to_json` wrote.
+
+        Raises ValueError if a key is missing, unknown or wrong.
+        """
+        try:
+            values: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
+            }
+            found = cls(**values)
+        except TypeError as error:
+            raise ValueError(f"calibrated_on: {error}") from None
+        if not isinstance(found.kind, str):
+            raise ValueError(f"calibrated_on: expected a text for kind, got {found.kind!r}")
+        for name in ("low", "high", "reversals", "minor", "contracting"):
+            _checks.number(f"calibrated_on: {name}", getattr(found, name))
+        for name in ("swings", "highs", "lows"):
+            deciles = getattr(found, name)
+            if deciles and _checks.samples(f"calibrated_on: {name}", deciles).size != _DECILES.size:
+                raise ValueError(f"calibrated_on: {name}: expected {_DECILES.size} deciles, got {len(deciles)}")
+        return found
+
+
+def _reversals(values: Floats) -> Floats:
+    """Return the first input, the values at which the inputs turn, and the last one."""
+    return values[turning_points(values, LEAST_SWING * float(np.ptp(values)))]
+
+
+def _turning(points: Floats) -> tuple[Floats, Floats]:
+    """Return the upper and the lower turning points among points that alternate; both ends are none."""
+    inner = points[1:-1]
+    above = inner > points[:-2]
+    return inner[above], inner[~above]
+
+
+def _deciles(values: Floats) -> tuple[float, ...]:
+    if not values.size:
+        return ()
+    return tuple(float(f"{value:.6g}") for value in np.quantile(values, _DECILES))
+
+
+def _kind(upper: Floats, lower: Floats, contracting: float, low: float, high: float) -> str:
+    count = upper.size + lower.size
+    if count < _FEWEST:
+        return RAMPS
+    margin = _TOLERANCE * (high - low)
+    # The first turn ends the approach.
+    if max(np.ptp(upper[1:]), np.ptp(lower[1:])) <= 2.0 * margin:
+        return PERIODIC
+    if (upper >= high - margin).mean() >= _MOST:
+        return FROM_ABOVE
+    if (lower <= low + margin).mean() >= _MOST:
+        return FROM_BELOW
+    if contracting >= _MOST:
+        return DAMPED
+    return GROWING if contracting <= 1.0 - _MOST else RANDOM
+
+
+def _distance(deciles: tuple[float, ...], sample: Floats, tolerance: float) -> float:
+    """Return the greatest difference of two distributions at the deciles of one.
+
+    Values within the tolerance count as equal.
+    """
+    ordered = np.sort(sample)
+    points = np.array(deciles)
+    below = np.searchsorted(ordered, points - tolerance, side="left") / ordered.size
+    up_to = np.searchsorted(ordered, points + tolerance, side="right") / ordered.size
+    return float(np.maximum(below - _DECILES, _DECILES - up_to).max())

@@ -1,0 +1,66 @@
+"""Products of the columns of a regressor with each other, by folds of the samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.hysteresis import Regressor
+from bench.hysteresis._checks import Floats
+from bench.identification.cell_layout import Indices
+
+# Samples whose rows are formed at a time.
+_ROWS = 4096
+
+
+def normal_equations(
+    regressor: Regressor,
+    outputs: Floats,
+    weights: Floats,
+    skip: int,
+    fold: Indices | None = None,
+    folds: int = 1,
+) -> Floats:
+    """Return, for each fold, the weighted products of the columns, of ones and of the outputs with each other.
+
+    Shape (folds, K + q + 2, K + q + 2). Columns and outputs have about their means subtracted, so that little is
+    cancelled later. The rows are formed some at a time.
+
+    Parameters
+    ----------
+    regressor : Regressor
+        Shape (N, K + q).
+    outputs, weights : ndarray, shape (N,)
+        Measured outputs, and weight of each sample.
+    skip : int
+        Number of first samples left out.
+    fold : ndarray of int64, shape (N,), optional
+        Fold of each sample, from 0; all are one if not given.
+    folds : int
+        Number of folds.
+    """
+    from bench.hysteresis import _kernels
+
+    count = regressor.shape[1] + 2
+    cells = regressor.base.size
+    result = np.zeros((folds, count, count))
+    w = np.where(np.arange(outputs.size) < skip, 0.0, weights)
+    centre = np.zeros(count)
+    row = regressor.base
+    for start in range(0, outputs.size, _ROWS):
+        chunk = slice(start, min(start + _ROWS, outputs.size))
+        dense = np.empty((chunk.stop - start, cells))
+        _kernels.dense_rows(
+            regressor.starts[start : chunk.stop + 1], regressor.cells, regressor.changes, row.copy(), dense
+        )
+        row = dense[-1].copy()
+        rows = np.column_stack([dense, regressor.extra[chunk], np.ones(len(dense)), outputs[chunk]])
+        if not start:
+            # Little is then cancelled in what follows.
+            centre[:] = rows.mean(axis=0)
+            centre[-2] = 0.0
+        rows -= centre
+        counted = w[chunk] > 0.0
+        for k in range(folds):
+            chosen = counted if fold is None else counted & (fold[chunk] == k)
+            result[k] += (rows[chosen] * w[chunk][chosen, None]).T @ rows[chosen]
+    return result

@@ -1,0 +1,135 @@
+"""A model's predictions for one file of measurements, with the session recalibrated and the band about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.errors import ConfigurationError
+from bench.hysteresis import TimedModel
+from bench.identification import Errors, measure_errors
+from bench.identification.recalibration import Recalibration
+from bench.model_file import ModelFile
+from bench.results.bands import BandedPrediction, predict_band
+from bench.results.recalibrations import Session
+from bench.results.times import bind_times
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What a model gives for a sequence of inputs.
+
+    Attributes
+    ----------
+    predicted : ndarray, shape (N,)
+        Outputs of the model, after recalibration if one was asked for.
+    measured : ndarray, shape (N,), or None
+        The measured outputs, where there are some.
+    recalibration : Recalibration or None
+        What moved in the session, if that was asked for.
+    band : BandedPrediction or None
+        The band about the predictions, if the model's file has one.
+    units : (str, str)
+        Units of input and output.
+    first : int
+        First row that counts in errors: those before drive the memory or tell the recalibration.
+    """
+
+    predicted: Floats
+    measured: Floats | None
+    recalibration: Recalibration | None
+    band: BandedPrediction | None
+    units: tuple[str, str]
+    first: int
+
+    @property
+    def residuals(self) -> Floats | None:
+        """Measured minus predicted outputs of the rows that count; None without measurements."""
+        return None if self.measured is None else (self.measured - self.predicted)[self.first :]
+
+    def errors(self) -> Errors:
+        """Return the errors over the rows that count. There must be measurements."""
+        assert self.measured is not None
+        return measure_errors(self.measured[self.first :], self.predicted[self.first :])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return `recalibration` and `band` for programs, those that there are."""
+        found: dict[str, Any] = {}
+        if self.recalibration is not None:
+            found["recalibration"] = {**self.recalibration.to_json(), "errors_from_row": self.first + 1}
+        if self.band is not None:
+            found["band"] = self.band.to_json(self.residuals)
+        return found
+
+
+def examine(
+    model: ModelFile,
+    inputs: Floats,
+    measured: Floats | None = None,
+    *,
+    state: Any = None,  # noqa: ANN401 - each operator has its own
+    session: Session | None = None,
+    skip: int = 0,
+    times: Floats | None = None,
+) -> Examined:
+    """Return what a model gives for a sequence of inputs, shape (N,).
+
+    Parameters
+    ----------
+    model : ModelFile
+        The model.
+    inputs : ndarray, shape (N,)
+        In the unit of the model, finite.
+    measured : ndarray, shape (N,), or None
+        Measured outputs.
+    state : object
+        State before the first row; None is the initial one.
+    session : Session, optional
+        What is estimated of the session from measured outputs.
+    skip : int
+        First rows that drive the memory but do not count.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
+
+    Raises
+    ------
+    ConfigurationError
+        If the session cannot be estimated, or a model with time has no times.
+    """
+    if isinstance(model.model, TimedModel):
+        if session is not None:
+            raise ConfigurationError(f"--recalibrate: {model.name} is a model with time; it takes none")
+        outputs = bind_times(model, times).evaluate(inputs, state)
+        return Examined(outputs, measured, None, None, (model.model.input_unit, model.model.output_unit), skip)
+    operator = model.operator
+    units = operator.input_unit, operator.output_unit
+    if session is None:
+        predicted = np.asarray(operator.evaluate(inputs, state))
+        return Examined(predicted, measured, None, predict_band(model, inputs, state), units, skip)
+    if measured is None:
+        raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
+    found = session.estimate(operator, inputs, measured, skip=skip, state=state)
+    return Examined(
+        found.predict(operator, inputs, state),
+        measured,
+        found,
+        predict_band(model, inputs + found.values.get("input-offset", 0.0), state),
+        units,
+        session.first_unused(inputs.size, skip),
+    )
+
+
+def band_columns(examined: Mapping[str, Examined]) -> list[tuple[str, Floats]]:
+    """Return heads and values of the ends of all bands, the model named in the heads if there are several."""
+    return [
+        (f"{name} {head}" if len(examined) > 1 else head, values)
+        for name, each in examined.items()
+        if each.band is not None
+        for head, values in each.band.columns(each.predicted)
+    ]

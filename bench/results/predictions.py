@@ -1,0 +1,103 @@
+"""A model beside measurements, row by row: the columns that `bench predict` and `bench compare` write."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.identification import Errors, measure_errors
+from bench.units import header_with_unit
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of measurements.
+
+    Attributes
+    ----------
+    name : str
+        As it was asked for; a unit at the end, as in `force [N]`, is that of the quantity.
+    unit : str
+        Empty if unknown.
+    values : ndarray, shape (N,)
+        In that unit.
+    """
+
+    name: str
+    unit: str
+    values: Floats
+
+    @property
+    def header(self) -> str:
+        """The head of the column, with the unit."""
+        return header_with_unit(self.title, self.unit)
+
+    @property
+    def title(self) -> str:
+        """The name without the unit."""
+        return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Outputs of models for one sequence of inputs, beside what was measured.
+
+    Attributes
+    ----------
+    input : Quantity
+        The inputs.
+    unit : str
+        Unit of the output; empty if unknown.
+    predicted : mapping of str to ndarray
+        Outputs by the name of the model, shape (N,) each.
+    measured : Quantity or None
+        The measured outputs, where there are some.
+    time : Quantity or None
+        When each row was taken, where it is known.
+    skip : int
+        First rows, which drive the memory but count in no error.
+    further : sequence of (str, ndarray)
+        Heads and columns of shape (N,) that follow in the table, such as the ends of a prediction band.
+    """
+
+    input: Quantity
+    unit: str
+    predicted: Mapping[str, Floats]
+    measured: Quantity | None = None
+    time: Quantity | None = None
+    skip: int = 0
+    further: Sequence[tuple[str, Floats]] = ()
+
+    def residuals(self) -> dict[str, Floats]:
+        """Return measured minus predicted output by model, shape (N,) each; none without measurements."""
+        if self.measured is None:
+            return {}
+        return {name: self.measured.values - values for name, values in self.predicted.items()}
+
+    def errors(self) -> dict[str, Errors]:
+        """Return the errors over the rows after `skip` by model; none without measurements."""
+        if self.measured is None:
+            return {}
+        measured = self.measured.values[self.skip :]
+        return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
+
+    def table(self) -> list[tuple[str, Floats]]:
+        """Return the columns of a file with their heads: time, input, measured; predicted and residual; `further`.
+
+        The model is named in the heads if there are several.
+        """
+        columns = [(each.header, each.values) for each in (self.time, self.input) if each is not None]
+        if self.measured is not None:
+            columns.append((header_with_unit("measured", self.unit), self.measured.values))
+        residuals = self.residuals()
+        for name, values in self.predicted.items():
+            prefix = f"{name} " if len(self.predicted) > 1 else ""
+            columns.append((header_with_unit(f"{prefix}predicted", self.unit), values))
+            if name in residuals:
+                columns.append((header_with_unit(f"{prefix}residual", self.unit), residuals[name]))
+        return [*columns, *self.further]

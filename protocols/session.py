@@ -1,0 +1,83 @@
+"""The session of a controlled specimen: what moved since its model was identified, estimated before the task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bench.identification.excitation import ramps
+from bench.identification.recalibration import Kind, parse_kinds, recalibrate
+from bench.model_file import ModelFile
+from bench.protocol import Dwell, Note, Phase, Reading, Slots, Step, from_slot, parameter
+from protocols.preparation import ControlledParameters, Part, reset, reset_unknown_memory
+
+SESSION = "session"
+"""Label of the steps that visit known set-points."""
+
+# Where the rig file has none for its drive, s: protocols that take no other readings need none.
+_DWELL = 8.0
+
+
+class SessionParameters(ControlledParameters):
+    """What can be set where a session may be estimated before a controller by a model drives the specimen."""
+
+    recalibrate: str = parameter(
+        "",
+        unit="",
+        help="what is estimated of the session before the task and corrected in the model: some of offset, gain, "
+        "input-offset, with commas; nothing if empty",
+    )
+    recalibrate_readings: int = parameter(
+        120, unit="1", low=10, high=10000, help="readings for that, on one loop from `reset` to `hottest` and back"
+    )
+    recalibrate_dwell: float = parameter(
+        from_slot("drive", "dwell", fallback=_DWELL),
+        unit="s",
+        low=0.01,
+        high=3600,
+        help="hold before each of these readings",
+    )
+
+
+def session_kinds(parameters: SessionParameters) -> tuple[Kind, ...]:
+    """Return what is estimated of the session; nothing if that is not asked for.
+
+    Raises ValueError if it is not understood, or a controller cannot be corrected by it.
+    """
+    kinds = parse_kinds(parameters.recalibrate) if parameters.recalibrate else ()
+    if "drift" in kinds:
+        raise ValueError("recalibrate = drift: a controller has no rows; expected offset, gain, input-offset")
+    return kinds
+
+
+def begin_session(
+    parameters: SessionParameters, slots: Slots, model: ModelFile, kinds: tuple[Kind, ...]
+) -> Part[tuple[Reading, ModelFile]]:
+    """Reset the memory; return the last reading and the model, corrected by what moved in the session.
+
+    With `kinds` the drive visits known set-points on one loop of its range, and returns to the reset. What moved is
+    estimated from all readings there, and noted. Raises ValueError if the readings do not tell it, or the input of
+    such a model cannot be shifted.
+    """
+    if "input-offset" in kinds:
+        # A model that cannot be corrected is refused before anything moves.
+        model.operator.shifted(0.0)
+    reading = yield from reset_unknown_memory(parameters, slots)
+    if not kinds:
+        return reading, model
+    drive, response = slots["drive"], slots["response"]
+    low, high = parameters.reset, parameters.hottest
+    state = model.operator.saturated_state(-1, reading[drive.signal])
+    inputs, outputs = [reading[drive.signal]], [reading[response.signal]]
+    yield Phase("session: known set-points")
+    for target in ramps([low, high, low], 2.0 * abs(high - low) / parameters.recalibrate_readings)[1:].tolist():
+        reading = yield Step({drive.device: target}, Dwell(parameters.recalibrate_dwell), label=SESSION)
+        inputs.append(reading[drive.signal])
+        outputs.append(reading[response.signal])
+    found = recalibrate(model.operator, np.array(inputs), np.array(outputs), kinds, state=state)
+    texts = ", ".join(f"{kind} {text}" for kind, text in found.texts(drive.unit, response.unit))
+    yield Note(f"session: {texts}, from {found.rows} readings at known set-points; the model is corrected by it")
+    corrected = found.corrected(model.operator)
+    reading = yield from reset(slots, low, 8.0)
+    return reading, replace(model, model=corrected, memory=None, band=None)

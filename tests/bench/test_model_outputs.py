@@ -1,0 +1,283 @@
+"""What the commands about models write beside what they print: rows as CSV, figures, model cards."""
+
+import csv
+import hashlib
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from bench.errors import DataError
+from bench.results.data import read_columns
+from bench.results.model_card import sha256_of, write_card
+from bench.results.models import compare_models, identify_file
+from bench.results.prediction_figures import errors_text
+from bench.results.predictions import Predictions, Quantity
+from bench.results.report import draw_comparison, draw_identification, draw_predicted
+
+COLUMNS = ("--input", "voltage", "--output", "displacement")
+NAMES = {"input_column": "voltage", "output_column": "displacement"}
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory):
+    """A file of shrinking loops of a play."""
+    path = tmp_path_factory.mktemp("data") / "loop.csv"
+    inputs = 5 * np.sin(np.linspace(0, 6 * np.pi, 300)) * np.linspace(1, 0.2, 300)
+    play, outputs = 0.0, []
+    for value in inputs:
+        play = min(max(play, value - 1.0), value + 1.0)
+        outputs.append(play + 0.2 * value)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time [s]", "voltage [V]", "displacement [µm]"])
+        writer.writerows(zip(0.5 * np.arange(300.0), inputs, outputs, strict=True))
+    return path
+
+
+@pytest.fixture(scope="module")
+def models(loop):
+    """A model with a plane and one without, in files."""
+    paths = {}
+    for name, options in (("preisach", {"levels": 8}), ("polynomial", {"degree": 3})):
+        paths[name] = loop.parent / f"{name}.json"
+        identify_file(loop, **NAMES, model=name, **options).file.save(paths[name])
+    return paths
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The axes of every figure that is saved, by the name of its file."""
+    found = {}
+    save = Figure.savefig
+
+    def keep(self, path, **options):
+        found[path.name] = self.axes
+        save(self, path, **options)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return found
+
+
+def texts_of(axes):
+    """The legend of axes."""
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def assert_labelled(all_axes):
+    """The lowest of the panels has a label below it, and each has one beside it that names its unit."""
+    assert all_axes[-1].get_xlabel()
+    for axes in all_axes:
+        assert axes.get_ylabel().endswith(("/ µm", "/ V", "/ µm/V²"))
+
+
+class TestRows:
+    def test_rows_have_what_was_printed(self, bench, tmp_path, loop, models):
+        out, result = tmp_path / "out.csv", tmp_path / "out.json"
+        code, text, err = bench("predict", models["preisach"], loop, *COLUMNS, "--out", out, "--json", result)
+        assert code == 0, err
+        rows = read_columns(out, ["voltage", "measured", "predicted", "residual"])
+        assert set(rows.units.values()) == {"V", "µm"}
+        residual = rows.values["residual"]
+        np.testing.assert_array_equal(residual, rows.values["measured"] - rows.values["predicted"])
+        rms = float(np.sqrt(np.mean(residual**2)))
+        assert json.loads(result.read_text())["rms"] == rms
+        assert f"{rms:.4g} µm" in text
+
+    def test_inputs_alone_are_predicted_too(self, bench, tmp_path, loop, models, drawn):
+        code, _, err = bench(
+            "predict", models["preisach"], loop, "--input", "2", "--out", tmp_path / "o.csv",
+            "--figures", tmp_path / "figures",
+        )  # fmt: skip
+        assert code == 0, err
+        assert (tmp_path / "o.csv").read_text().splitlines()[0] == "2 [V],predicted [µm]"
+        assert list(drawn) == ["preisach-loops.png"]
+        assert_labelled(drawn["preisach-loops.png"])
+
+    def test_time_goes_first_and_models_are_told_apart(self):
+        found = Predictions(
+            Quantity("u [V]", "V", np.arange(3.0)),
+            "N",
+            {"a": np.zeros(3), "b": np.ones(3)},
+            Quantity("force", "N", np.full(3, 2.0)),
+            Quantity("t", "s", np.arange(3.0)),
+            skip=1,
+            further=[("b upper [N]", np.full(3, 1.5))],
+        )
+        heads = [head for head, _ in found.table()]
+        assert heads[:3] == ["t [s]", "u [V]", "measured [N]"]
+        assert heads[3:] == ["a predicted [N]", "a residual [N]", "b predicted [N]", "b residual [N]", "b upper [N]"]
+        assert {name: errors.rms for name, errors in found.errors().items()} == {"a": 2.0, "b": 1.0}
+
+    def test_compared_rows_give_the_compared_errors(self, bench, tmp_path, loop, models):
+        out, result = tmp_path / "out.csv", tmp_path / "out.json"
+        code, _, err = bench(
+            *("compare", *models.values(), "--data", loop, "--skip", 40, "--out", out, "--json", result)
+        )
+        assert code == 0, err
+        compared = json.loads(result.read_text())
+        for name in models:
+            residual = read_columns(out, [f"{name} residual"]).values[f"{name} residual"]
+            assert residual.size == 300
+            assert np.abs(residual[40:]).max() == pytest.approx(compared[name]["raw"]["max"], rel=1e-12)
+
+    def test_an_output_in_another_unit_is_refused(self, bench, tmp_path, loop, models):
+        other = tmp_path / "other.csv"
+        other.write_text(loop.read_text(encoding="utf-8").replace("µm", "mm"), encoding="utf-8")
+        code, _, err = bench("predict", models["preisach"], other, *COLUMNS, "--out", tmp_path / "o.csv")
+        assert code == 3
+        assert "displacement is in mm" in err
+
+
+class TestFigures:
+    @pytest.mark.parametrize("model", ["preisach", "polynomial"])
+    def test_a_fit_is_drawn_with_the_errors_of_the_text(self, tmp_path, loop, drawn, model):
+        found = identify_file(loop, **NAMES, model=model, skip=60)
+        paths = draw_identification(found, tmp_path / "figures")
+        assert [path.name for path in paths] == list(drawn)
+        errors = found.identification.errors
+        for name in (f"{model}-loops.png", f"{model}-errors.png"):
+            top, bottom = drawn[name]
+            assert_labelled([top, bottom])
+            assert texts_of(bottom) == [f"{model}: {errors_text(errors, 'µm')}"]
+            assert "first 60 samples, not in the errors" in texts_of(top)
+            # The last line but one is the residual that counts: no more than what the text says.
+            counted = bottom.lines[-2].get_ydata()
+            assert counted.size == 240
+            assert np.abs(counted).max() == pytest.approx(errors.maximum, rel=1e-12)
+        assert drawn[f"{model}-loops.png"][1].get_xlabel() == "voltage / V"
+        assert drawn[f"{model}-errors.png"][1].get_xlabel() == "row"
+
+    def test_cells_that_the_samples_of_the_fit_leave_out_are_grey(self, tmp_path, loop, drawn):
+        found = identify_file(loop, **NAMES, model="preisach", skip=60)
+        # The memory has swept them, the fit has not seen it.
+        assert found.coverage.fraction == 1.0
+        draw_identification(found, tmp_path)
+        share = 1.0 - found.identification.certificate.coverage
+        title = drawn["preisach-density.png"][0].get_title(loc="left")
+        assert title == f"grey: never swept ({share:.0%} of the cells)"
+        assert share > 0.1
+
+    def test_a_prediction_is_drawn_over_time_where_it_is_known(self, tmp_path, drawn):
+        u = np.linspace(0.0, 1.0, 5)
+        found = Predictions(
+            Quantity("u", "V", u), "N", {"m": u}, Quantity("f", "N", u + 1.0), Quantity("t", "s", 2.0 * u)
+        )
+        draw_predicted(found, tmp_path)
+        assert drawn["m-errors.png"][1].get_xlabel() == "time / s"
+        assert drawn["m-errors.png"][1].lines[0].get_xdata()[-1] == 2.0
+
+    def test_compared_models_share_their_figures(self, tmp_path, loop, models, drawn):
+        compared = compare_models(list(models.values()), loop, None, None, skip=30)
+        draw_comparison(compared, tmp_path)
+        assert len(texts_of(drawn["models-errors.png"][1])) == 2
+        for axes, name in zip(drawn["residuals.png"], models, strict=True):
+            shown = float(re.search(r"max (\S+),", axes.get_title(loc="left")).group(1))
+            assert shown == pytest.approx(compared.comparisons[name].raw.maximum, rel=6e-3)
+
+    def test_a_figure_that_cannot_be_written_is_named(self, tmp_path, loop):
+        found = identify_file(loop, **NAMES, model="polynomial")
+        (tmp_path / "polynomial-loops.png").mkdir()
+        with pytest.raises(DataError, match=r"polynomial-loops\.png cannot be written"):
+            draw_identification(found, tmp_path)
+
+
+class TestPlaces:
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (["--out", "DIR/none/m.json"], ["--out", "no folder"]),
+            (["--out", "DIR"], ["--out", "is a folder"]),
+            (["--out", "DATA"], ["--out", "it is read"]),
+            (["--card", "DIR/none/card.md"], ["--card", "no folder"]),
+            (["--card", "DIR/x", "--out", "DIR/x"], ["--card", "that of --out"]),
+            (["--figures", "DATA/figures"], ["--figures", "cannot be made"]),
+            (["--json", "DATA"], ["--json", "it is read"]),
+            (["--out", "DIR/x", "--json", "DIR/../DIRNAME/x"], ["--json", "that of --out"]),
+        ],
+    )
+    def test_what_cannot_be_written_is_found_before_the_fit(self, bench, tmp_path, options, words):
+        # Of a file that cannot be fitted: the options come first.
+        data = tmp_path / "data.csv"
+        data.write_text("voltage,displacement\n1,1\n")
+        places = [
+            text.replace("DIRNAME", tmp_path.name).replace("DIR", str(tmp_path)).replace("DATA", str(data))
+            for text in options
+        ]
+        code, _, err = bench("identify", data, *COLUMNS, "--model", "preisach", *places)
+        assert code in (2, 3)
+        for word in words:
+            assert word in err.replace("\n", " ")
+        assert data.read_text() == "voltage,displacement\n1,1\n"
+
+    def test_the_folder_of_figures_is_made(self, bench, tmp_path, loop):
+        code, _, err = bench(
+            "identify", loop, *COLUMNS, "--model", "polynomial", "--figures", tmp_path / "new" / "figures"
+        )
+        assert code == 0, err
+        assert len(list((tmp_path / "new" / "figures").iterdir())) == 2
+
+
+def read_card(path):
+    """A card's sections by title: the rows of the table by their first cells, or the text."""
+    found = {}
+    for section in path.read_text(encoding="utf-8").split("\n## ")[1:]:
+        title, _, text = section.partition("\n")
+        lines = text.strip().splitlines()
+        if lines[0].startswith("|"):
+            rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in lines[2:]]
+            found[title] = {key.strip(): [cell.strip() for cell in cells] for key, *cells in rows}
+        else:
+            found[title] = text.strip()
+    return found
+
+
+class TestCard:
+    def test_a_card_has_what_the_fit_has(self, bench, tmp_path, loop):
+        result = tmp_path / "fit.json"
+        code, _, err = bench(
+            "identify", loop, *COLUMNS, "--model", "preisach", "--levels", 6, "--plane", -6, 6, "--skip", 60,
+            "--cross-validate", "--card", tmp_path / "card.md", "--figures", tmp_path / "figures", "--json", result,
+            "--out", tmp_path / "model.json",
+        )  # fmt: skip
+        assert code == 0, err
+        card, fit = read_card(tmp_path / "card.md"), json.loads(result.read_text())
+        assert card["Data"]["SHA-256"] == [hashlib.sha256(loop.read_bytes()).hexdigest()]
+        assert card["Data"]["rows"][0].startswith("300, of which the first 60 ")
+        assert card["Data"]["output"][0].endswith("µm")
+        assert card["Errors"]["RMS"] == [f"{fit['rms']:.4g}", f"{fit['rms_percent']:.2f}"]
+        assert card["Errors"]["largest"] == [f"{fit['max']:.4g}", f"{fit['max_percent']:.2f}"]
+        assert card["Certificate"]["coefficients"] == [f"{fit['passive']} free, {fit['active']} held at zero"]
+        assert card["Limits of validity"]["input"][0].startswith("-6 to 6 V")
+        assert "negative saturation" in card["Limits of validity"]["memory before the first row"][0]
+        assert "smoothing" in card["Selection"]
+        for warning in fit["warnings"]:
+            assert f"- {warning}" in card["Warnings"]
+        for link in re.findall(r"\]\(<(.+?)>\)", card["Figures"]):
+            assert (tmp_path / link).stat().st_size > 0
+
+    def test_its_command_identifies_the_same_model(self, bench, tmp_path, loop):
+        bench(
+            "identify", loop, *COLUMNS, "--model", "prandtl-ishlinskii", "--option", "plays=4", "--option",
+            "origin=0.5", "--initial", "skip", "--card", tmp_path / "card.md", "--out", tmp_path / "model.json",
+        )  # fmt: skip
+        program, *words = shlex.split(read_card(tmp_path / "card.md")["Reproduce"].splitlines()[1])
+        assert program == "bench"
+        model = (tmp_path / "model.json").read_text()
+        (tmp_path / "model.json").unlink()
+        code, _, err = bench(*words)
+        assert code == 0, err
+        assert (tmp_path / "model.json").read_text() == model
+
+    def test_a_model_without_memory_has_a_card(self, tmp_path, loop):
+        found = identify_file(loop, **NAMES, model="polynomial")
+        write_card(tmp_path / "a|b.md", found, loop, command="bench", model=None, figures=[])
+        card = read_card(tmp_path / "a|b.md")
+        assert "Figures" not in card
+        assert card["Limits of validity"]["memory before the first row"][0].startswith("none")
+        assert sha256_of(loop) == card["Data"]["SHA-256"][0]
+        with pytest.raises(DataError, match=r"model card .* cannot be written"):
+            write_card(tmp_path / "none" / "card.md", found, loop, command="bench", model=None, figures=[])

@@ -1,0 +1,171 @@
+"""Prediction bands: their coverage on plants of another structure, and where they are flagged."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from other_plants import STEP, damped, first_order, measured, random_reversals
+
+from bench.identification import ramps
+from bench.identification.bands import Band, calibrate_band
+from bench.identification.by_name import set_up_problem
+
+PREISACH = ("preisach", {"levels": 20, "plane": (-1.0, 1.0), "reversible": "linear"})
+PLAYS = ("prandtl-ishlinskii", {})
+
+
+def calibrated(model, inputs, outputs, **options):
+    name, given = model
+    problem = set_up_problem(name, inputs, outputs, None, options.pop("skip", 0), 0.0, None, dict(given))
+    found = problem.fit(0.0)
+    return problem.template.with_coefficients(found.coefficients, found.bias), calibrate_band(problem, **options)
+
+
+def coverage(model, band, inputs, outputs, *, simultaneous=False):
+    inside = np.abs(outputs - model.evaluate(inputs)) <= band.half_widths(model, inputs, simultaneous=simultaneous)
+    if not simultaneous:
+        return float(inside.mean())
+    stretches = inside[: inside.size // band.stretch * band.stretch].reshape(-1, band.stretch)
+    return float(stretches.all(axis=1).mean())
+
+
+def departures(band, model, inputs):
+    return band.departures(inputs, band.spread(model, inputs))
+
+
+@pytest.mark.parametrize("plant", ["bouc-wen", "duhem"])
+@pytest.mark.parametrize("model", [PREISACH, PLAYS], ids=["preisach", "plays"])
+def test_nine_of_ten_are_covered_on_other_inputs_of_the_same_class(plant, model):
+    covered, together, flagged = [], [], 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        inputs, others = random_reversals(rng), random_reversals(rng)
+        found, band = calibrated(model, inputs, measured(plant, inputs, rng))
+        outputs = measured(plant, others, rng)
+        flagged += bool(departures(band, found, others))
+        covered.append(coverage(found, band, others, outputs))
+        together.append(coverage(found, band, others, outputs, simultaneous=True))
+    assert 0.85 <= np.mean(covered) <= 0.95
+    assert min(covered) >= 0.7
+    assert flagged <= 2
+    assert np.mean(together) >= 0.8
+
+
+@pytest.mark.parametrize("plant", ["bouc-wen", "duhem"])
+def test_a_band_is_flagged_where_it_covers_less_than_it_says(plant):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        inputs = damped(rng)
+        found, band = calibrated(PREISACH, inputs, measured(plant, inputs, rng))
+        assert band.calibrated_on.kind == "damped oscillations"
+        others = first_order(rng)
+        assert coverage(found, band, others, measured(plant, others, rng)) < 0.85
+        assert any("first-order reversals" in text for text in departures(band, found, others))
+        assert departures(band, found, random_reversals(rng))
+
+
+def test_independent_noise_on_a_line_gives_the_quantile_of_the_noise():
+    rng = np.random.default_rng(0)
+    inputs = rng.uniform(-1.0, 1.0, 4000)
+    found, band = calibrated(("polynomial", {"degree": 1}), inputs, inputs + 0.1 * rng.normal(size=inputs.size))
+    assert band.pointwise == pytest.approx(1.645, abs=0.06)
+    assert band.variance.residual == pytest.approx(0.1, rel=0.03)
+    assert band.variance.freedom == 2.0
+    assert band.held_out == pytest.approx(0.1, rel=0.03)
+    np.testing.assert_allclose(band.half_widths(found, inputs), 0.1645, rtol=0.06)
+
+
+def test_scale_and_offset_of_the_output_go_through():
+    rng = np.random.default_rng(4)
+    inputs = random_reversals(rng)
+    outputs = measured("bouc-wen", inputs, rng)
+    for model, factor, offset in ((PREISACH, 1024.0, 0.0), (PLAYS, 1000.0, 7.0)):
+        small, band = calibrated(model, inputs, outputs)
+        large, wider = calibrated(model, inputs, factor * outputs + offset)
+        assert wider.pointwise == pytest.approx(band.pointwise, rel=1e-3)
+        widths = factor * band.half_widths(small, inputs)
+        np.testing.assert_allclose(wider.half_widths(large, inputs), widths, rtol=1e-3)
+
+
+def test_a_falling_output_has_the_band_of_the_rising_one():
+    rng = np.random.default_rng(4)
+    inputs = random_reversals(rng)
+    outputs = measured("duhem", inputs, rng)
+    model, band = calibrated(PREISACH, inputs, outputs)
+    falling, other = calibrated(PREISACH, inputs, -outputs)
+    assert other.pointwise == pytest.approx(band.pointwise, rel=1e-3)
+    np.testing.assert_allclose(other.half_widths(falling, inputs), band.half_widths(model, inputs), rtol=1e-3)
+
+
+def test_the_record_is_not_cut_and_skipped_rows_do_not_count():
+    rng = np.random.default_rng(5)
+    inputs = random_reversals(rng)
+    outputs = measured("duhem", inputs, rng)
+    strange = outputs.copy()
+    strange[:100] = 1e3
+    _, band = calibrated(PREISACH, inputs, outputs, skip=100)
+    _, other = calibrated(PREISACH, inputs, strange, skip=100)
+    assert other.to_json() == band.to_json()
+    assert band.rows <= inputs.size - 100
+
+
+def test_the_outermost_loop_is_left_out_of_the_scores():
+    # Only the first two ramps leave the middle; all else is within it.
+    rng = np.random.default_rng(6)
+    inner = 0.3 * random_reversals(rng)
+    inputs = np.concatenate([ramps([-1.0, 1.0, -0.3], STEP), inner])
+    outputs = measured("duhem", inputs, rng)
+    _, band = calibrated(PREISACH, inputs, outputs)
+    assert band.rows < inputs.size
+    assert band.held_out < 0.1 * np.ptp(outputs)
+
+
+def test_few_samples():
+    rng = np.random.default_rng(7)
+    inputs = ramps([-1.0, 1.0, -0.5, 0.5, 0.0], 0.15)
+    outputs = measured("bouc-wen", inputs, rng)
+    model, band = calibrated(("prandtl-ishlinskii", {"plays": 4}), inputs, outputs)
+    assert band.simultaneous is None
+    with pytest.raises(ValueError, match=r"\d blocks are too few for a simultaneous band of 90 %"):
+        band.half_widths(model, inputs, simultaneous=True)
+    with pytest.raises(ValueError, match="too few to leave blocks of them out"):
+        calibrated(("polynomial", {"degree": 2}), inputs[:9], outputs[:9])
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_levels(level):
+    inputs = np.linspace(0.0, 1.0, 50)
+    with pytest.raises(ValueError, match="level: expected a number between 0 and 1"):
+        calibrated(("polynomial", {"degree": 1}), inputs, inputs, level=level)
+
+
+def test_a_higher_level_is_wider():
+    rng = np.random.default_rng(8)
+    inputs = random_reversals(rng)
+    outputs = measured("duhem", inputs, rng)
+    widths = [calibrated(PLAYS, inputs, outputs, level=level)[1].pointwise for level in (0.5, 0.9, 0.95)]
+    assert widths == sorted(widths)
+    assert widths[0] < widths[-1]
+
+
+def test_what_is_written_is_read():
+    rng = np.random.default_rng(9)
+    inputs = random_reversals(rng)
+    model, band = calibrated(PREISACH, inputs, measured("bouc-wen", inputs, rng))
+    again = Band.from_json(json.loads(json.dumps(band.to_json())))
+    assert again.to_json() == band.to_json()
+    np.testing.assert_array_equal(again.half_widths(model, inputs), band.half_widths(model, inputs))
+    assert Band.from_json(replace(band, simultaneous=None).to_json()).simultaneous is None
+    for key, value in (("level", 1.5), ("pointwise", -1.0), ("rows", None), ("variance", []), ("calibrated_on", 1)):
+        with pytest.raises(ValueError, match="band"):
+            Band.from_json({**band.to_json(), key: value})
+
+
+def test_a_band_of_another_model_is_refused():
+    rng = np.random.default_rng(10)
+    inputs = random_reversals(rng)
+    _, band = calibrated(PREISACH, inputs, measured("bouc-wen", inputs, rng))
+    small, _ = calibrated(("polynomial", {"degree": 2}), inputs, inputs + 0.01 * rng.normal(size=inputs.size))
+    with pytest.raises(ValueError, match="band: belongs to a model of more than"):
+        band.half_widths(small, inputs)
