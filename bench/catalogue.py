@@ -8,7 +8,7 @@ from typing import Any
 
 from bench import registry
 from bench.errors import ConfigurationError
-from bench.hysteresis import identifiable_models
+from bench.hysteresis import identifiable_models, timed_models
 from bench.protocol import ProtocolDefinition, packaged_protocols
 from bench.protocol.fit import fits
 from bench.rig_file import RigFile, load_rig, packaged_rigs
@@ -61,7 +61,7 @@ class Catalogue:
         packaged = packaged_protocols()
         problems += packaged.problems
         packages |= {name: package for name, package in packaged.packages.items() if package != registry.OWN_PACKAGE}
-        models = identifiable_models()
+        models = identifiable_models() | timed_models()
         # Not listed by themselves; what another package cannot load is named all the same.
         groups: tuple[registry.Group, ...] = ("devices", "laboratories", "derived_signals", "commands")
         for group in groups:

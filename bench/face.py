@@ -165,9 +165,9 @@ def identify(
         Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
         `response` if not given.
     **options
-        As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`
-        and the options of the model; and those of `ReadingOptions` where the layout of a file is not found from it:
-        `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
+        As in `bench.results.models.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`,
+        `time_column` for a model with time, and the options of the model; and those of `ReadingOptions` where the
+        layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
 
     Raises
     ------
@@ -202,7 +202,12 @@ def identify(
 
 
 def predict(
-    model: Model, inputs: npt.ArrayLike, *, initial: str | None = None, continue_memory: bool = False
+    model: Model,
+    inputs: npt.ArrayLike,
+    *,
+    times: npt.ArrayLike | None = None,
+    initial: str | None = None,
+    continue_memory: bool = False,
 ) -> npt.NDArray[np.float64]:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its units.
 
@@ -212,6 +217,8 @@ def predict(
         The model.
     inputs : array_like, shape (N,)
         Inputs in the unit of the model.
+    times : array_like, shape (N,), optional
+        s, strictly increasing, for a model with time.
     initial : {"file", "negative", "positive"}, optional
         The memory before the first input: that at the start of the model's own data (if not given), or saturation at
         the low or the high end of the operating range.
@@ -222,9 +229,12 @@ def predict(
     ------
     DataError
         If a model file cannot be read.
+    ConfigurationError
+        If a model with time has no times.
     """
     values = np.asarray(inputs, dtype=np.float64)
-    return predict_file(_model(model), values, initial=initial, continue_memory=continue_memory)
+    moments = None if times is None else np.asarray(times, dtype=np.float64)
+    return predict_file(_model(model), values, initial=initial, continue_memory=continue_memory, times=moments)
 
 
 def invert(

@@ -11,10 +11,10 @@ A file of version 2 is an object with these keys:
 `model`
     The content that the model's class writes: its `type` (the kind), coefficients, ranges and units.
 `memory`
-    The state of an operator at the end of the data from which it was identified; null for a model without memory
-    or of several inputs.
+    The state of an operator, or of a model with time, at the end of the data from which it was identified; null for
+    a model without memory or of several inputs.
 `initial`
-    Its state before the first row of these data, written alike; may be missing: the operator's own initial state.
+    Its state before the first row of these data, written alike; may be missing: the model's own initial state.
 `band`
     The prediction band (`Band` of `bench.identification.bands`); left out if there is none.
 `provenance`
@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import DataError
-from bench.hysteresis import Operator, model_class, model_from_json
+from bench.hysteresis import Operator, TimedModel, model_class, model_from_json
 
 if TYPE_CHECKING:
     from bench.identification.bands import Band
@@ -58,7 +58,8 @@ class ModelFile:
     model : object
         The model itself, of a registered class.
     memory : object
-        State of an operator at the end of the data from which it was identified; None for other models.
+        State of an operator, or of a model with time, at the end of the data from which it was identified; None for
+        other models.
     provenance : mapping
         Where it comes from.
     initial : object
@@ -82,8 +83,17 @@ class ModelFile:
         Raises DataError if it is another.
         """
         if not isinstance(self.model, Operator):
-            raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one of one input")
+            expected = "without time" if isinstance(self.model, TimedModel) else "of one input"
+            raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one {expected}")
         return self.model
+
+    @property
+    def response(self) -> Operator[Any] | TimedModel[Any]:
+        """The model, if it is one of one input and one output, with time or without.
+
+        Raises DataError if it is another.
+        """
+        return self.model if isinstance(self.model, TimedModel) else self.operator
 
     def to_json(self) -> dict[str, Any]:
         """Return the file's content."""
@@ -93,8 +103,8 @@ class ModelFile:
             "name": self.name,
             "kind": self.model.kind,
             "model": self.model.to_json(),
-            "memory": None if self.memory is None else self.operator.state_to_json(self.memory),
-            "initial": None if self.initial is None else self.operator.state_to_json(self.initial),
+            "memory": None if self.memory is None else self.response.state_to_json(self.memory),
+            "initial": None if self.initial is None else self.response.state_to_json(self.initial),
             **({} if self.band is None else {"band": self.band.to_json()}),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
@@ -195,7 +205,7 @@ def parse_model(content: object, source: str) -> ModelFile:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
         memory = content["memory"] if format_ == FORMAT else None
         initial = None if former else content.get("initial")
-        if isinstance(model, Operator):
+        if isinstance(model, Operator | TimedModel):
             for key in ("input_unit", "output_unit"):
                 if not isinstance(getattr(model, key), str):
                     raise TypeError(f"operator: expected a text for {key}, got {getattr(model, key)!r}")

@@ -22,6 +22,7 @@ from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
 from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
+from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
 from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
@@ -92,6 +93,14 @@ def twin() -> None:
     Specimen((operator,), Dynamics(0.02, ActuatorDynamics(frequency=1.0), response), 0.0).advance(np.ones(4))
 
 
+def timed() -> None:
+    """Evaluate models with time."""
+    times, inputs = np.arange(4.0), np.array([0.0, 1.0, 0.2, 0.8])
+    plays = PrandtlIshlinskii(np.array([0.0, 0.2]), np.ones(2))
+    Hammerstein(plays, LinearPart(0.5, (0.1, 0.1))).evaluate(times, inputs)
+    BoucWenOscillator(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
+
+
 def laboratories() -> None:
     """Open each: it compiles its loops."""
     for rig in ("vo2", "sma", "mckibben", "coiled-polymer", "hybrid"):
@@ -104,4 +113,5 @@ if __name__ == "__main__":
     element_operators()
     hybrid_estimate()
     twin()
+    timed()
     laboratories()

@@ -43,6 +43,9 @@ def compare_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Output column; the first model's if not given.")
     ] = None,
+    time_column: Annotated[
+        str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for models with time.")
+    ] = None,
     skip: Annotated[
         int | None,
         typer.Option(
@@ -75,11 +78,14 @@ def compare_(
     and how far each signal is apart at equal steps.
     """
     if data is None:
-        of_models = (input_column, output_column, skip, initial, bands, recalibrate, recalibrate_rows, out, figures)
+        of_models = (
+            input_column, output_column, time_column, skip, initial, bands, recalibrate, recalibrate_rows, out,
+            figures,
+        )  # fmt: skip
         if any(of_models) or reading != ReadingOptions():
             raise ConfigurationError(
-                "--input, --output, --skip, --initial, --bands, --recalibrate, --out, --figures and how a file is "
-                "read are for models, with --data FILE"
+                "--input, --output, --time, --skip, --initial, --bands, --recalibrate, --out, --figures and how a "
+                "file is read are for models, with --data FILE"
             )
         check_outputs(json_file=json_file)
         _compare_runs(compared, json_file)
@@ -97,6 +103,7 @@ def compare_(
             output_column,
             skip=skip,
             initial=initial,
+            time_column=time_column,
             session=session,
             reading=reading,
         )

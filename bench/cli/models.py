@@ -53,6 +53,11 @@ InitialOption = Annotated[
 ]
 
 
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for a model with time.")
+]
+
+
 @app.command("identify")
 @offer_comparing
 @offer_model_options
@@ -99,6 +104,19 @@ def identify_(
             metavar="KIND",
             help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
             "reach, or estimate it.",
+        ),
+    ] = None,
+    time_column: TimeColumn = None,
+    static: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
+    ] = None,
+    dynamics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
+            "none; chosen by the data if not given (hammerstein).",
         ),
     ] = None,
     orientation: Annotated[
@@ -164,6 +182,9 @@ def identify_(
             input_column=input_column,
             output_column=output_column,
             model=model,
+            time_column=time_column,
+            static=static,
+            dynamics=dynamics,
             cross_validated=cross_validate,
             weights_column=weights_column,
             levels_to_try=options.levels_to_try,
@@ -176,7 +197,7 @@ def identify_(
         found = selected.record_in(found)
     print_assumptions(names, found.assumptions)
     if found.trials is not None:
-        console.print(f"cross-validation, errors in {found.file.operator.output_unit or 'output units'}:")
+        console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
@@ -204,6 +225,7 @@ def predict_(
     output_column: Annotated[
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
+    time_column: TimeColumn = None,
     skip: Annotated[
         int | None,
         typer.Option(
@@ -237,25 +259,28 @@ def predict_(
     from bench.results.predictions import Predictions, Quantity
     from bench.results.recalibrations import Session
     from bench.results.starting_state import starting_state
+    from bench.results.times import read_times
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     session = Session.parse(recalibrate, recalibrate_rows)
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
-        columns = read_columns(file, [input_column] + ([output_column] if output_column else []), options=reading)
+        names = [name for name in (input_column, output_column, time_column) if name]
+        columns = read_columns(file, names, options=reading)
     print_assumptions(file.name, columns.assumptions)
     inputs = columns.values[input_column]
-    check_unit(model.operator.input_unit, columns.units[input_column], input_column)
+    check_unit(model.response.input_unit, columns.units[input_column], input_column)
     if output_column:
-        check_unit(model.operator.output_unit, columns.units[output_column], output_column)
+        check_unit(model.response.output_unit, columns.units[output_column], output_column)
     if warning := outside_of_range(model, inputs):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
     measured = columns.values[output_column] if output_column else None
-    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip)
-    unit = model.operator.output_unit
+    times = read_times(columns, time_column) if time_column else None
+    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip, times=times)
+    unit = model.response.output_unit
     rows = Predictions(
-        Quantity(input_column, columns.units[input_column] or model.operator.input_unit, inputs),
+        Quantity(input_column, columns.units[input_column] or model.response.input_unit, inputs),
         unit,
         {model.name: found.predicted},
         Quantity(output_column, unit, columns.values[output_column]) if output_column else None,

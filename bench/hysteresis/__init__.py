@@ -10,7 +10,14 @@ from bench.hysteresis.inverse import Inverse, Inversion, Policy
 from bench.hysteresis.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bench.hysteresis.maxwell_slip import MaxwellSlip
 from bench.hysteresis.memory import MemoryCurve
-from bench.hysteresis.models import ModelSpec, find_model, identifiable_models, model_class, model_from_json
+from bench.hysteresis.models import (
+    ModelSpec,
+    find_model,
+    identifiable_models,
+    model_class,
+    model_from_json,
+    timed_models,
+)
 from bench.hysteresis.operator import Operator, Shape, operator_from_json
 from bench.hysteresis.polynomial import Polynomial
 from bench.hysteresis.polynomial_plays import PolynomialPlays
@@ -25,6 +32,7 @@ from bench.hysteresis.reversible import (
     ThermalExpansion,
     reversible_from_json,
 )
+from bench.hysteresis.timed import TimedModel
 from bench.hysteresis.two_stage import Coupled, Linear, Summed, TwoStage
 from bench.hysteresis.two_stage_state import TwoStageState
 
@@ -60,6 +68,7 @@ __all__ = [
     "Shape",
     "Summed",
     "ThermalExpansion",
+    "TimedModel",
     "TwoStage",
     "TwoStageState",
     "find_model",
@@ -68,5 +77,6 @@ __all__ = [
     "model_from_json",
     "operator_from_json",
     "reversible_from_json",
+    "timed_models",
     "uniform_levels",
 ]

@@ -39,6 +39,9 @@ class ModelSpec:
     sizes : mapping of str to tuple
         Values of options of `template` from the coarsest to the finest, which it goes through together as long as
         the error falls.
+    fit_in_time : callable or None
+        For a model with time (`TimedModel`), in place of `template`: takes times, inputs, outputs and the keyword
+        options `weights`, `skip`, `initial`, units and its own; returns an `Identification`.
     """
 
     summary: str
@@ -49,11 +52,17 @@ class ModelSpec:
     estimate_state: Callable[..., Any] | None = None
     variants: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     sizes: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    fit_in_time: Callable[..., Any] | None = None
 
 
 def identifiable_models() -> dict[str, ModelSpec]:
     """Return the registered models that `identify` can fit, by name; entries that cannot be imported are left out."""
     return {name: spec for name, spec in _specs().items() if spec.template is not None}
+
+
+def timed_models() -> dict[str, ModelSpec]:
+    """Return the registered models with time that can be fitted, by name; what cannot be imported is left out."""
+    return {name: spec for name, spec in _specs().items() if spec.fit_in_time is not None}
 
 
 def find_model(name: str) -> ModelSpec:

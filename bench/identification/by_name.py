@@ -8,7 +8,7 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import ModelSpec, Operator, Regressor, _checks, find_model
+from bench.hysteresis import ModelSpec, Operator, Regressor, TimedModel, _checks, find_model
 from bench.hysteresis._checks import Floats
 from bench.identification.inspection import check_data
 from bench.identification.least_squares import Certificate, Fit, counted_weights
@@ -26,7 +26,7 @@ from bench.identification.regularization import Regularization, choose_regulariz
 from bench.identification.shape import fit_operator, fit_shape, undetermined_shape
 from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 
-M = TypeVar("M", bound=Operator[Any])
+M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
 
 
@@ -38,8 +38,8 @@ class Identification(Generic[M]):
     ----------
     model_name : str
         Name of the model in `bench.models`.
-    model : Operator
-        The identified operator.
+    model : Operator or TimedModel
+        The identified model.
     residuals : ndarray, shape (N,)
         Measured output minus `model.evaluate(inputs, initial_state)` for every sample, the skipped ones too,
         output units.

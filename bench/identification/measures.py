@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import Operator, _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.timed import TimedSequence
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Comparison:
 
 
 def compare(
-    models: Mapping[str, Operator[Any]],
+    models: Mapping[str, Operator[Any] | TimedSequence],
     inputs: ArrayLike,
     outputs: ArrayLike,
     *,

@@ -101,9 +101,10 @@ def predict_band(model: ModelFile, inputs: Floats, state: Any = None) -> BandedP
     state : object
         State before the first row; None is the initial one.
     """
-    band, operator = model.band, model.operator
+    band = model.band
     if band is None:
         return None
+    operator = model.operator
     spread = band.spread(operator, inputs, state)
     return BandedPrediction(
         band,

@@ -10,11 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import ConfigurationError
+from bench.hysteresis import TimedModel
 from bench.identification import Errors, measure_errors
 from bench.identification.recalibration import Recalibration
 from bench.model_file import ModelFile
 from bench.results.bands import BandedPrediction, predict_band
 from bench.results.recalibrations import Session
+from bench.results.times import bind_times
 
 Floats = npt.NDArray[np.float64]
 
@@ -74,6 +76,7 @@ def examine(
     state: Any = None,  # noqa: ANN401 - each operator has its own
     session: Session | None = None,
     skip: int = 0,
+    times: Floats | None = None,
 ) -> Examined:
     """Return what a model gives for a sequence of inputs, shape (N,).
 
@@ -91,12 +94,19 @@ def examine(
         What is estimated of the session from measured outputs.
     skip : int
         First rows that drive the memory but do not count.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
 
     Raises
     ------
     ConfigurationError
-        If the session cannot be estimated.
+        If the session cannot be estimated, or a model with time has no times.
     """
+    if isinstance(model.model, TimedModel):
+        if session is not None:
+            raise ConfigurationError(f"--recalibrate: {model.name} is a model with time; it takes none")
+        outputs = bind_times(model, times).evaluate(inputs, state)
+        return Examined(outputs, measured, None, None, (model.model.input_unit, model.model.output_unit), skip)
     operator = model.operator
     units = operator.input_unit, operator.output_unit
     if session is None:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import DataError
-from bench.hysteresis import MemoryCurve, Operator
+from bench.hysteresis import MemoryCurve, Operator, TimedModel
 from bench.identification import Errors
 from bench.journal import Record
 from bench.results.models import IdentifiedFile, certificate_lines
@@ -150,7 +150,7 @@ def _errors(found: IdentifiedFile) -> list[tuple[str, str, str]]:
 
 
 def _limits(found: IdentifiedFile, inputs: Quantity, time: Quantity | None) -> list[tuple[str, str]]:
-    operator = found.file.operator
+    operator = found.file.response
     # Swings between reversals say which class of inputs the errors hold for.
     moved = inputs.values[np.append(True, np.diff(inputs.values) != 0.0)]
     turns = np.flatnonzero(np.diff(np.sign(np.diff(moved)))) + 1
@@ -176,14 +176,17 @@ def _rate(inputs: Quantity, time: Quantity | None) -> str:
 
 
 def _memory(found: IdentifiedFile) -> str:
-    text = _memory_text(found.file.operator, found.identification.initial_state)
+    operator, state = found.file.response, found.identification.initial_state
+    text = _memory_text(operator, state)
     how = found.file.provenance.get("initial")
     if how == "skip":
         return f"unknown; taken as {text}, and the rows that it reaches are left out"
     return f"estimated: {text}" if how == "estimate" else text
 
 
-def _memory_text(operator: Operator[Any], state: Any) -> str:  # noqa: ANN401 - each operator has its own state
+def _memory_text(operator: Operator[Any] | TimedModel[Any], state: Any) -> str:  # noqa: ANN401 - each has its own
+    if isinstance(operator, TimedModel):
+        return str(operator.state_to_json(state))
     if operator.memoryless:
         return "none: the output depends on the present input alone"
     for direction, name in ((-1, "negative saturation"), (1, "positive saturation")):

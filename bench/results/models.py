@@ -17,9 +17,10 @@ from bench.hysteresis import (
     Operator,
     Policy,
     Reach,
+    TimedModel,
     find_model,
-    identifiable_models,
 )
+from bench.hysteresis.timed import TimedSequence
 from bench.identification import (
     Comparison,
     CrossValidation,
@@ -43,9 +44,14 @@ from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
+from bench.results.times import bind_times, check_model_name, read_times
+from bench.timed import identify_in_time
 
 Floats = npt.NDArray[np.float64]
 
+
+_OF_ALL = ("initial", "orientation")
+"""Options of `identify_file` that every model takes, though they are not its own."""
 
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of the roughness penalty that cross-validation tries."""
@@ -95,7 +101,7 @@ class IdentifiedFile:
 
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
-        operator, names = self.file.operator, self.file.provenance
+        operator, names = self.file.response, self.file.provenance
         return Predictions(
             Quantity(names["input"], operator.input_unit, self.inputs),
             operator.output_unit,
@@ -108,7 +114,7 @@ class IdentifiedFile:
         """Return the result for programs."""
         found = self.identification
         certificate = found.certificate
-        operator = self.file.operator
+        operator = self.file.response
         penalties = found.regularization
         return {
             "model": found.model_name,
@@ -182,6 +188,7 @@ def identify_file(
     weights_column: str | None = None,
     levels_to_try: Sequence[int] = (),
     train: slice | None = None,
+    time_column: str | None = None,
     band: bool = False,
     reading: ReadingOptions | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
@@ -208,6 +215,8 @@ def identify_file(
         Values of the option `levels` among which cross-validation chooses.
     train : slice, optional
         Rows that are fitted; all others still drive the memory. The errors are those of the rows fitted.
+    time_column : str or None
+        Column of times, for a model with time.
     band : bool
         Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
@@ -222,23 +231,21 @@ def identify_file(
     ConfigurationError
         If an option is wrong or does not belong to the model.
     """
-    try:
-        find_model(model)
-    except ValueError:
-        known = ", ".join(identifiable_models())
-        raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
+    check_model_name(model, time_column)
     if skip < 0:
         raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
     options = {name: value for name, value in options.items() if value is not None}
     if levels_to_try:
         options["levels"] = levels_to_try[0]
-    try:
-        # These two every model takes.
-        check_options(model, {key: value for key, value in options.items() if key not in ("initial", "orientation")})
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from None
-    names = (input_column, output_column, *((weights_column,) if weights_column else ()))
+    if time_column is None:
+        try:
+            check_options(model, {key: value for key, value in options.items() if key not in _OF_ALL})
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from None
+    names = tuple(name for name in (input_column, output_column, weights_column, time_column) if name)
     paths = [path] if isinstance(path, Path) else path
+    if time_column is not None and len(paths) > 1:
+        raise ConfigurationError(f"--time: expected one file, as times are those of one record; got {len(paths)}")
     files = read_files(paths, names, at_least=FEWEST_ROWS, options=reading)
     columns = files.columns
     inputs, outputs = columns.values[input_column], columns.values[output_column]
@@ -255,33 +262,42 @@ def identify_file(
         if columns.units[column]:
             options[key] = columns.units[column]
     trials: CrossValidation | None = None
+    if time_column is not None and (cross_validated or smoothing or ridge or band):
+        raise ConfigurationError(f"model {model} takes no --smoothing, --ridge, --cross-validate or --band")
     try:
-        if cross_validated or levels_to_try:
-            others, orders = dict(options), levels_to_try or None
-            if isinstance(options.get("levels"), int):
-                orders = orders or [others["levels"]]
-                del others["levels"]
-            # A signed density is not fitted without a penalty.
-            is_open = cross_validated or (smoothing is None and not find_model(model).constrained)
-            tried = SMOOTHING if is_open else (smoothing or 0.0,)
-            ridge = ridge or 0.0
-            trials = cross_validate(
-                model,
-                inputs,
-                outputs,
-                smoothing=tried,
-                ridge=ridge,
-                levels=orders,
-                weights=weights,
-                skip=skip,
-                **others,
+        if time_column is not None:
+            times = read_times(columns, time_column)
+            found = identify_in_time(model, times, inputs, outputs, weights=weights, skip=skip, **options)
+            memory, coverage = found.model.run(times, inputs, found.initial_state)[1], None
+        else:
+            if cross_validated or levels_to_try:
+                others, orders = dict(options), levels_to_try or None
+                if isinstance(options.get("levels"), int):
+                    orders = orders or [others["levels"]]
+                    del others["levels"]
+                # A signed density is not fitted without a penalty.
+                is_open = cross_validated or (smoothing is None and not find_model(model).constrained)
+                tried = SMOOTHING if is_open else (smoothing or 0.0,)
+                ridge = ridge or 0.0
+                trials = cross_validate(
+                    model,
+                    inputs,
+                    outputs,
+                    smoothing=tried,
+                    ridge=ridge,
+                    levels=orders,
+                    weights=weights,
+                    skip=skip,
+                    **others,
+                )
+                smoothing = trials.best.smoothing
+                if trials.best.levels is not None and levels_to_try:
+                    options["levels"] = trials.best.levels
+            found = identify(
+                model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
             )
-            smoothing = trials.best.smoothing
-            if trials.best.levels is not None and levels_to_try:
-                options["levels"] = trials.best.levels
-        found = identify(
-            model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **options
-        )
+            memory = found.model.advance(found.initial_state, inputs)
+            coverage = found.model.coverage(inputs, found.initial_state)
         penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
         calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
     except ValueError as error:
@@ -289,11 +305,11 @@ def identify_file(
     if not fitted.all():
         counted = fitted & (np.arange(inputs.size) >= found.skip)
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
+    warnings += found.warnings
     tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
-    warnings += (*found.warnings, *(test.text for test in tests if test.holds is False))
-    memory = found.model.advance(found.initial_state, inputs)
-    coverage = found.model.coverage(inputs, found.initial_state)
-    penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
+    if time_column is None:
+        # A model with time takes neither for granted.
+        warnings += tuple(test.text for test in tests if test.holds is False)
     resolution: Resolution | None = None
     if coverage is not None:
         regressor = found.model.regressor(inputs, found.initial_state)
@@ -303,6 +319,7 @@ def identify_file(
         "source": ", ".join(each.name for each in paths),
         "input": input_column,
         "output": output_column,
+        **({} if time_column is None else {"time": time_column}),
         "rows": int(inputs.size),
         "skipped": found.skip,
         "initial": options.get("initial"),
@@ -328,8 +345,10 @@ def identify_file(
     )
 
 
-def _shape(operator: Operator[Any]) -> dict[str, float]:
+def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:
     """Return the shape parameters by name; none of an operator that is linear in all it has."""
+    if isinstance(operator, TimedModel):
+        return {name: value for name, (value, _) in operator.parameters().items()}
     shape = operator.shape_parameters()
     return dict(zip(shape.names, shape.values, strict=True))
 
@@ -339,7 +358,14 @@ def _largest(uncertainties: Floats) -> float | None:
     return float(known.max()) if known.size else None
 
 
-def predict(model: ModelFile, inputs: Floats, *, initial: str | None = None, continue_memory: bool = False) -> Floats:
+def predict(
+    model: ModelFile,
+    inputs: Floats,
+    *,
+    initial: str | None = None,
+    continue_memory: bool = False,
+    times: Floats | None = None,
+) -> Floats:
     """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
 
     Parameters
@@ -350,9 +376,16 @@ def predict(model: ModelFile, inputs: Floats, *, initial: str | None = None, con
         Inputs in the unit of the model, finite.
     initial, continue_memory
         The state before the first input, as for `starting_state`.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
+
+    Raises
+    ------
+    ConfigurationError
+        If a model with time has none.
     """
     start = starting_state(model, initial=initial, continue_memory=continue_memory)
-    return np.asarray(model.operator.evaluate(inputs, start.state))
+    return bind_times(model, times).evaluate(inputs, start.state)
 
 
 @dataclass(frozen=True)
@@ -427,24 +460,28 @@ def check_unit(expected: str, unit: str, column: str) -> None:
 
 def outside_of_range(model: ModelFile, inputs: Floats) -> str:
     """Return a warning if inputs leave the range for which the model was identified, else an empty text."""
-    low, high = model.operator.input_range
+    low, high = model.response.input_range
     outside = np.flatnonzero((inputs < low) | (inputs > high))
     if outside.size == 0:
         return ""
     return (
         f"{outside.size} of {inputs.size} inputs (first: row {outside[0] + 1}, {inputs[outside[0]]:g}) are outside "
-        f"of {low:g} to {high:g} {model.operator.input_unit}, for which the model was identified"
+        f"of {low:g} to {high:g} {model.response.input_unit}, for which the model was identified"
     )
 
 
 def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     """Return what a person should know of a fit, as (name, text) pairs."""
-    found, operator = identified.identification, identified.file.operator
+    found, operator = identified.identification, identified.file.response
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate = found.errors, found.certificate
-    shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
+    if isinstance(operator, TimedModel):
+        own = [(name, f"{value:.4g} {its}".rstrip()) for name, (value, its) in operator.parameters().items()]
+    else:
+        shape = ", ".join(f"{name} {value:.4g}" for name, value in _shape(operator).items())
+        own = [("shape", shape)] if shape else []
     return (
-        *([("shape", shape)] if shape else []),
+        *own,
         ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
         ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
         ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
@@ -463,7 +500,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
 def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:
     """Return how many coefficients are free, what the data determine of them, and whether others would do as well."""
     certificate = found.certificate
-    is_least_norm = not find_model(found.model_name).constrained and found.regularization is None
+    signed = not isinstance(found.model, TimedModel) and not find_model(found.model_name).constrained
+    is_least_norm = signed and found.regularization is None
     if is_least_norm:
         text = f"rank {certificate.passive}, null space of {certificate.active} (least norm)"
     else:
@@ -541,6 +579,7 @@ def compare_models(
     *,
     skip: int | None = None,
     initial: str | None = None,
+    time_column: str | None = None,
     session: Session | None = None,
     reading: ReadingOptions | None = None,
 ) -> ComparedModels:
@@ -557,6 +596,8 @@ def compare_models(
     skip, initial
         First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
         the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
+    time_column : str or None
+        Column of times, for models with time; that of the first such model if None.
     session : Session, optional
         What is estimated of the session for each model; the rows that it uses do not count either.
     reading : ReadingOptions, optional
@@ -574,27 +615,31 @@ def compare_models(
         given or str(files[0].provenance.get(key, ""))
         for key, given in (("input", input_column), ("output", output_column))
     ]
-    columns = read_columns(data, names, options=reading)
+    timed = [file for file in files if isinstance(file.model, TimedModel)]
+    if time_column is None and timed:
+        time_column = str(timed[0].provenance.get("time", ""))
+    columns = read_columns(data, [*names, *([time_column] if time_column else [])], options=reading)
     inputs, outputs = (columns.values[name] for name in names)
-    operators: dict[str, Operator[Any]] = {}
+    times = read_times(columns, time_column) if time_column else None
+    operators: dict[str, Operator[Any] | TimedSequence] = {}
     starts: dict[str, StartingState] = {}
     for path, file in zip(paths, files, strict=True):
-        check_unit(file.operator.input_unit, columns.units[names[0]], names[0])
-        check_unit(file.operator.output_unit, columns.units[names[1]], names[1])
+        check_unit(file.response.input_unit, columns.units[names[0]], names[0])
+        check_unit(file.response.output_unit, columns.units[names[1]], names[1])
         name = path.stem if path.stem not in operators else str(path)
-        operators[name] = file.operator
+        operators[name] = bind_times(file, times)
         starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
     states = {name: start.state for name, start in starts.items()}
     most = max(start.skip for start in starts.values())
     examined = {
-        name: examine(file, inputs, outputs, state=states[name], session=session, skip=most)
+        name: examine(file, inputs, outputs, state=states[name], session=session, skip=most, times=times)
         for name, file in zip(operators, files, strict=True)
     }
     first = most if session is None else session.first_unused(inputs.size, most)
     comparisons = compare(operators, inputs, outputs, states=states, skip=first)
     predictions = Predictions(
-        Quantity(names[0], columns.units[names[0]] or files[0].operator.input_unit, inputs),
-        files[0].operator.output_unit,
+        Quantity(names[0], columns.units[names[0]] or files[0].response.input_unit, inputs),
+        files[0].response.output_unit,
         {name: entry.predicted for name, entry in examined.items()},
         Quantity(names[1], columns.units[names[1]], outputs),
         skip=first,

@@ -167,7 +167,7 @@ def _picture(record: Record, folder: Path) -> Path:
 def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     """Draw loops, errors and density of an identified model; return the files."""
     folder = _make_folder(out)
-    operator = found.file.operator
+    operator = found.file.response
     name = found.file.name
     paths = draw_predictions(found.predictions(), folder, name)
     for density in operator.densities():

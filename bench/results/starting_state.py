@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import ConfigurationError
+from bench.hysteresis import TimedModel
 from bench.model_file import ModelFile
 
 Floats = npt.NDArray[np.float64]
@@ -18,7 +19,7 @@ Start: TypeAlias = Literal["file", "negative", "positive", "skip"]
 
 @dataclass(frozen=True)
 class StartingState:
-    """State of an operator before the first row, and the number of first rows left out of errors."""
+    """State of a model before the first row, and the number of first rows left out of errors."""
 
     state: Any
     skip: int
@@ -44,7 +45,8 @@ def starting_state(
         "file": the state at the start of the model's own data. On these data the rows that its identification left
         out are left out again, on others as many as their inputs leave unknown if it was identified with "skip".
         "negative", "positive": saturation at the low or the high end of the operating range. "skip": unknown, so
-        that the rows are left out until the inputs have overwritten the memory. Default "file".
+        that the rows are left out until the inputs have overwritten the memory. Default "file". A model with time has
+        words of its own: `TimedModel.starts`.
     skip : int or None
         Number of first rows to leave out instead; with "skip" at least.
     continue_memory : bool
@@ -55,9 +57,10 @@ def starting_state(
     ConfigurationError
         If `initial` is none of these or given beside `continue_memory`, or `skip` leaves no row.
     """
-    operator = model.operator
-    if initial not in (None, *get_args(Start)):
-        raise ConfigurationError(f"--initial {initial}: expected one of {', '.join(get_args(Start))}")
+    operator = model.response
+    words = ("file", *operator.starts) if isinstance(operator, TimedModel) else get_args(Start)
+    if initial not in (None, *words):
+        raise ConfigurationError(f"--initial {initial}: expected one of {', '.join(words)}")
     if continue_memory and initial is not None:
         raise ConfigurationError(f"--initial {initial} and --continue-memory exclude each other")
     if inputs is None and initial == "skip":
@@ -66,7 +69,10 @@ def starting_state(
         raise ConfigurationError(f"--skip {skip}: there are {inputs.size} rows; at least one must be left")
     if continue_memory:
         return StartingState(model.memory, skip or 0)
-    if initial in ("negative", "positive"):
+    if isinstance(operator, TimedModel):
+        if initial not in (None, "file", "skip"):
+            return StartingState(operator.start(initial), skip or 0)
+    elif initial in ("negative", "positive"):
         return StartingState(operator.saturated_state(-1 if initial == "negative" else 1), skip or 0)
     state = operator.initial_state() if model.initial is None else model.initial
     if inputs is None or (skip is not None and initial != "skip"):

@@ -1,0 +1,78 @@
+"""The column of times, and which models take one."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import Operator, TimedModel, find_model, identifiable_models, timed_models
+from bench.hysteresis.timed import TimedSequence
+from bench.model_file import ModelFile
+from bench.results.data import Columns, Floats
+
+_SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+
+def check_model_name(model: str, time_column: str | None) -> None:
+    """Check that there is a model of this name that can be fitted to a file with or without a column of times.
+
+    Raises ConfigurationError if not: names the models, or the option `--time`.
+    """
+    timed = timed_models()
+    if model in timed:
+        if time_column is None:
+            raise ConfigurationError(f"model {model} needs the time of each row: give --time COLUMN")
+        return
+    try:
+        find_model(model)
+    except ValueError:
+        known = ", ".join(sorted([*identifiable_models(), *timed]))
+        raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
+    if time_column is not None:
+        raise ConfigurationError(f"--time: {model} is a model without time; with time there are: {', '.join(timed)}")
+
+
+def option_names(model: str) -> tuple[str, ...]:
+    """Return the names of the options of a model with time, but for those of an operator in it."""
+    fit = timed_models()[model].fit_in_time
+    assert fit is not None
+    known = inspect.signature(fit).parameters.values()
+    return tuple(each.name for each in known if each.kind is each.KEYWORD_ONLY)
+
+
+def read_times(columns: Columns, name: str) -> Floats:
+    """Return a column of times, shape (N,), in s.
+
+    Raises DataError if its unit is none of time, or the times do not increase: names the row.
+    """
+    unit = columns.units[name]
+    if unit not in _SECONDS:
+        raise DataError(
+            f"{columns.source}: column {name} is in {unit}; expected a time in {', '.join(filter(None, _SECONDS))}"
+        )
+    times = columns.values[name] * _SECONDS[unit]
+    wrong = np.flatnonzero(np.diff(times) <= 0.0)
+    if wrong.size:
+        row = int(wrong[0]) + 2
+        before, after = columns.values[name][row - 2 : row]
+        raise DataError(
+            f"{columns.source}: column {name} does not increase in row {row} ({after:g} after {before:g}); "
+            "times must be those of one record, in order"
+        )
+    return times
+
+
+def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSequence:
+    """Return what evaluates inputs: the operator, or the model with time at these times, s.
+
+    Raises ConfigurationError if a model with time has none.
+    """
+    model = file.response
+    if not isinstance(model, TimedModel):
+        return model
+    if times is None:
+        raise ConfigurationError(f"model {file.name} needs the time of each row: give --time COLUMN")
+    return model.at(times)

@@ -1,0 +1,17 @@
+"""Models with time, and their identification."""
+
+from bench.timed.by_name import identify_in_time
+from bench.timed.hammerstein import Hammerstein, HammersteinState
+from bench.timed.linear_parts import FilterState, LinearPart, logarithmic_creep
+from bench.timed.oscillator import BoucWenOscillator, OscillatorState
+
+__all__ = [
+    "BoucWenOscillator",
+    "FilterState",
+    "Hammerstein",
+    "HammersteinState",
+    "LinearPart",
+    "OscillatorState",
+    "identify_in_time",
+    "logarithmic_creep",
+]

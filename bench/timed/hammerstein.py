@@ -1,0 +1,219 @@
+"""The Hammerstein model: a hysteresis operator, then delay, lag or resonance, creep, and a drift in time.
+
+y(t) = bias + T(s) [operator(u) - its bias] + drift(t), with T as in `bench.timed.linear_parts`. The operator acts at
+the samples, and its output is a straight line between them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import Operator, _checks, operator_from_json
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.density import Density
+from bench.hysteresis.documents import Parts
+from bench.hysteresis.timed import TimedModel, check_sequence
+from bench.timed.linear_parts import FilterState, LinearPart
+
+
+class Knots(NamedTuple):
+    """What the delay has not yet let through.
+
+    Attributes
+    ----------
+    times : tuple of float
+        Since the start of the record, s.
+    values : tuple of float
+        Output of the operator less its bias, output units.
+    filters : FilterState
+        State at the first of these times.
+    """
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+    filters: FilterState
+
+
+class HammersteinState(NamedTuple):
+    """Memory of a Hammerstein model.
+
+    Attributes
+    ----------
+    memory : object
+        State of the operator.
+    clock : float
+        Time of the last sample, s; 0 before the first.
+    knots : Knots or None
+        What the linear part knows; None before the first sample, at which it then is settled.
+    """
+
+    memory: Any
+    clock: float = 0.0
+    knots: Knots | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Hammerstein(TimedModel[HammersteinState]):
+    """A hysteresis operator behind which a linear part and a drift follow.
+
+    Parameters
+    ----------
+    static : Operator
+        The operator; its bias is that of the output.
+    linear : LinearPart
+        Delay, lag or resonance, and creep.
+    drift : float
+        Output units / s, counted from the first sample of a record; with `drift_time` the final value, output units.
+    drift_time : float
+        Time constant of a drift that fades, s; 0 for one that does not.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or `drift_time` negative.
+    """
+
+    kind: ClassVar[str] = "hammerstein"
+    starts: ClassVar[tuple[str, ...]] = ("negative", "positive", "skip")
+    parts: ClassVar[Parts] = {"static": operator_from_json, "linear": LinearPart.from_json}
+
+    static: Operator[Any]
+    linear: LinearPart
+    drift: float = 0.0
+    drift_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("drift", "drift_time"):
+            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
+        if self.drift_time < 0.0:
+            raise ValueError(f"drift_time: expected a number >= 0, got {self.drift_time}")
+
+    @property
+    def input_range(self) -> tuple[float, float]:  # type: ignore[override]
+        """Operating range of the operator, input units."""
+        return self.static.input_range
+
+    @property
+    def input_unit(self) -> str:  # type: ignore[override]
+        """Unit of the input."""
+        return self.static.input_unit
+
+    @property
+    def output_unit(self) -> str:  # type: ignore[override]
+        """Unit of the output."""
+        return self.static.output_unit
+
+    def densities(self) -> tuple[Density, ...]:
+        """Return those of the operator."""
+        return self.static.densities()
+
+    def run(
+        self, times: ArrayLike, inputs: ArrayLike, state: HammersteinState | None = None
+    ) -> tuple[Floats, HammersteinState]:
+        """Return the outputs of a sequence, shape (N,), and the state after it; see `TimedModel.run`."""
+        clock, sequence = check_sequence(times, inputs=inputs)
+        state = self.initial_state() if state is None else state
+        values = self.static.evaluate(sequence, state.memory) - self.static.bias
+        knots = state.knots
+        elapsed, filters, known = clock - clock[0], None, 0
+        if knots is not None:
+            gap = clock[0] - state.clock if clock[0] > state.clock else clock[1] - clock[0]
+            elapsed = np.concatenate([knots.times, knots.times[-1] + gap + elapsed])
+            values = np.concatenate([knots.values, values])
+            filters, known = knots.filters, len(knots.times)
+        response = self.linear.respond(elapsed, values[:, None], filters)[0][known:, 0]
+        outputs = self.static.bias + response + self.drift_after(elapsed[known:])
+        memory = self.static.advance(state.memory, sequence)
+        return outputs, HammersteinState(memory, float(clock[-1]), self._knots(elapsed, values, filters))
+
+    def _knots(self, times: Floats, values: Floats, filters: FilterState | None) -> Knots:
+        first = max(int(np.searchsorted(times, times[-1] - self.linear.delay, side="right")) - 1, 0)
+        _, (value, rate, crept) = self.linear.respond(times[: first + 1], values[: first + 1, None], filters)
+        at_first = FilterState(float(value[0]), float(rate[0]), tuple(crept[:, 0].tolist()))
+        return Knots(tuple(times[first:].tolist()), tuple(values[first:].tolist()), at_first)
+
+    def initial_state(self) -> HammersteinState:
+        """Return the initial state of the operator."""
+        return HammersteinState(self.static.initial_state())
+
+    def start(self, word: str) -> HammersteinState:
+        """Return a saturated state of the operator: "negative" or "positive"."""
+        return HammersteinState(self.static.saturated_state({"negative": -1, "positive": 1}[word]))
+
+    def unknown_until(self, inputs: ArrayLike) -> int:
+        """Return what the operator does."""
+        return self.static.unknown_until(inputs)
+
+    def drift_after(self, elapsed: Floats) -> Floats:
+        """Return the drift at times since the start of the record, s; output units, same shape."""
+        if self.drift_time > 0.0:
+            return np.asarray(-self.drift * np.expm1(-elapsed / self.drift_time))
+        return self.drift * elapsed
+
+    def parameters(self) -> Mapping[str, tuple[float, str]]:
+        """Return the numbers of the linear part and the drift."""
+        found: dict[str, tuple[float, str]] = {}
+        first, second = self.linear.lag
+        if second > 0.0:
+            found["frequency"] = 1.0 / (2.0 * math.pi * math.sqrt(second)), "Hz"
+            found["damping ratio"] = 0.5 * first / math.sqrt(second), ""
+        elif first > 0.0:
+            found["time constant"] = first, "s"
+        if self.linear.delay > 0.0:
+            found["delay"] = self.linear.delay, "s"
+        creep_times, strengths = self.linear.creep_times, self.linear.creep_strengths
+        if strengths.size > 1 and (strengths == strengths[0]).all():
+            decades = math.log10(creep_times[1] / creep_times[0])
+            found["creep per decade"] = 100.0 * float(strengths[0]) / decades, "%"
+        else:
+            pairs = zip(creep_times.tolist(), strengths.tolist(), strict=True)
+            found |= {f"creep with {time:.3g} s": (100.0 * strength, "%") for time, strength in pairs}
+        if self.drift:
+            unit = self.output_unit or "output units"
+            found["drift"] = self.drift, unit if self.drift_time > 0.0 else f"{unit}/s"
+        if self.drift_time > 0.0:
+            found["drift time"] = self.drift_time, "s"
+        return found
+
+    def state_to_json(self, state: HammersteinState) -> Any:  # noqa: ANN401
+        """Return a state as JSON."""
+        knots = state.knots
+        return {
+            "memory": self.static.state_to_json(state.memory),
+            "clock": state.clock,
+            "knots": None
+            if knots is None
+            else {
+                "times": list(knots.times),
+                "values": list(knots.values),
+                "value": knots.filters.value,
+                "rate": knots.filters.rate,
+                "crept": list(knots.filters.crept),
+            },
+        }
+
+    def state_from_json(self, document: Any) -> HammersteinState:  # noqa: ANN401
+        """Return the state that `state_to_json` wrote.
+
+        Raises ValueError if it is no state of this model.
+        """
+        memory, clock, found = (_checks.json_field(document, key, "memory") for key in ("memory", "clock", "knots"))
+        knots = None
+        if found is not None:
+            times, values, crept = (
+                [_checks.number("memory", each) for each in _checks.json_field(found, key, "memory")]
+                for key in ("times", "values", "crept")
+            )
+            if not times or len(times) != len(values) or len(crept) != self.linear.creep_times.size:
+                raise ValueError(f"memory: expected knots and creep of this {self.kind} model")
+            value, rate = (
+                _checks.number("memory", _checks.json_field(found, key, "memory")) for key in ("value", "rate")
+            )
+            knots = Knots(tuple(times), tuple(values), FilterState(value, rate, tuple(crept)))
+        return HammersteinState(self.static.state_from_json(memory), _checks.number("memory", clock), knots)

@@ -1,0 +1,518 @@
+"""Fit of a Hammerstein model: operator, linear part and drift at once.
+
+The response is linear in the operator's coefficients: filtered columns of its regressor are a regressor again. Time
+constants, delay and creep enter nonlinearly. They are found by variable projection (Golub and Pereyra, Inverse
+Problems 19(2), R1-R26, 2003; Kaufman's form of the Jacobian) over the coefficients that a constrained fit
+leaves free, in turns with that fit, from several starts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.hysteresis import Regressor
+from bench.hysteresis._checks import Floats
+from bench.hysteresis.timed import check_sequence
+from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
+from bench.identification.least_squares import Fit, fit, fit_minimum_norm, one_thread
+from bench.identification.measures import measure_errors
+from bench.identification.orientation import NAMES, Orientation, has_orientation
+from bench.timed.hammerstein import Hammerstein, HammersteinState
+from bench.timed.linear_parts import LinearPart, logarithmic_creep
+
+ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift")
+"""What can follow the operator: see `identify_hammerstein`."""
+
+_CHOICE = ("lag", "resonance", "delay", "creep", "drift")
+# What cannot stand beside each other.
+_EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
+# Part by which an element must lower the RMS error, if nobody asked for it. A drift belongs to one record only.
+_WORTH, _WORTH_OF_DRIFT = 0.03, 0.2
+# Greatest regressor, numbers; 400 MB.
+_LARGEST = 50_000_000
+# Rounds of search and constrained fit, and the relative gain of the cost at which they end.
+_ROUNDS, _GAIN = 6, 1e-7
+_STARTS, _EVALUATIONS = 3, 40
+# Evaluations of a search that only chooses among elements.
+_FEW = 8
+# Principal columns of the operator in a first search, and in the grid that it starts from.
+_FREE, _COARSE = 30, 6
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class _Parameter:
+    """A nonlinear parameter: its name, the values to start from, and bounds."""
+
+    name: str
+    starts: tuple[float, ...]
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Everything but the elements: the measured sequence, and the operator's columns."""
+
+    times: Floats
+    static: FitProblem
+    columns: Floats
+    roots: Floats
+    signs: tuple[Literal[1, -1], ...]
+    elapsed: Floats = field(init=False)
+    principal: Floats = field(init=False)
+    step: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "elapsed", self.times - self.times[0])
+        object.__setattr__(self, "step", float(np.median(np.diff(self.times))))
+        centred = self.columns - self.columns.mean(axis=0)
+        strengths, directions = np.linalg.eigh(centred.T @ centred)
+        kept = strengths > 1e-10 * strengths[-1]
+        object.__setattr__(self, "principal", np.ascontiguousarray(self.columns @ directions[:, kept][:, ::-1]))
+
+    @property
+    def span(self) -> float:
+        return float(self.elapsed[-1])
+
+    @property
+    def creep_span(self) -> tuple[float, float]:
+        """Shortest and longest retardation time, s."""
+        return 10.0 * self.step, self.span
+
+    def parameters(self, elements: Sequence[str]) -> list[_Parameter]:
+        """Return the nonlinear parameters of elements: logarithms of times and damping, delay in steps."""
+        shortest, longest, found = math.log(self.step), math.log(self.span), []
+        decades = max(1, round(math.log10(self.creep_span[1] / self.creep_span[0])))
+        for element in elements:
+            if element == "lag":
+                starts = tuple(np.linspace(shortest - 1.0, longest - 1.0, 12))
+                found.append(_Parameter("lag", starts, shortest - math.log(100.0), longest + 1.0))
+            elif element == "resonance":
+                low, high = math.log(2.0 * math.pi) - longest, math.log(20.0 * math.pi) - shortest
+                top = math.log(math.pi) - shortest
+                starts = (*np.linspace(max(low, top - 6.0), top, 13), high - 0.5)
+                found.append(_Parameter("frequency", starts, low, high))
+                found.append(_Parameter("damping", tuple(map(math.log, (0.03, 0.3, 1.0))), math.log(1e-3), 3.4))
+            elif element == "delay":
+                most = min(0.25 * self.span / self.step, 200.0)
+                found.append(_Parameter("delay", (0.3, 1.5, min(6.0, most)), 0.0, most))
+            elif element == "creep":
+                found.append(_Parameter("creep", (0.02,), 0.0, 3.0))
+            elif element == "kelvin-voigt":
+                found += [_Parameter(f"creep {k}", (0.02,), 0.0, 3.0) for k in range(decades)]
+            elif element == "fading-drift":
+                found.append(_Parameter("drift", (longest - 1.0,), longest - 4.6, longest + 2.3))
+        return found
+
+    def linear(self, parameters: Sequence[_Parameter], values: Floats) -> tuple[LinearPart, float]:
+        """Return the linear part and the time constant of the drift, s."""
+        x = {parameter.name: float(value) for parameter, value in zip(parameters, values, strict=True)}
+        lag = (math.exp(x["lag"]), 0.0) if "lag" in x else (0.0, 0.0)
+        if "frequency" in x:
+            lag = (2.0 * math.exp(x["damping"] - x["frequency"]), math.exp(-2.0 * x["frequency"]))
+        times, strengths = np.empty(0), np.empty(0)
+        if "creep" in x:
+            times, strengths = logarithmic_creep(x["creep"], *self.creep_span)
+        elif elements := [x[name] for name in x if name.startswith("creep ")]:
+            strengths = np.array(elements)
+            shortest, longest = self.creep_span
+            times = shortest * (longest / shortest) ** ((np.arange(strengths.size) + 0.5) / strengths.size)
+        part = LinearPart(self.step * x.get("delay", 0.0), lag, times, strengths)
+        return part, math.exp(x["drift"]) if "drift" in x else 0.0
+
+    def drifts(self, elements: Sequence[str], time: float) -> Floats:
+        """Return the columns of the drift, shape (N, 0) or (N, 1)."""
+        if not {"drift", "fading-drift"} & set(elements):
+            return np.empty((self.times.size, 0))
+        shape = self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time)
+        return shape[:, None]
+
+    def fit(self, elements: Sequence[str], values: Floats) -> Fit:
+        """Return the coefficients of operator and drift for given parameters, of the sign that fits better."""
+        part, time = self.linear(self.parameters(elements), values)
+        drifts = self.drifts(elements, time)
+        columns, problem = part.respond(self.times, self.columns)[0], self.static
+        if not problem.spec.constrained:
+            regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
+            return fit_minimum_norm(regressor, problem.outputs, weights=problem.weights, skip=problem.skip)
+        constrained = np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)])
+        fits = []
+        for sign in self.signs:
+            found = fit(
+                Regressor.of_columns(np.column_stack([sign * columns, drifts])),
+                problem.outputs,
+                nonnegative=constrained,
+                weights=problem.weights,
+                skip=problem.skip,
+            )
+            turned = found.coefficients.copy()
+            turned[: columns.shape[1]] *= sign
+            fits.append(replace(found, coefficients=turned))
+        return min(fits, key=lambda each: self.cost(elements, values, each))
+
+    def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
+        """Return the weighted sum of squares of a fit."""
+        part, time = self.linear(self.parameters(elements), values)
+        count = self.columns.shape[1]
+        response = part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
+        drift = self.drifts(elements, time) @ found.coefficients[count:]
+        return float(np.sum((self.roots * (self.static.outputs - found.bias - response - drift)) ** 2))
+
+    def basis(self, found: Fit) -> Floats:
+        """Return the operator's columns over which the search projects, shape (N, r)."""
+        if self.static.spec.constrained:
+            used = found.coefficients[: self.columns.shape[1]] != 0.0
+            return self.columns[:, used]
+        return self.principal[:, :100]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Elements with their parameters and the fit."""
+
+    elements: tuple[str, ...]
+    values: Floats
+    fit: Fit
+    cost: float
+    deviations: Floats
+
+
+class _Point(NamedTuple):
+    """Projection at given parameters."""
+
+    key: bytes
+    columns: Floats
+    inverse: Floats
+    weights: Floats
+    rest: Floats
+
+
+class _Projection:
+    """Residuals and Jacobian of variable projection over given columns."""
+
+    def __init__(self, search: _Search, elements: Sequence[str], basis: Floats) -> None:
+        self._search, self._elements, self._basis = search, elements, basis
+        self._parameters = search.parameters(elements)
+        self._at: _Point | None = None
+        self._creep: dict[float, list[Floats]] = {}
+
+    def _respond(self, part: LinearPart) -> Floats:
+        """Return the filtered basis; responses of the creep, whose times stay, are kept for the last delay."""
+        times, basis = self._search.times, self._basis
+        strengths = part.creep_strengths
+        if not strengths.size:
+            return part.respond(times, basis)[0]
+        if part.delay not in self._creep:
+            # Logarithmic creep has one strength for all.
+            shared = [name for name in (p.name for p in self._parameters) if name == "creep"]
+            banks = [np.full(strengths.size, 1.0)] if shared else list(np.eye(strengths.size))
+            fast = replace(part, creep_strengths=np.zeros(strengths.size)).respond(times, basis)[0]
+            self._creep = {
+                part.delay: [replace(part, creep_strengths=bank).respond(times, basis)[0] - fast for bank in banks]
+            }
+        result = replace(part, creep_times=np.empty(0), creep_strengths=np.empty(0)).respond(times, basis)[0]
+        for strength, bank in zip(strengths, self._creep[part.delay], strict=False):
+            result += strength * bank
+        return result
+
+    def _solve(self, values: Floats) -> _Point:
+        key = values.tobytes()
+        if self._at is None or self._at.key != key:
+            search = self._search
+            part, time = search.linear(self._parameters, values)
+            columns = np.column_stack([
+                self._respond(part),
+                search.drifts(self._elements, time),
+                np.ones(search.times.size),
+            ])  # fmt: skip
+            columns *= search.roots[:, None]
+            norms = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+            columns /= norms
+            gram = columns.T @ columns
+            # The search only leads to where the constrained fit is then exact.
+            gram.flat[:: gram.shape[0] + 1] += 1e-12
+            inverse = np.linalg.inv(np.linalg.cholesky(gram))
+            target = search.roots * search.static.outputs
+            shares = inverse.T @ (inverse @ (columns.T @ target))
+            self._at = _Point(key, columns, inverse, shares / norms, target - columns @ shares)
+        return self._at
+
+    def residuals(self, values: Floats) -> Floats:
+        return self._solve(values).rest
+
+    def jacobian(self, values: Floats) -> Floats:
+        at, search = self._solve(values), self._search
+        count = self._basis.shape[1]
+        signal = (self._basis @ at.weights[:count])[:, None]
+
+        def model(x: Floats) -> Floats:
+            part, time = search.linear(self._parameters, x)
+            drift = search.drifts(self._elements, time)
+            return search.roots * (part.respond(search.times, signal)[0][:, 0] + drift @ at.weights[count:-1])
+
+        slopes = []
+        for k, parameter in enumerate(self._parameters):
+            ends = [values.copy(), values.copy()]
+            ends[0][k] = max(values[k] - _STEP, parameter.low)
+            ends[1][k] = min(values[k] + _STEP, parameter.high)
+            slopes.append((model(ends[1]) - model(ends[0])) / (ends[1][k] - ends[0][k]))
+        slope = np.column_stack(slopes)
+        return np.asarray(at.columns @ (at.inverse.T @ (at.inverse @ (at.columns.T @ slope))) - slope)
+
+
+def identify_hammerstein(
+    times: ArrayLike,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    skip: int = 0,
+    initial: Initial | None = None,
+    orientation: Orientation = "auto",
+    static: str = "preisach",
+    dynamics: str | None = None,
+    **options: Any,  # noqa: ANN401 - those of the operator
+) -> Identification[Any]:
+    """Return the Hammerstein model that fits a measured sequence best in the least-squares sense.
+
+    ================  ==========================================================================================
+    `lag`             1 / (1 + τ s)
+    `resonance`       1 / (1 + 2 ζ s/ω + s²/ω²); ζ above 1 stands for two real poles
+    `delay`           exp(-delay s)
+    `creep`           with the logarithm of time, by a part of the response per decade
+    `kelvin-voigt`    one Kelvin-Voigt element a decade, each with a strength of its own
+    `drift`           in proportion to time
+    `fading-drift`    1 - exp(-time / time constant)
+    `none`            the operator alone
+    ================  ==========================================================================================
+
+    Parameters
+    ----------
+    times : array_like, shape (N,)
+        s, strictly increasing.
+    inputs, outputs : array_like, shape (N,)
+        The measured sequence.
+    weights, skip, initial, orientation
+        As `identify`; the orientation is that of the operator.
+    static : str
+        Name of the operator in `bench.models`.
+    dynamics : str or None
+        Elements as listed above, separated by commas. None chooses among lag, resonance, delay, creep and drift: one
+        after the other as long as it lowers the RMS error by 3 %, and more than its parameters would by chance.
+    **options
+        Those of the operator; see `identify`. A Preisach operator has a linear reversible part unless they say
+        otherwise.
+
+    Raises
+    ------
+    ValueError
+        If an option is wrong or the data are unfit.
+    """
+    moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
+    chosen = None if dynamics is None else _elements(dynamics)
+    if static == "preisach":
+        options = {"reversible": "linear", **options}
+    problem = set_up_problem(
+        static, sequence, measured, weights, skip, 0.0, initial, options, orientation=orientation
+    )
+    if math.prod(problem.regressor.shape) > _LARGEST:
+        rows, count = problem.regressor.shape
+        size = 8e-9 * rows * count
+        raise ValueError(
+            f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer levels, or every nth row"
+        )
+    # The output of a lag may fall while the operator rises: the sign is found with the linear part.
+    oriented = has_orientation(problem.spec, problem.template)
+    search = _set_up(moments, problem, (1, -1) if oriented and orientation == "auto" else (problem.orientation,))
+    warnings = list(problem.warnings())
+    with one_thread():
+        found = _choose(search) if chosen is None else _best(search, chosen)
+    parameters = search.parameters(found.elements)
+    for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
+        # A delay or creep of 0 is an answer; a time at its bound is not.
+        if parameter.name in ("lag", "frequency", "damping", "drift") and not deviation < 1.0:
+            warnings.append(
+                f"the data do not determine the {parameter.name} of the linear part; leave it out with --dynamics, "
+                "or give data with faster and slower inputs"
+            )
+        elif parameter.name == "delay" and value > 0.99 * parameter.high:
+            warnings.append("the delay is the longest that is tried; check the columns of time and output")
+    part, time = search.linear(parameters, found.values)
+    count = search.columns.shape[1]
+    drift = float(found.fit.coefficients[count]) if found.fit.coefficients.size > count else 0.0
+    operator = problem.template.with_coefficients(found.fit.coefficients[:count], found.fit.bias)
+    model = Hammerstein(operator, part, drift, time)
+    sign: Literal[1, -1] = -1 if (found.fit.coefficients[:count][problem.template.nonnegative()] < 0.0).any() else 1
+    state = HammersteinState(problem.state)
+    predicted = model.evaluate(moments, sequence, state)
+    return Identification(
+        model_name="hammerstein",
+        model=model,
+        residuals=measured - predicted,
+        errors=measure_errors(measured[problem.skip :], predicted[problem.skip :]),
+        uncertainties=found.fit.uncertainties,
+        certificate=found.fit.certificate,
+        skip=problem.skip,
+        initial_state=state,
+        warnings=tuple(warnings),
+        orientation=NAMES[sign] if oriented else None,
+    )
+
+
+def _elements(text: str) -> tuple[str, ...]:
+    """Return the elements that a text names.
+
+    Raises ValueError if one is unknown or two exclude each other.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip() not in ("", "none"))
+    if unknown := [name for name in names if name not in ELEMENTS]:
+        raise ValueError(f"dynamics: expected none or {', '.join(ELEMENTS)}, got {', '.join(unknown)}")
+    for group in _EXCLUSIVE:
+        if len(group & set(names)) > 1:
+            raise ValueError(f"dynamics: expected one of {' and '.join(sorted(group))}, got both")
+    return tuple(dict.fromkeys(names))
+
+
+def _set_up(times: Floats, problem: FitProblem, signs: tuple[Literal[1, -1], ...]) -> _Search:
+    roots = np.sqrt(problem.weights)
+    roots[: problem.skip] = 0.0
+    return _Search(times, problem, problem.regressor.dense(), roots, signs)
+
+
+def _choose(search: _Search) -> _Found:
+    """Return the elements that are worth it, one after the other, with the rest."""
+    found = _best(search, ())
+    used = max(int(np.count_nonzero(search.roots)), 1)
+    shortest, longest = search.creep_span
+    while found.cost > 0.0:
+        basis, trials = search.principal[:, :_FREE], []
+        for element in _CHOICE:
+            kept = tuple(name for name in found.elements if not any({name, element} <= group for group in _EXCLUSIVE))
+            if element in found.elements or (element == "lag" and "resonance" in found.elements):
+                continue
+            if element == "creep" and longest < 10.0 * shortest:
+                continue
+            trials += _ends(search, (*kept, element), found, basis, starts=1, evaluations=_FEW)
+        least = min(trials, key=lambda trial: trial.cost, default=found)
+        best = _best(search, least.elements, found, rounds=1) if least.elements else least
+        added = set(best.elements) - set(found.elements)
+        more = max(best.values.size - found.values.size + len(added & {"drift"}), 1)
+        gain = math.log(found.cost / max(best.cost, 1e-300))
+        worth = _WORTH_OF_DRIFT if "drift" in added else _WORTH
+        if not gain > max(-2.0 * math.log1p(-worth), 2.0 * more * math.log(used) / used):
+            break
+        found = best
+    return min(_best(search, found.elements), found, key=lambda each: each.cost)
+
+
+def _best(search: _Search, elements: tuple[str, ...], before: _Found | None = None, rounds: int = _ROUNDS) -> _Found:
+    """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
+    parameters = search.parameters(elements)
+    if not parameters:
+        found = search.fit(elements, np.empty(0))
+        return _Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
+    first = _best(search, ()) if before is None else before
+    trials = [
+        replace(
+            trial, fit=(refit := search.fit(elements, trial.values)), cost=search.cost(elements, trial.values, refit)
+        )
+        for trial in _ends(search, elements, first, search.principal[:, :_FREE])
+    ]
+    best = min(trials, key=lambda trial: trial.cost)
+    values, deviations, found, cost = best.values, best.deviations, best.fit, best.cost
+    for _ in range(rounds):
+        moved, wider, _ = _search(search, elements, parameters, values, search.basis(found))
+        refit = search.fit(elements, moved)
+        lower = search.cost(elements, moved, refit)
+        gained = cost - lower
+        if gained > 0.0:
+            values, deviations, found, cost = moved, wider, refit, lower
+        if not gained > _GAIN * cost:
+            break
+    return _Found(elements, values, found, cost, deviations)
+
+
+def _ends(
+    search: _Search,
+    elements: tuple[str, ...],
+    before: _Found,
+    basis: Floats,
+    starts: int = _STARTS,
+    evaluations: int = _EVALUATIONS,
+) -> list[_Found]:
+    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit."""
+    parameters = search.parameters(elements)
+    if not parameters:
+        none = np.empty(0)
+        cost = float(np.sum(_Projection(search, elements, basis).residuals(none) ** 2))
+        return [_Found(elements, none, before.fit, cost, none)]
+    names = [p.name for p in search.parameters(before.elements)]
+    known = dict(zip(names, before.values.tolist(), strict=True))
+    found = []
+    for start in _starts(search, elements, parameters, known, before.fit)[:starts]:
+        values, deviations, cost = _search(search, elements, parameters, start, basis, evaluations)
+        found.append(_Found(elements, values, before.fit, cost, deviations))
+    return found
+
+
+def _starts(
+    search: _Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
+) -> list[Floats]:
+    """Return the best few of a grid, judged with the fit of the smaller model and the principal columns."""
+    grids = [(known[p.name],) if p.name in known else p.starts for p in parameters]
+    signal = search.columns @ before.coefficients[: search.columns.shape[1]]
+    basis = np.column_stack([signal, search.principal[:, :_COARSE]])
+    projection = _Projection(search, elements, basis)
+    grid = [np.array(values) for values in product(*grids)]
+    costs = [float(np.sum(projection.residuals(values) ** 2)) for values in grid]
+    order = np.argsort(costs, kind="stable")
+    chosen: list[Floats] = []
+    for place in order.tolist():
+        # Neighbours end in the same minimum.
+        if all(np.abs(grid[place] - other).max() > 1.0 for other in chosen):
+            chosen.append(grid[place])
+        if len(chosen) == _STARTS:
+            break
+    return chosen
+
+
+def _search(
+    search: _Search,
+    elements: Sequence[str],
+    parameters: Sequence[_Parameter],
+    start: Floats,
+    basis: Floats,
+    evaluations: int = _EVALUATIONS,
+) -> tuple[Floats, Floats, float]:
+    """Return the parameters at the end of a search, their standard deviations, and the cost."""
+    from scipy.optimize import least_squares
+
+    projection = _Projection(search, elements, basis)
+    low, high = (np.array([getattr(p, name) for p in parameters]) for name in ("low", "high"))
+    residuals: Callable[[Floats], Floats] = projection.residuals
+    end = least_squares(
+        residuals,
+        np.clip(start, low, high),
+        jac=projection.jacobian,
+        bounds=(low, high),
+        x_scale="jac",
+        ftol=1e-9,
+        xtol=1e-9,
+        gtol=1e-9,
+        max_nfev=evaluations,
+    )
+    values = np.asarray(end.x)
+    freedom = max(search.times.size - basis.shape[1] - values.size - 1, 1)
+    slopes = np.asarray(end.jac)
+    covariance = np.linalg.pinv(slopes.T @ slopes) * 2.0 * end.cost / freedom
+    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
+    deviations = np.where(flat, np.inf, np.sqrt(np.diag(covariance)))
+    return values, deviations, 2.0 * float(end.cost)

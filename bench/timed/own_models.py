@@ -1,0 +1,20 @@
+"""The bench's own models with time, as entries of `bench.models`."""
+
+from __future__ import annotations
+
+from bench.hysteresis import ModelSpec
+from bench.timed.hammerstein import Hammerstein
+from bench.timed.hammerstein_fit import identify_hammerstein
+from bench.timed.oscillator import BoucWenOscillator
+from bench.timed.oscillator_fit import identify_bouc_wen_oscillator
+
+HAMMERSTEIN = ModelSpec(
+    "an operator, then lag or resonance, delay, creep and drift; needs the time of each row",
+    Hammerstein,
+    fit_in_time=identify_hammerstein,
+)
+BOUC_WEN_OSCILLATOR = ModelSpec(
+    "a mass on a spring, a damper and a Bouc-Wen force; needs the time of each row",
+    BoucWenOscillator,
+    fit_in_time=identify_bouc_wen_oscillator,
+)

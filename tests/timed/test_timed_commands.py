@@ -1,0 +1,109 @@
+"""Models with time from the command line: `identify`, then `predict` and `compare` with the same errors."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.errors import ConfigurationError
+from bench.hysteresis import Preisach, uniform_levels
+from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
+
+COLUMNS = ("--time", "time", "--input", "drive", "--output", "response")
+
+
+def write(path, t, u, y, header="time [ms],drive [V],response [um]"):
+    np.savetxt(path, np.column_stack([t, u, y]), delimiter=",", header=header, comments="", fmt="%.17g")
+    return str(path)
+
+
+def hammerstein(folder):
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(5e-4, 2e-3, 400))
+    u = 5.0 + 5.0 * np.sin(2.0 * np.pi * 12.0 * t) * (1.0 - t)
+    model = Hammerstein(Preisach(uniform_levels(0.0, 10.0, 5), rng.random(15)), LinearPart(0.0, (0.004, 0.0)))
+    return write(folder / "lagging.csv", 1e3 * t, u, model.evaluate(t, u) + rng.normal(0.0, 0.01, 400))
+
+
+def oscillator(folder):
+    rng = np.random.default_rng(0)
+    t = np.arange(512) / 750.0
+    lines = np.fft.rfftfreq(512, 1.0 / 750.0)
+    u = np.fft.irfft((lines > 5.0) * (lines < 150.0) * np.exp(2j * np.pi * rng.random(lines.size)), 512)
+    u *= 50.0 / u.std()
+    model = BoucWenOscillator(0.002, 0.01, 50.0, 50.0, 0.8, -1.1, 0.0, (-200.0, 200.0))
+    return write(folder / "swinging.csv", 1e3 * t, u, model.evaluate(t, u) + rng.normal(0.0, 8e-3, 512))
+
+
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag")),
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "none", "--skip", 20)),
+        (hammerstein, ("--model", "hammerstein", "--static", "polynomial", "--degree", 3, "--dynamics", "lag,drift")),
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--initial", "positive")),
+        (oscillator, ("--model", "bouc-wen-oscillator")),
+    ],
+)
+def test_prediction_of_the_same_file_has_the_errors_of_the_identification(bench, tmp_path, make, options):
+    data, model, out = make(tmp_path), tmp_path / "model.json", tmp_path / "predicted.csv"
+    code, _, text = bench("identify", data, *COLUMNS, *options, "--out", model, "--json", tmp_path / "fit.json")
+    assert code == 0, text
+    code, _, text = bench("predict", model, data, *COLUMNS, "--out", out, "--json", tmp_path / "predict.json")
+    assert code == 0, text
+    code, _, text = bench("compare", model, "--data", data, "--json", tmp_path / "compare.json")
+    assert code == 0, text
+    fit, predicted, compared = (
+        json.loads((tmp_path / f"{name}.json").read_text()) for name in ("fit", "predict", "compare")
+    )
+    for key in ("max", "rms", "average", "rms_percent"):
+        assert predicted[key] == pytest.approx(fit[key], rel=1e-9)
+        assert compared["model"]["raw"][key] == pytest.approx(fit[key], rel=1e-9)
+    assert fit["output_unit"] == "µm"
+    assert fit["rms_percent"] < (0.6 if "lag" in options and "positive" not in options else 25.0)
+
+
+def test_the_functions_of_the_package_take_times(tmp_path):
+    import bench
+
+    data = hammerstein(tmp_path)
+    options = {"time_column": "time", "levels": 5, "dynamics": "lag"}
+    found = bench.identify(data, "hammerstein", input="drive", output="response", **options)
+    table = np.loadtxt(data, delimiter=",", skiprows=1)
+    predicted = bench.predict(found, table[:, 1], times=1e-3 * table[:, 0])
+    np.testing.assert_allclose(table[:, 2] - predicted, found.identification.residuals, atol=1e-12)
+    with pytest.raises(ConfigurationError, match="give --time COLUMN"):
+        bench.predict(found, table[:, 1])
+
+
+def test_times_are_read_in_their_unit(bench, tmp_path):
+    code, _, _ = bench(
+        "identify", hammerstein(tmp_path), *COLUMNS, "--model", "hammerstein", "--levels", 5, "--dynamics", "lag",
+        "--json", tmp_path / "fit.json",
+    )  # fmt: skip
+    assert code == 0
+    assert json.loads((tmp_path / "fit.json").read_text())["shape"]["time constant"] == pytest.approx(4e-3, rel=0.05)
+
+
+def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
+    data, model = hammerstein(tmp_path), tmp_path / "model.json"
+    without = COLUMNS[2:]
+    code, _, text = bench("identify", data, *without, "--model", "hammerstein")
+    assert (code, "needs the time of each row: give --time COLUMN" in text) == (2, True)
+    code, _, text = bench("identify", data, *COLUMNS, "--model", "preisach")
+    assert (code, "--time: preisach is a model without time" in text.replace("\n", " ")) == (2, True)
+    code, _, text = bench("identify", data, *COLUMNS, "--model", "hammerstein", "--dynamics", "echo")
+    assert (code, "kelvin-voigt" in text) == (2, True)
+    code, _, text = bench("identify", data, *without, "--time", "drive", "--model", "hammerstein")
+    assert code != 0
+    assert "column drive is in V" in text
+    assert bench("identify", data, *COLUMNS, "--model", "hammerstein", "--dynamics", "lag", "--out", model)[0] == 0
+    code, _, text = bench("predict", model, data, *without, "--out", tmp_path / "p.csv")
+    assert (code, "give --time COLUMN" in text) == (2, True)
+    code, _, text = bench("predict", model, data, *COLUMNS, "--out", tmp_path / "p.csv", "--initial", "rest")
+    assert (code, "negative, positive, skip" in text.replace("\n", " ")) == (2, True)
+    swapped = tmp_path / "swapped.csv"
+    write(swapped, [0, 1, 3, 2, *range(4, 14)], np.arange(14.0), np.arange(14.0))
+    code, _, text = bench("identify", swapped, *COLUMNS, "--model", "hammerstein")
+    assert code != 0
+    assert "does not increase in row 4" in text.replace("\n", " ")
