@@ -246,11 +246,11 @@ def predict_(
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
-    Writes a CSV file with the input column and `predicted`; with `--output` also `measured` and `residual` (measured
-    minus predicted), and if the model has a prediction band `predicted lower` and `predicted upper`. Heads have the
-    units. The model starts from the memory that it had at the start of its own data, so that on these data the errors
-    are those of `bench identify`. With `--recalibrate` the predictions are those for the session of the measured
-    output.
+    Writes a CSV file with the input column and `predicted`; with `--time` the time before them, with `--output` also
+    `measured` and `residual` (measured minus predicted), and if the model has a prediction band `predicted lower` and
+    `predicted upper`. Heads have the units. The model starts from the memory that it had at the start of its own
+    data, so that on these data the errors are those of `bench identify`. With `--recalibrate` the predictions are
+    those for the session of the measured output.
     """
     from bench.model_file import load_model
     from bench.results.data import read_columns
@@ -259,7 +259,7 @@ def predict_(
     from bench.results.predictions import Predictions, Quantity
     from bench.results.recalibrations import Session
     from bench.results.starting_state import starting_state
-    from bench.results.times import read_times
+    from bench.results.times import read_times, time_quantity
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     session = Session.parse(recalibrate, recalibrate_rows)
@@ -284,6 +284,7 @@ def predict_(
         unit,
         {model.name: found.predicted},
         Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
+        time_quantity(times),
         skip=found.first,
         further=found.band.columns(found.predicted) if found.band else (),
     )

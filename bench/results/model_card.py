@@ -17,7 +17,7 @@ from bench.hysteresis import MemoryCurve, Operator, TimedModel
 from bench.identification import Errors
 from bench.journal import Record
 from bench.results.models import IdentifiedFile, certificate_lines
-from bench.results.predictions import Quantity
+from bench.results.predictions import Predictions, Quantity
 
 Floats = npt.NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def model_card(
     rows = found.predictions()
     measured = Quantity(found.file.provenance["output"], rows.unit, found.outputs)
     sections = {
-        "Data": _table(("", ""), _data(found, rows.input, measured, source, digest)),
+        "Data": _table(("", ""), _data(found, rows, measured, source, digest)),
         "Errors": _table(("error", measured.unit or "output units", "% of the range"), _errors(found)),
         "Certificate": _table(("", ""), certificate_lines(found)),
         "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
@@ -117,7 +117,7 @@ def model_card(
 
 
 def _data(
-    found: IdentifiedFile, inputs: Quantity, outputs: Quantity, source: str, digest: str
+    found: IdentifiedFile, rows: Predictions, outputs: Quantity, source: str, digest: str
 ) -> list[tuple[str, str]]:
     skip = found.identification.skip
     first = f", of which the first {skip} drive the memory and count in no error" if skip else ""
@@ -126,7 +126,8 @@ def _data(
         ("SHA-256", digest),
         *([("layout", found.assumptions)] if found.assumptions else []),
         ("rows", f"{found.inputs.size}{first}"),
-        ("input", _extent(inputs)),
+        *([] if rows.time is None else [("sampling rate", _sampling(rows.time))]),
+        ("input", _extent(rows.input)),
         ("output", _extent(outputs)),
     ]
 
@@ -171,8 +172,17 @@ def _limits(found: IdentifiedFile, inputs: Quantity, time: Quantity | None) -> l
 def _rate(inputs: Quantity, time: Quantity | None) -> str:
     if time is None:
         return "no time was read; the errors hold at the rate of these data"
-    speed = np.abs(np.diff(inputs.values) / np.diff(time.values)).max()
-    return f"at most {speed:.4g} {inputs.unit or 'input units'}/{time.unit or 's'} in these data"
+    speeds = np.abs(np.diff(inputs.values) / np.diff(time.values))
+    speeds = speeds[speeds > 0.0]
+    unit = f"{inputs.unit or 'input units'}/{time.unit}"
+    return f"{speeds.min():.4g} to {speeds.max():.4g} {unit}, median {np.median(speeds):.4g}; the errors hold there"
+
+
+def _sampling(time: Quantity) -> str:
+    steps = np.diff(time.values)
+    low, middle, high = steps.min(), np.median(steps), steps.max()
+    uneven = f"; uneven steps of {low:.4g} to {high:.4g} {time.unit}" if high - low > 1e-3 * middle else ""
+    return f"{1.0 / middle:.4g} Hz over {time.values[-1] - time.values[0]:.4g} {time.unit}{uneven}"
 
 
 def _memory(found: IdentifiedFile) -> str:

@@ -44,7 +44,7 @@ from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
-from bench.results.times import bind_times, check_model_name, read_times
+from bench.results.times import bind_times, check_model_name, read_times, time_quantity
 from bench.timed import identify_in_time
 
 Floats = npt.NDArray[np.float64]
@@ -81,6 +81,8 @@ class IdentifiedFile:
         The table by which smoothing was chosen, if it was.
     assumptions : str
         What was assumed about the layout of the file; empty for a run.
+    times : ndarray, shape (N,), or None
+        When each row was taken, s; None for a model without time.
     """
 
     file: ModelFile
@@ -94,6 +96,7 @@ class IdentifiedFile:
     resolution: Resolution | None = None
     trials: CrossValidation | None = None
     assumptions: str = ""
+    times: Floats | None = None
 
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
@@ -107,6 +110,7 @@ class IdentifiedFile:
             operator.output_unit,
             {self.file.name: self.outputs - self.identification.residuals},
             Quantity(names["output"], operator.output_unit, self.outputs),
+            time_quantity(self.times),
             skip=self.identification.skip,
         )
 
@@ -264,9 +268,9 @@ def identify_file(
     trials: CrossValidation | None = None
     if time_column is not None and (cross_validated or smoothing or ridge or band):
         raise ConfigurationError(f"model {model} takes no --smoothing, --ridge, --cross-validate or --band")
+    times = None if time_column is None else read_times(columns, time_column)
     try:
-        if time_column is not None:
-            times = read_times(columns, time_column)
+        if times is not None:
             found = identify_in_time(model, times, inputs, outputs, weights=weights, skip=skip, **options)
             memory, coverage = found.model.run(times, inputs, found.initial_state)[1], None
         else:
@@ -342,6 +346,7 @@ def identify_file(
         resolution,
         trials,
         columns.assumptions,
+        times,
     )
 
 
@@ -510,13 +515,13 @@ def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> li
     if resolution is not None and not is_least_norm:
         lines.append(("determined by data", resolution.summary()))
     if certificate.exchangeable:
-        lines.append(
-            (
-                "not unique",
-                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
-                "changing the fit; they are resolved by --smoothing",
-            )
+        text = (
+            f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+            "changing the fit"
         )
+        # Models with time take no smoothing.
+        remedy = "give fewer --levels" if isinstance(found.model, TimedModel) else "they are resolved by --smoothing"
+        lines.append(("not unique", f"{text}; {remedy}"))
     return lines
 
 
@@ -642,6 +647,7 @@ def compare_models(
         files[0].response.output_unit,
         {name: entry.predicted for name, entry in examined.items()},
         Quantity(names[1], columns.units[names[1]], outputs),
+        time_quantity(times),
         skip=first,
         further=band_columns(examined),
     )

@@ -12,6 +12,7 @@ from bench.hysteresis import Operator, TimedModel, find_model, identifiable_mode
 from bench.hysteresis.timed import TimedSequence
 from bench.model_file import ModelFile
 from bench.results.data import Columns, Floats
+from bench.results.predictions import Quantity
 
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
@@ -63,6 +64,11 @@ def read_times(columns: Columns, name: str) -> Floats:
             "times must be those of one record, in order"
         )
     return times
+
+
+def time_quantity(times: Floats | None) -> Quantity | None:
+    """Return times, shape (N,) in s, as a column of results; None without them."""
+    return None if times is None else Quantity("time", "s", times)
 
 
 def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSequence:

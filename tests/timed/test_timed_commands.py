@@ -76,6 +76,31 @@ def test_the_functions_of_the_package_take_times(tmp_path):
         bench.predict(found, table[:, 1])
 
 
+def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
+    data, model, card = hammerstein(tmp_path), tmp_path / "model.json", tmp_path / "card.md"
+    options = ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--figures", tmp_path / "figures")
+    code, _, text = bench("identify", data, *COLUMNS, *options, "--out", model, "--card", card)
+    assert code == 0, text
+    assert "--smoothing" not in text
+    assert (tmp_path / "figures" / "hammerstein-errors.png").is_file()
+    times, drive, _ = np.loadtxt(data, delimiter=",", skiprows=1, unpack=True)
+    rates = np.abs(np.diff(drive) / np.diff(1e-3 * times))
+    steps = 1e-3 * np.diff(times)
+    page = card.read_text(encoding="utf-8")
+    assert f"| rate | {rates.min():.4g} to {rates.max():.4g} V/s" in page
+    assert (
+        f"| sampling rate | {1.0 / np.median(steps):.4g} Hz over {1e-3 * np.ptp(times):.4g} s; uneven steps" in page
+    )
+    rows = {name: tmp_path / f"{name}.csv" for name in ("predict", "compare")}
+    assert bench("predict", model, data, *COLUMNS, "--out", rows["predict"])[0] == 0
+    assert bench("compare", model, "--data", data, "--out", rows["compare"])[0] == 0
+    for path in rows.values():
+        head = path.read_text(encoding="utf-8").splitlines()[0]
+        assert head == "time [s],drive [V],measured [µm],predicted [µm],residual [µm]"
+        written = np.loadtxt(path, delimiter=",", skiprows=1, usecols=0)
+        np.testing.assert_allclose(written, 1e-3 * times, rtol=1e-12)
+
+
 def test_times_are_read_in_their_unit(bench, tmp_path):
     code, _, _ = bench(
         "identify", hammerstein(tmp_path), *COLUMNS, "--model", "hammerstein", "--levels", 5, "--dynamics", "lag",
