@@ -16,13 +16,14 @@ from bench.hysteresis import (
     MaxwellSlip,
     PrandtlIshlinskii,
     Preisach,
+    QuadraticTerm,
     uniform_levels,
 )
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
 from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
-from bench.timed import BoucWenOscillator, Hammerstein, LinearPart
+from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, PreisachOscillator
 from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
@@ -99,6 +100,8 @@ def timed() -> None:
     plays = PrandtlIshlinskii(np.array([0.0, 0.2]), np.ones(2))
     Hammerstein(plays, LinearPart(0.5, (0.1, 0.1))).evaluate(times, inputs)
     BoucWenOscillator(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
+    force = Preisach(uniform_levels(-1.0, 1.0, 4), np.zeros(10), reversible=QuadraticTerm(1.0))
+    PreisachOscillator(1.0, 1.0, force, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
 
 
 def laboratories() -> None:

@@ -4,6 +4,7 @@ from bench.timed.by_name import identify_in_time
 from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.linear_parts import FilterState, LinearPart, logarithmic_creep
 from bench.timed.oscillator import BoucWenOscillator, OscillatorState
+from bench.timed.preisach_oscillator import PreisachOscillator, PreisachOscillatorState
 
 __all__ = [
     "BoucWenOscillator",
@@ -12,6 +13,8 @@ __all__ = [
     "HammersteinState",
     "LinearPart",
     "OscillatorState",
+    "PreisachOscillator",
+    "PreisachOscillatorState",
     "identify_in_time",
     "logarithmic_creep",
 ]

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from bench.hysteresis import _kernels as memory
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -125,3 +127,70 @@ def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, 
         outputs[n + 1] = y
     state[0], state[1], state[2] = y, v, z
     return True
+
+
+@njit(cache=True)
+def oscillate_on_plane(
+    inputs: Floats,
+    steps: Floats,
+    parameters: Floats,
+    plane: memory.Plane,
+    below: Floats,
+    terms: memory.Terms,
+    pieces: memory.Pieces,
+    count: int,
+    state: Floats,
+    outputs: Floats,
+) -> tuple[int, bool]:
+    """Integrate m y'' + c y' + F[y] = u, F a Preisach operator, by the leapfrog method (Störmer and Verlet).
+
+    The memory moves with each substep: the method needs the force at y alone, once a substep.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (N - 1, S + 1)
+        Input at the ends of the S substeps of each step.
+    steps : ndarray, shape (N - 1,)
+        s.
+    parameters : ndarray, shape (3,)
+        m, c and the operator's offset.
+    plane, below, terms
+        The operator's `Lattice`.
+    pieces, count
+        The memory and its number of pieces, with room for two more each substep; written.
+    state : ndarray, shape (2,)
+        y and y' at the first sample, and at the last on return.
+    outputs : ndarray, shape (N, 3)
+        y, y' and F[y] at the samples; written.
+
+    Returns
+    -------
+    The number of pieces, and whether it stayed finite; outputs from there on are those of the last sample before.
+    """
+    m, c, offset = parameters
+    y, v = state
+    low, high = plane[0][0], plane[0][-1]
+    present = min(max(y, low), high)
+    cell, mass = memory.load(plane, pieces, count, present)
+    force = memory.output_at(plane, below, offset, terms, y, present, cell, mass)
+    outputs[0, 0], outputs[0, 1], outputs[0, 2] = y, v, force
+    substeps = inputs.shape[1] - 1
+    for n in range(steps.size):
+        half = 0.5 * steps[n] / substeps
+        for s in range(substeps):
+            # Damping is implicit in the first half of a step, explicit in the second: the method stays symmetric.
+            middle = (v + half * (inputs[n, s] - force) / m) / (1.0 + half * c / m)
+            y += 2.0 * half * middle
+            if not abs(y) < 1e100 or count + 2 > pieces[0].size:
+                for later in range(n + 1, outputs.shape[0]):
+                    for i in range(3):
+                        outputs[later, i] = outputs[n, i]
+                return count, False
+            u = min(max(y, low), high)
+            count, cell, mass = memory.move(plane, pieces, count, present, cell, mass, u)
+            present = u
+            force = memory.output_at(plane, below, offset, terms, y, present, cell, mass)
+            v = middle * (1.0 - half * c / m) + half * (inputs[n, s + 1] - force) / m
+        outputs[n + 1, 0], outputs[n + 1, 1], outputs[n + 1, 2] = y, v, force
+    state[0], state[1] = y, v
+    return count, True

@@ -10,7 +10,7 @@ nonlinearity", Workshop on Nonlinear System Identification Benchmarks 2016) this
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
@@ -134,7 +134,7 @@ class BoucWenOscillator(TimedModel[State]):
             at = np.array([state.position, state.velocity, state.force])
             integrate(self.vector, between, np.array([gap]), at)
         driven = Drive.of(clock, sequence, self.interpolation, substeps, periodic=state == "periodic")
-        outputs, finite = driven.respond(self.vector, at)
+        outputs, finite = respond(driven, self.vector, at)
         if not finite:
             raise ValueError(f"inputs: the response of this {self.kind} grows without bounds")
         position, velocity, force = at.tolist()
@@ -221,22 +221,34 @@ class Drive:
         count = steps.size
         return cls(np.ascontiguousarray(rows[:count]), steps, rows[count:] if periodic else None)
 
-    def respond(self, parameters: Floats, state: Floats) -> tuple[Floats, bool]:
-        """Return y at the samples, shape (N,), and whether it stayed finite; `state` is that at the end then.
+    def respond(
+        self, integrate: Callable[[Floats, Floats], tuple[Floats, bool]], decay: float
+    ) -> tuple[Floats, bool]:
+        """Return what the integration of the sequence returns; from the steady state if it repeats itself.
 
-        From the steady state if the sequence repeats itself.
+        Parameters
+        ----------
+        integrate : callable
+            From inputs and steps as above to the response at the samples and whether it stayed finite; keeps the
+            state from call to call.
+        decay : float
+            Rate at which free oscillations decay, 1/s; 0 if it is not known.
         """
         if self.closing is not None:
-            m, c, k, a = parameters[:4]
-            period = float(self.steps.sum() + self.steps[-1])
-            decay = abs(c / (2.0 * m)) if (k + a) / m > 0.0 else 0.0
-            periods = math.ceil(_SETTLED / (decay * period)) if decay * period > 0.0 else _MOST_PERIODS
-            for _ in range(min(periods, _MOST_PERIODS)):
-                outputs, finite = integrate(parameters, self.inputs, self.steps, state)
+            turns = decay * float(self.steps.sum() + self.steps[-1])
+            for _ in range(min(math.ceil(_SETTLED / turns), _MOST_PERIODS) if turns > 0.0 else _MOST_PERIODS):
+                outputs, finite = integrate(self.inputs, self.steps)
                 if not finite:
                     return outputs, False
-                integrate(parameters, self.closing, self.steps[-1:], state)
-        return integrate(parameters, self.inputs, self.steps, state)
+                integrate(self.closing, self.steps[-1:])
+        return integrate(self.inputs, self.steps)
+
+
+def respond(driven: Drive, parameters: Floats, state: Floats) -> tuple[Floats, bool]:
+    """Return y at the samples, shape (N,), and whether it stayed finite; `state` is that at the end then."""
+    m, c, k, a = parameters[:4]
+    decay = abs(c / (2.0 * m)) if (k + a) / m > 0.0 else 0.0
+    return driven.respond(lambda inputs, steps: integrate(parameters, inputs, steps, state), decay)
 
 
 def integrate(parameters: Floats, inputs: Floats, steps: Floats, state: Floats) -> tuple[Floats, bool]:

@@ -21,7 +21,7 @@ from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import Identification
 from bench.identification.least_squares import Certificate
 from bench.identification.measures import measure_errors
-from bench.timed.oscillator import BoucWenOscillator, Drive, Interpolation, Start, substeps_for
+from bench.timed.oscillator import BoucWenOscillator, Drive, Interpolation, Start, respond, substeps_for
 
 # Shares of the small-amplitude stiffness that is hysteretic, and loop rate and shape in 1 / (3 RMS output).
 _SHARES, _RATES, _SHAPES = (0.3, 0.6, 0.9), (0.3, 1.0, 3.0), (-1.2, 0.0, 1.2)
@@ -47,7 +47,7 @@ class _Simulation:
 
     def offset(self, values: Floats) -> tuple[float, Floats]:
         """Return the offset, and the residuals without it."""
-        simulated, finite = self.drive.respond(values * self.scales, np.zeros(3))
+        simulated, finite = respond(self.drive, values * self.scales, np.zeros(3))
         if not finite or np.abs(simulated).max() > 1e6 * np.ptp(self.outputs):
             return 0.0, np.full(simulated.size, 1e6 * float(np.ptp(self.outputs)))
         rest = self.outputs - simulated
@@ -132,7 +132,7 @@ def identify_bouc_wen_oscillator(
         raise ValueError(f"weights: expected {u.size} values >= 0, some above 0")
     roots = np.sqrt(w)
     roots[:skip] = 0.0
-    linear = _linear_start(clock, u, y)
+    linear = linear_start(clock, u, y)
     substeps = substeps_for(np.array([*linear, 0.0, 0.0, 0.0]), clock)
     ends: dict[Start, tuple[_Simulation, Any]] = {}
     starts: tuple[Start, ...] = ("rest", "periodic") if initial is None else (initial,)  # type: ignore[assignment]
@@ -224,7 +224,7 @@ def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats
     return fine, fine.search(np.asarray(best.x), 100)
 
 
-def _linear_start(times: Floats, inputs: Floats, outputs: Floats) -> Floats:
+def linear_start(times: Floats, inputs: Floats, outputs: Floats) -> Floats:
     """Return m, c and k of the linear oscillator that fits the spectra best, shape (3,).
 
     Raises ValueError if there is none.

@@ -7,6 +7,8 @@ from bench.timed.hammerstein import Hammerstein
 from bench.timed.hammerstein_fit import identify_hammerstein
 from bench.timed.oscillator import BoucWenOscillator
 from bench.timed.oscillator_fit import identify_bouc_wen_oscillator
+from bench.timed.preisach_oscillator import PreisachOscillator
+from bench.timed.preisach_oscillator_fit import identify_preisach_oscillator
 
 HAMMERSTEIN = ModelSpec(
     "an operator, then lag or resonance, delay, creep and drift; needs the time of each row",
@@ -17,4 +19,9 @@ BOUC_WEN_OSCILLATOR = ModelSpec(
     "a mass on a spring, a damper and a Bouc-Wen force; needs the time of each row",
     BoucWenOscillator,
     fit_in_time=identify_bouc_wen_oscillator,
+)
+PREISACH_OSCILLATOR = ModelSpec(
+    "a mass on a damper and a Preisach force with a spring; needs the time of each row",
+    PreisachOscillator,
+    fit_in_time=identify_preisach_oscillator,
 )

@@ -97,17 +97,21 @@ def test_oscillator_beats_every_published_score():
     rng = np.random.default_rng(0)
     u, clean = steady(multisine(rng))
     times = np.arange(PERIOD) / RATE
-    found = identify_in_time(
-        "bouc-wen-oscillator", times, u, clean + rng.normal(0.0, 8e-6, PERIOD), input_unit="N", output_unit="m"
-    )
+    measured = clean + rng.normal(0.0, 8e-6, PERIOD)
+    found = identify_in_time("bouc-wen-oscillator", times, u, measured, input_unit="N", output_unit="m")
     model = found.model
+    on_plane = identify_in_time("preisach-oscillator", times, u, measured, input_unit="N", output_unit="m")
     assert found.initial_state == "periodic"
     u, y = steady(multisine(rng))
     on_multisine = decibels(y - model.evaluate(times, u, "periodic"))
+    plane_on_multisine = decibels(y - on_plane.model.evaluate(times, u, "periodic"))
     t, u, y = sweep()
     on_sweep = decibels(y - model.evaluate(t, u))
     table = Table("model", "multisine / dB", "sweep / dB", title="Bouc-Wen benchmark")
     table.add_row("bench: bouc-wen-oscillator, 7 parameters", f"{on_multisine:.1f}", f"{on_sweep:.1f}")
+    plane_on_sweep = decibels(y - on_plane.model.evaluate(t, u))
+    name = f"bench: preisach-oscillator, {on_plane.certificate.passive} parameters"
+    table.add_row(name, f"{plane_on_multisine:.1f}", f"{plane_on_sweep:.1f}")
     for name, score in PUBLISHED.items():
         table.add_row(name, f"{score:.1f}", "")
     Console(width=110).print(table)
@@ -115,3 +119,5 @@ def test_oscillator_beats_every_published_score():
         print(f"{name:22} {value:12.6g} {unit}")
     assert on_multisine <= -120.0
     assert on_sweep <= -105.0
+    # Loops of this plant drift, which a Preisach force cannot follow; it still does better than a linear oscillator.
+    assert plane_on_multisine < PUBLISHED["linear, subspace, order 3"]

@@ -43,6 +43,7 @@ def oscillator(folder):
         (hammerstein, ("--model", "hammerstein", "--static", "polynomial", "--degree", 3, "--dynamics", "lag,drift")),
         (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--initial", "positive")),
         (oscillator, ("--model", "bouc-wen-oscillator")),
+        (oscillator, ("--model", "preisach-oscillator", "--levels", 4)),
     ],
 )
 def test_prediction_of_the_same_file_has_the_errors_of_the_identification(bench, tmp_path, make, options):
