@@ -516,7 +516,7 @@ def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> li
         lines.append(("determined by data", resolution.summary()))
     if certificate.exchangeable:
         text = (
-            f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+            f"the minimiser is not unique: {certificate.exchangeable} cells could replace others without "
             "changing the fit"
         )
         # Models with time take no smoothing.
