@@ -93,7 +93,7 @@ class PreisachOscillator(TimedModel[State]):
             object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
         if self.mass == 0.0:
             raise ValueError("mass: expected a number other than 0")
-        if not isinstance(self.force, Preisach):
+        if self.force.kind != Preisach.kind:
             raise ValueError("force: expected a Preisach operator")
         low, high = (_checks.number("input_range", value) for value in self.input_range)
         object.__setattr__(self, "input_range", (low, high))

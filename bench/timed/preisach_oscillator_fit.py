@@ -242,9 +242,10 @@ def identify_preisach_oscillator(
 def _begin(search: _Search, template: PreisachOscillator, signs: tuple[Sign, ...]) -> tuple[_Search, _Trial, Sign]:
     """Return the search, the trial after the step along the measured displacement, and the sign of its density."""
     linear, path = search.simulate(template), search.measured(template.offset)
-    ends = [(_advance(search, linear, path, np.zeros(path.position.size), sign), sign) for sign in signs]
+    still = np.zeros(path.position.size)
+    ends = [(_polish(search, _advance(search, linear, path, still, sign)), sign) for sign in signs]
     best, sign = min(ends, key=lambda each: each[0].cost)
-    return search, _polish(search, best), sign
+    return search, best, sign
 
 
 def _descend(search: _Search, best: _Trial, sign: Sign) -> _Trial:
