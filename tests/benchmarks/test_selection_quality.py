@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bench.hysteresis import identifiable_models
-from bench.identification import set_up_problem
+from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Measurements
 from bench.identification.selection import select
 
