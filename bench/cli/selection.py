@@ -157,11 +157,11 @@ def choose_model(
 def _print_table(found: SelectedModel) -> None:
     """Print the best models, a line each; cells are never cut off."""
     selection = found.selection
-    unit = f", {found.unit}" if found.unit else ""
-    heads = (
-        *("", "model", "free", f"training{unit}", f"held out{unit}", "±", "% of range"),
-        *(f"other cycles{unit}", "CPU s"),
-    )
+    unit = found.unit or "units"
+    heads = [
+        ("", "", "", "training", "held out", "", "% of", "other", "CPU"),
+        ("", "model", "free", unit, unit, "±", "range", f"cycles, {unit}", "s"),
+    ]
     shown = list(selection.evaluations[:_SHOWN])
     shown += [each for each in (selection.chosen,) if each not in shown]
     rows = [
@@ -178,15 +178,15 @@ def _print_table(found: SelectedModel) -> None:
         )
         for each in shown
     ]
-    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
     _print_line("models by their RMS error on what was left out of the fit")
-    for row in (heads, *rows):
+    for row in (*heads, *rows):
         # Marks and names begin a column, numbers end it.
         cells = [
             text.ljust(width) if place < 2 else text.rjust(width)
             for place, (text, width) in enumerate(zip(row, widths, strict=True))
         ]
-        _print_line("  ".join(cells).rstrip())
+        _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
     more = len(selection.evaluations) - len(shown)
     _print_line(
         "* chosen, the simplest within one standard error of the least error (+)"
@@ -208,8 +208,8 @@ def _describe(one: Candidate) -> str:
     parts = [own.pop("static") + " with " + own.pop("dynamics") if "static" in own else one.model]
     parts += [value if isinstance(value, str) else f"{name} {value}" for name, value in own.items() if value]
     parts.append(one.orientation if one.orientation == "falling" else "")
-    parts.append(f"initial {one.initial}" if one.initial else "")
-    parts.append(f"smoothing {one.smoothing:g}" if one.smoothing else "")
+    parts.append(f"start {one.initial}" if one.initial else "")
+    parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
     return ", ".join(part for part in parts if part and part != "none")
 
 
@@ -222,7 +222,7 @@ def print_test(
     if comparing.test is None:
         return None
     tested = evaluate_on_test(found, comparing.test, columns, reading)
-    unit = found.file.operator.output_unit
+    unit = found.file.response.output_unit
     raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
     skipped = f", first {tested.skip} rows left out" if tested.skip else ""
     print_rows(

@@ -71,7 +71,7 @@ _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
 _FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
 # Operators to which a linear part and a drift are added.
-_IN_TIME = 3
+_IN_TIME = 2
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
 _WARNED = 3.0
 
@@ -151,14 +151,15 @@ class Selection:
         chosen = self.chosen
         if self.reversals is not None and self.reversals < _FEW_REVERSALS:
             found.append(
-                f"the input reverses only {self.reversals} times, which tells little of hysteresis: "
+                f"the input reverses only {_times(self.reversals)}, which tells little of hysteresis: "
                 "record more cycles, of several amplitudes, as `bench design` proposes"
             )
         if self.trend is not None and self.trend.share > _DRIFTS:
+            part = 100.0 * abs(self.trend.change) / self.span
             found.append(
-                f"the errors drift by {100.0 * abs(self.trend.change) / self.span:.1f} % of the range from the first to "
-                f"the last row ({self.trend.share:.0%} of their variance): give --time COLUMN, so that models with drift and creep "
-                "take part"
+                f"the errors drift by {part:.1f} % of the range from the first to the last row "
+                f"({self.trend.share:.0%} of their variance): give --time COLUMN, so that models with drift and "
+                "creep take part"
             )
         if not chosen.units and self.has_one_kind:
             found.append(
@@ -322,13 +323,9 @@ class _Search:
 
     def _count(self, kind: _Kind, step: int) -> int:
         """Return the number of coefficients of a kind at a size."""
-        return self._coefficients(Candidate(kind.model, kind.options(step)))
-
-    def _coefficients(self, candidate: Candidate) -> int:
-        """Return the number of coefficients of a candidate."""
-        template = find_model(candidate.model).template
+        template = find_model(kind.model).template
         assert template is not None
-        operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
+        operator: Operator[Any] = template(self.measured.inputs, **kind.options(step))
         return operator.coefficients.size
 
     def smooth(self) -> None:
@@ -399,14 +396,14 @@ class _Search:
         ]
         return found + [each for each in finalists if each not in near]
 
-    def with_time(self, judged: Sequence[Evaluation]) -> list[Evaluation]:
-        """Return models with time with the best operators, one of each model; none if times are not known."""
+    def with_time(self, judged: list[Evaluation]) -> list[Evaluation]:
+        """Return models with time with the best operators, each of another model; none if times are not known."""
         if self.in_time is None:
             return []
         best: dict[str, Evaluation] = {}
-        for each in sorted(judged, key=lambda one: one.rms):
-            count = self._coefficients(each.candidate)
-            if self._in_time_too(each.candidate.model, count):
+        # The one that would be chosen without time, then the best of each model.
+        for each in (self._decide(judged)[1], *sorted(judged, key=lambda one: one.rms)):
+            if self._in_time_too(each.candidate):
                 best.setdefault(each.candidate.model, each)
         gap = self.measured.gap
         tasks: list[tuple[str, Task]] = [
@@ -416,24 +413,30 @@ class _Search:
         found = [one for each in self.carry(tasks) for one in each]
         determined = {name: each.determined for name, each in best.items()}
         self.given_up += [each for each in found if each.failure]
+        # What is left out of the others decides.
+        units = bool(self.measured.units())
         return [
-            replace(each, determined=determined[each.candidate.options["static"]])
+            replace(
+                each,
+                determined=determined[each.candidate.options["static"]],
+                units=each.units if units else (),
+            )
             for each in found
             if not each.failure
         ]
 
-    def _in_time_too(self, model: str, coefficients: int) -> bool:
-        """Return whether a model can be the operator of one with time: a free plane would need penalties."""
+    def _in_time_too(self, candidate: Candidate) -> bool:
+        """Return whether a candidate can be the operator of a model with time: a free plane would need penalties."""
         assert self.in_time is not None
-        has_plane = any(self._has_plane.get(kind) for kind in self.kinds if kind.model == model)
-        return self.in_time.is_small(coefficients) and (find_model(model).constrained or not has_plane)
+        template = find_model(candidate.model).template
+        assert template is not None
+        operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
+        bounded = find_model(candidate.model).constrained or not operator.densities()
+        return bounded and self.in_time.is_small(operator.coefficients.size)
 
     def choose(self, finalists: list[Evaluation]) -> Selection:
         """Return the table with what is chosen."""
-        judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        best = min(judged, key=lambda each: _score(each).mean())
-        within = [each for each in judged if is_within_one_standard_error(each, best)]
-        chosen = min(within, key=lambda each: (each.free, _score(each).mean()))
+        best, chosen = self._decide(finalists)
         others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
         table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
         measured = self.measured
@@ -448,6 +451,13 @@ class _Search:
             max(turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs))).size - 2, 0),
             self._trend(chosen) if "static" not in chosen.candidate.options else None,
         )
+
+    def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
+        """Return the one of the least error, and the simplest near it, of those that may be chosen."""
+        judged = [each for each in finalists if each.units] or self._without_units(finalists)
+        best = min(judged, key=lambda each: _score(each).mean())
+        within = [each for each in judged if is_within_one_standard_error(each, best)]
+        return best, min(within, key=lambda each: (each.free, _score(each).mean()))
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
@@ -538,6 +548,10 @@ class _Search:
         """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
         block = int(self.measured.tested.sum()) // self.measured.count_of_blocks
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
+
+
+def _times(number: int) -> str:
+    return "once" if number == 1 else f"{number} times"
 
 
 def _is_bounded(candidate: Candidate) -> bool:
