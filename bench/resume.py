@@ -17,6 +17,7 @@ from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, SCHEMA, Record, take_in
 from bench.locks import Holder, Locks
 from bench.past import Interrupted, Past
+from bench.printing import print_plain
 from bench.recorded_files import Original, unpack
 from bench.repetition import recorded_protocol
 from bench.rig_file import load_rig, rig_of_content
@@ -103,14 +104,14 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         if asked.attach is not None or run.original is None or run.original.rig is None:
             with opened(run.rig, run.overrides, asked.attach, "bench resume") as place:
                 for name, meaning in clear_expired_watchdogs(place).items():
-                    console.print(f"{name}: cleared: {meaning}", highlight=False, markup=False, soft_wrap=True)
+                    print_plain(console, f"{name}: cleared: {meaning}")
         result = carry_out(run, console, interrupts, again)
     recording = folder / RECORDING_NAME
     if recording.exists():
         # It ends where the run died.
         recording.unlink()
         text = f"{recording} was of the first part and is removed; bench export {folder} --format rrd makes the whole"
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, text)
     return result
 
 

@@ -31,6 +31,7 @@ from bench.journal import FILE_NAME, Journal, abandon
 from bench.locks import Holder, Locks
 from bench.model_file import models_among
 from bench.past import Interrupted
+from bench.printing import print_plain
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rehearsal import Rehearsal, rehearse
@@ -198,7 +199,7 @@ def carry_out(
         elif original:
             meta["repeats"] = original.meta["run"]
             for difference in differences(original.meta, meta):
-                console.print(f"not as in the original: {difference}", highlight=False, markup=False, soft_wrap=True)
+                print_plain(console, f"not as in the original: {difference}")
         folder = again.folder if again is not None else make_folder(run.folder, run_name(run.protocol, meta))
         if again is None:
             locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
@@ -417,7 +418,7 @@ def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
     except MissingExtraError as error:
         if run.live:
             raise
-        console.print(f"no recording: {error}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"no recording: {error}")
         return None
     return Dashboard
 

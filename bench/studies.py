@@ -18,6 +18,7 @@ from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record
+from bench.printing import print_plain
 from bench.protocol import find_protocol
 from bench.results.tracking import TargetResults, target_results
 
@@ -284,7 +285,7 @@ def reproduce(
         check_extra("an .rrd file", "rerun", "dashboard")
         recorded = True
     except MissingExtraError as error:
-        console.print(f"no recordings: {error}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"no recordings: {error}")
         recorded = False
     from bench.results.report import export_run
     from bench.workers import Workers
@@ -333,10 +334,10 @@ def _print_end(values: Mapping[str, Any], console: Console) -> None:
         f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
         highlight=False,
     )
-    console.print(f"runs, models and recordings: {values['folder']}", highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, f"runs, models and recordings: {values['folder']}")
     for folder in dict.fromkeys(str(Path(path).parent) for path in values["figures"]):
-        console.print(f"figures: {folder}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"figures: {folder}")
     if values["recordings"]:
         console.print("open a recording with `rerun FILE`:", highlight=False)
     for path in values["recordings"]:
-        console.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"  {path}")

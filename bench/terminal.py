@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
+from bench.printing import print_plain
 from bench.remaining_time import Expectation, RemainingTime
 from bench.running import ABORT, RESUME
 from bench.units import format_duration
@@ -191,7 +192,7 @@ class RehearsalDisplay:
         if not self._shown and self._since_start.seconds() > _UNSEEN:
             self._shown = True
             if not self._console.is_terminal:
-                self._console.print(f"{self._title} …", highlight=False, markup=False, soft_wrap=True)
+                print_plain(self._console, f"{self._title} …")
             # A compilation draws on the same console.
             with suppress(LiveError):
                 self._progress.start()

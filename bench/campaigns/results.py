@@ -16,6 +16,7 @@ from rich.text import Text
 from bench.campaigns.expansion import Expansion
 from bench.campaigns.tasks import Done, ModelTask, RunTask, StudyTask
 from bench.extras import MissingExtraError, needed_for
+from bench.printing import print_plain
 from bench.results.data import write_csv
 from bench.units import header_with_unit
 
@@ -229,7 +230,7 @@ def write_tables(tables: Mapping[str, ResultsTable], folder: Path, console: Cons
             table.write_parquet(folder / f"{name}.parquet")
             paths.append(folder / f"{name}.parquet")
     except MissingExtraError as error:
-        console.print(f"no Parquet files: {error}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"no Parquet files: {error}")
     return paths
 
 

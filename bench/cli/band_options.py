@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.cli.console import console, print_rows, warn
+from bench.printing import print_plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,7 @@ RecalibrateRowsOption = Annotated[
 def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | None = None, name: str = "") -> None:
     """Print a band in a line, with its coverage if there are residuals, and warn where it may not hold."""
     prefix = f"{name}: " if name else ""
-    console.print(prefix + found.text(residuals), highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, prefix + found.text(residuals))
     if warning := found.warning():
         warn(prefix + warning)
 

@@ -13,6 +13,7 @@ import typer
 
 from bench.cli.console import JsonOption, console, error_console, show_compilation, write_json
 from bench.errors import AbortError
+from bench.printing import print_plain
 
 if TYPE_CHECKING:
     from bench.campaigns.expansion import Expansion
@@ -99,7 +100,7 @@ def campaign(
     files = _show(expansion, done, folder)
     failed = {name: each for name, each in done.items() if not each.carried_out}
     for name, each in failed.items():
-        error_console.print(f"{each.status}: {name}: {each.reason}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(error_console, f"{each.status}: {name}: {each.reason}")
     console.print(
         f"{len(done) - len(failed)} of {len(done)} carried out, {len(before.done)} of them before, "
         f"in {stopwatch.seconds():.1f} s: {folder}",
@@ -159,7 +160,7 @@ def _list(expansion: Expansion, before: dict[str, Done]) -> None:
     for name in expansion.tasks:
         planned = expansion.plans.get(name)
         parts = [name, f"{planned[0]:.0f} s" if planned else "", before[name].status if name in before else ""]
-        console.print(", ".join(filter(None, parts)), highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, ", ".join(filter(None, parts)))
 
 
 def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from bench.cli.console import console
+from bench.printing import print_plain
 from bench.results.reading.options import ReadingOptions
 
 
@@ -68,4 +69,4 @@ layout_options = offer_options(_layout, "reading")
 def print_assumptions(name: str, assumptions: str) -> None:
     """Print in a line what was assumed about the layout of a file; nothing for a run."""
     if assumptions:
-        console.print(f"read {name}: {assumptions}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"read {name}: {assumptions}")

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from bench.cli.console import JsonOption, console, write_json
 from bench.errors import RecordError
+from bench.printing import print_plain
 
 app = typer.Typer()
 
@@ -52,7 +53,7 @@ def recover_journal(
     said += [f"second file: {path}" for path in found.second_files]
     said.append("the journal is whole" if found.copy is None else f"repaired copy: {found.copy}")
     for line in said:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, line)
     write_json(
         json_file,
         {

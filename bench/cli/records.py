@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bench.cli.console import JsonOption, console, show_compilation, write_json
+from bench.printing import print_plain
 
 app = typer.Typer()
 
@@ -66,5 +67,5 @@ def export(
 
     paths = export_run(run, format_.value, out)
     for path in paths:
-        console.print(f"{path}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"{path}")
     write_json(json_file, {"files": [str(path) for path in paths]})

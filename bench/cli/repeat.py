@@ -9,6 +9,7 @@ import typer
 
 from bench.cli.console import JsonOption, LiveOption, console, parse_assignments, show_compilation, warn
 from bench.cli.runs import print_result
+from bench.printing import print_plain
 
 app = typer.Typer()
 
@@ -65,5 +66,5 @@ def repeat(
             if found.is_exact:
                 warn(text)
             else:
-                console.print(text, highlight=False, markup=False, soft_wrap=True)
+                print_plain(console, text)
         print_result(found.result, json_file, {"repeats": str(found.original), **found.comparison.to_json()})

@@ -27,6 +27,7 @@ from bench.cli.console import (
 from bench.cli.model_options import inverse_of, options_json, print_model, print_models
 from bench.cli.rehearse import show_rehearsal
 from bench.errors import BenchError, ConfigurationError
+from bench.printing import print_plain
 
 if TYPE_CHECKING:
     from bench.runs import RunResult
@@ -245,7 +246,7 @@ def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, A
     )
     if outcome.pace is not None and not outcome.pace.is_reached:
         console.print(f"clock: {outcome.pace}", highlight=False)
-    console.print(f"record: {result.folder}", highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, f"record: {result.folder}")
     write_json(
         json_file,
         {

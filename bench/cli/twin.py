@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bench.cli.console import JsonOption, console, print_rows, show_compilation, write_json
+from bench.printing import print_plain
 
 app = typer.Typer()
 
@@ -35,5 +36,5 @@ def twin_(
 
     twin = write_twin(runs, rig, out, model)
     print_rows(f"twin of {rig}", twin.rows())
-    console.print(f"rig file: {out}", highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, f"rig file: {out}")
     write_json(json_file, {"rig": rig, "out": str(out), **twin.summary()})

@@ -10,6 +10,7 @@ import typer
 
 from bench.cli.command_line import command_line
 from bench.cli.console import console
+from bench.printing import print_plain
 
 if TYPE_CHECKING:
     from bench.results.models import IdentifiedFile
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 def print_figures(paths: Iterable[Path]) -> None:
     """Print where figures are."""
     for path in paths:
-        console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"figure: {path}")
 
 
 def write_fit(
@@ -46,7 +47,7 @@ def write_fit(
         from bench.results.model_card import write_card
 
         write_card(card, found, data, command=command_line(context), model=out, figures=drawn)
-        console.print(f"card: {card}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"card: {card}")
 
 
 def write_rows(path: Path, found: Predictions) -> None:
@@ -58,4 +59,4 @@ def write_rows(path: Path, found: Predictions) -> None:
 
     table = found.table()
     write_csv(path, [head for head, _ in table], [values for _, values in table])
-    console.print(f"{found.input.values.size} rows: {path}", highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, f"{found.input.values.size} rows: {path}")

@@ -69,7 +69,7 @@ class LineThreads:
         self._notify = notify
         self._ending = threading.Event()
         self._lines = lines
-        self._lost: set[str] = set()
+        self._lost: dict[str, str] = {}
         self._numbers = itertools.count()
         queues: dict[str, queue.PriorityQueue[_Call]] = {line: queue.PriorityQueue() for line in lines.values()}
         self._queues = {name: queues[line] for name, line in lines.items()}
@@ -102,7 +102,7 @@ class LineThreads:
         line = self._lines[call.device]
         if call.priority != SAFE and line in self._lost:
             # That ends the run: each device of a lost line would take as long again to say so.
-            raise DeviceConnectionError(call.device, "was not asked, as its line is lost")
+            raise DeviceConnectionError(call.device, f"was not asked, as its line is lost ({self._lost[line]})")
         try:
             return Result(call.device, call.call(), None, was_away=False)
         except DeviceConnectionError as lost:
@@ -112,8 +112,8 @@ class LineThreads:
             device = self._devices[call.device]
             try:
                 seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
-            except DeviceConnectionError:
-                self._lost.add(line)
+            except DeviceConnectionError as gone:
+                self._lost[line] = str(gone)
                 raise
             self._notify(call.device, seconds, str(lost))
             # A set-point that waited for its line may not be sent after the end.

@@ -513,7 +513,7 @@ def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> li
         lines.append(
             (
                 "not unique",
-                f"the minimiser is not unique: {certificate.exchangeable} cells are exchanged for others without "
+                f"the minimiser is not unique: {certificate.exchangeable} cells could replace others without "
                 "changing the fit; they are resolved by --smoothing",
             )
         )

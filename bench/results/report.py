@@ -18,6 +18,7 @@ from bench.hysteresis import MemoryCurve, Operator
 from bench.identification import measure_errors
 from bench.journal import Record, Table, expected_steps, run_card
 from bench.model_file import ModelFile, parse_model
+from bench.printing import print_plain
 from bench.results.data import write_csv
 from bench.results.figures import (
     check_matplotlib,
@@ -66,7 +67,7 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
         if remark := record.remark():
-            console.print(remark, highlight=False, markup=False, soft_wrap=True)
+            print_plain(console, remark)
         _print_status(record, len(steps), console)
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
@@ -79,7 +80,7 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         _print_control(control, record, controlled, console)
         _print_comparison(comparison, models, record, console)
     for path in [*figures, *more]:
-        console.print(f"figure: {path}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"figure: {path}")
     return {
         "run": record.meta["run"],
         "status": record.status,

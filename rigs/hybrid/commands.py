@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bench.cli import JsonOption, console, print_rows, write_json
+from bench.printing import print_plain
 
 
 def identify(
@@ -48,7 +49,7 @@ def identify(
         ModelFile(
             "hybrid", found.model, provenance={"sources": [run.name for run in (steps, static, loops, step)]}
         ).save(out)
-        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"model: {out}")
     write_json(
         json_file,
         {

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from bench.cli import JsonOption, console, print_rows, write_json
+from bench.printing import print_plain
 
 
 def identify_muscle(
@@ -44,7 +45,7 @@ def identify_muscle(
     print_rows(f"{model} from {len(series)} series of lengths", rows)
     if out is not None:
         muscle.muscle_file(model, found, [force_run, *length_runs]).save(out)
-        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"model: {out}")
     write_json(
         json_file,
         {

@@ -58,7 +58,7 @@ def test_without_penalties_the_null_space_is_named(identify):
 def test_cells_that_could_replace_others_are_counted_until_smoothed(identify):
     found, out = identify("--model", "preisach", rows=40)
     assert found["exchangeable"] > 0
-    assert f"{found['exchangeable']} cells are exchanged for others" in out
+    assert f"{found['exchangeable']} cells could replace others" in out
     smooth, out = identify("--model", "preisach", "--smoothing", 0.01, rows=40)
     assert smooth["exchangeable"] == 0
     assert "not unique" not in out

@@ -276,7 +276,7 @@ class TestEnd:
             settings = {"model": model, **settings}
         command = ["-m", "bench", "run", name, "--rig", rig, "--clock", clock, "--seed", "3", "--out", str(tmp_path)]
         command += [f"--set={key}={value}" for key, value in settings.items()]
-        environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
+        environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1", "COLUMNS": "400"}
         with pexpect.spawn(
             sys.executable, command, dimensions=(40, 400), env=environment, encoding="utf-8", timeout=180
         ) as terminal:
