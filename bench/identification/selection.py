@@ -252,6 +252,8 @@ class _Search:
         self.given_up: list[Evaluation] = []
         self._has_plane: dict[_Kind, bool] = {}
         self._has_one_kind = has_one_kind(measured.inputs, measured.tested)
+        turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
+        self._reversals = max(turns.size - 2, 0)
         self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
 
     def run(self) -> Selection:
@@ -448,7 +450,7 @@ class _Search:
             int(measured.tested.sum()),
             float(np.ptp(measured.outputs)),
             self._has_one_kind,
-            max(turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs))).size - 2, 0),
+            self._reversals,
             self._trend(chosen) if "static" not in chosen.candidate.options else None,
         )
 
@@ -479,7 +481,9 @@ class _Search:
         determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
         if not self._has_one_kind or not determined:
             return self._bounded(finalists)
-        return [each for each in determined if _is_bounded(each.candidate)] or determined
+        # A polynomial through a single rise is bounded by nothing beyond it.
+        single_valued = self._reversals >= _FEW_REVERSALS
+        return [each for each in determined if _is_bounded(each.candidate, single_valued)] or determined
 
     def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists without those of a plane and free signs, unless these are clearly better."""
@@ -554,11 +558,11 @@ def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
 
 
-def _is_bounded(candidate: Candidate) -> bool:
-    """Return whether signs bound the answer to other inputs, or there is no memory that would have to be bounded."""
+def _is_bounded(candidate: Candidate, single_valued: bool) -> bool:
+    """Return whether signs bound the answer to other inputs, or it has no memory if `single_valued` will do."""
     operator = find_model(candidate.options.get("static", candidate.model)).model
     # A model without signs has no orientation.
-    return bool(candidate.orientation != "auto" or operator.memoryless)
+    return bool(candidate.orientation != "auto" or (single_valued and operator.memoryless))
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
