@@ -481,9 +481,16 @@ class _Search:
         determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
         if not self._has_one_kind or not determined:
             return self._bounded(finalists)
-        # A polynomial through a single rise is bounded by nothing beyond it.
-        single_valued = self._reversals >= _FEW_REVERSALS
-        return [each for each in determined if _is_bounded(each.candidate, single_valued)] or determined
+        return [each for each in determined if self._is_bounded(each)] or determined
+
+    def _is_bounded(self, each: Evaluation) -> bool:
+        """Return whether signs bound the answer to other inputs, or it has no memory."""
+        # A model without signs has no orientation.
+        if each.candidate.orientation != "auto":
+            return True
+        operator = find_model(each.candidate.options.get("static", each.candidate.model)).model
+        # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
+        return bool(operator.memoryless and (self._reversals >= _FEW_REVERSALS or each.free <= 1.0))
 
     def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists without those of a plane and free signs, unless these are clearly better."""
@@ -556,13 +563,6 @@ class _Search:
 
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
-
-
-def _is_bounded(candidate: Candidate, single_valued: bool) -> bool:
-    """Return whether signs bound the answer to other inputs, or it has no memory if `single_valued` will do."""
-    operator = find_model(candidate.options.get("static", candidate.model)).model
-    # A model without signs has no orientation.
-    return bool(candidate.orientation != "auto" or (single_valued and operator.memoryless))
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
