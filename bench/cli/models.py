@@ -170,12 +170,17 @@ def identify_(
     if is_comparison(model):
         if cross_validate or weights_column:
             raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
-        selected = choose_model(files, columns, model, options, settings, comparing, skip=skip, reading=reading)
+        if static is not None or dynamics is not None:
+            raise ConfigurationError("--static and --dynamics go with --model hammerstein")
+        selected = choose_model(
+            files, columns, model, options, settings, comparing, skip=skip, time_column=time_column, reading=reading
+        )
         model, settings = selected.model, settings | selected.settings()
+        time_column = time_column if selected.is_timed else None
     elif comparing.table_out is not None:
         raise ConfigurationError("--table-out goes with --model all, or several models")
     else:
-        settings |= options.values
+        settings |= {**options.values, "static": static, "dynamics": dynamics}
     with show_patience(f"reading and fitting {names}"):
         found = identify_file(
             files,
@@ -183,8 +188,6 @@ def identify_(
             output_column=output_column,
             model=model,
             time_column=time_column,
-            static=static,
-            dynamics=dynamics,
             cross_validated=cross_validate,
             weights_column=weights_column,
             levels_to_try=options.levels_to_try,

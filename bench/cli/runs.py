@@ -53,7 +53,7 @@ def list_(
     fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
     """
     from bench.catalogue import Catalogue
-    from bench.hysteresis import identifiable_models
+    from bench.hysteresis import identifiable_models, timed_models
 
     catalogue = Catalogue.of_installed()
     if name is None:
@@ -68,10 +68,10 @@ def list_(
         print_protocol(definition)
         write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
     elif name == "models":
-        specs = identifiable_models()
+        specs = identifiable_models() | timed_models()
         print_models(specs)
         write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
-    elif name in (specs := identifiable_models()):
+    elif name in (specs := identifiable_models() | timed_models()):
         print_model(specs[name])
         write_json(json_file, {"name": name, **_model_json(specs[name])})
     elif name in (others := {**catalogue.studies, **catalogue.controllers}):

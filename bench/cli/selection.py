@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from bench.cli.console import check_outputs, console, print_rows, warn
 from bench.cli.data_options import offer_options
@@ -90,13 +88,14 @@ def choose_model(
     comparing: Comparing,
     *,
     skip: int,
+    time_column: str | None,
     reading: ReadingOptions,
 ) -> SelectedModel:
     """Compare models on measurements, and print the table.
 
     Parameters
     ----------
-    files, columns, skip, reading
+    files, columns, skip, time_column, reading
         The measurements.
     model : str
         `all`, or names with commas between them.
@@ -114,6 +113,7 @@ def choose_model(
     """
     from bench.identification.selection import Given
     from bench.results.selection import named_models, select_model
+    from bench.results.times import find_times
 
     if settings["ridge"] is not None:
         raise ConfigurationError("--ridge goes with one --model NAME")
@@ -135,11 +135,19 @@ def choose_model(
         console=console,
         skip=skip,
         train=comparing.train,
+        time_column=time_column,
         reading=reading,
     )
     _print_table(found)
     for warning in found.warnings:
         warn(warning)
+    if time_column is None and len(files) == 1 and (name := find_times(files[0], reading)) is not None:
+        console.print(
+            f"column {name} holds times: with --time {name} rate, creep and drift would take part",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         console.print(f"table: {comparing.table_out}", highlight=False, markup=False, soft_wrap=True)
@@ -147,51 +155,62 @@ def choose_model(
 
 
 def _print_table(found: SelectedModel) -> None:
+    """Print the best models, a line each; cells are never cut off."""
     selection = found.selection
-    table = Table(
-        title=f"models by their error on what was left out of the fit, in {found.unit or 'output units'}",
-        title_justify="left",
-        box=None,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("")
-    table.add_column("model")
-    for name in ("free", "training", "held out", "/ %", "cycles out", "s"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for each in selection.evaluations[:_SHOWN]:
-        values = (
+    unit = found.unit or "units"
+    heads = [
+        ("", "", "", "training", "held out", "", "% of", "other", "CPU"),
+        ("", "model", "free", unit, unit, "±", "range", f"cycles, {unit}", "s"),
+    ]
+    shown = list(selection.evaluations[:_SHOWN])
+    shown += [each for each in (selection.chosen,) if each not in shown]
+    rows = [
+        (
             "*" if each is selection.chosen else "+" if each is selection.best else "",
             _describe(each.candidate),
             f"{each.free:.0f}",
             f"{each.training:.3g}",
-            f"{each.rms:.3g} ± {each.spread:.1g}",
+            f"{each.rms:.3g}",
+            f"{each.spread:.1g}",
             f"{100.0 * each.rms / selection.span:.2f}",
-            f"{each.units_rms:.3g}" if each.units else "",
+            f"{each.units_rms:.3g}" if each.units else "-",
             f"{each.seconds:.1f}",
         )
-        table.add_row(*(Text(value) for value in values))
-    console.print(table)
-    more = len(selection.evaluations) - _SHOWN
-    console.print(
-        "*: chosen, the simplest within one standard error of the least error (+)"
-        + (f"; {more} more were worse or given up" if more > 0 else ""),
-        highlight=False,
-        markup=False,
+        for each in shown
+    ]
+    widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
+    _print_line("models by their RMS error on what was left out of the fit")
+    for row in (*heads, *rows):
+        # Marks and names begin a column, numbers end it.
+        cells = [
+            text.ljust(width) if place < 2 else text.rjust(width)
+            for place, (text, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
+    more = len(selection.evaluations) - len(shown)
+    _print_line(
+        "* chosen, the simplest within one standard error of the least error (+)"
+        + (f"; {more} more were worse or given up" if more > 0 else "")
     )
-    console.print(
-        f"held out: blocks of {selection.rows} rows with gaps of {selection.gap}; cycles out: whole kinds of cycles",
-        highlight=False,
-        markup=False,
+    _print_line(
+        f"held out: blocks of {selection.rows} rows with gaps of {selection.gap}; "
+        "other cycles: whole kinds of cycles left out"
     )
+
+
+def _print_line(text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def _describe(one: Candidate) -> str:
-    """Return a model with its settings in a line."""
-    options = [value if isinstance(value, str) else f"{name} {value}" for name, value in one.options.items()]
-    parts = [*options, "" if one.orientation == "auto" else one.orientation]
-    parts.append(f"initial {one.initial}" if one.initial else "")
-    parts.append(f"smoothing {one.smoothing:g}" if one.smoothing else "")
-    return ", ".join((one.model, *(part for part in parts if part and part != "none")))
+    """Return a model with its settings in short: those that differ from none."""
+    own = dict(one.options)
+    parts = [own.pop("static") + " with " + own.pop("dynamics") if "static" in own else one.model]
+    parts += [value if isinstance(value, str) else f"{name} {value}" for name, value in own.items() if value]
+    parts.append(one.orientation if one.orientation == "falling" else "")
+    parts.append(f"start {one.initial}" if one.initial else "")
+    parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
+    return ", ".join(part for part in parts if part and part != "none")
 
 
 def print_test(
@@ -203,7 +222,7 @@ def print_test(
     if comparing.test is None:
         return None
     tested = evaluate_on_test(found, comparing.test, columns, reading)
-    unit = found.file.operator.output_unit
+    unit = found.file.response.output_unit
     raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
     skipped = f", first {tested.skip} rows left out" if tested.skip else ""
     print_rows(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,14 @@ from bench.identification.by_name import FitProblem, Initial, set_up_problem
 from bench.identification.folds import Flags, Fold, block_folds, unit_folds
 from bench.identification.least_squares import Fit
 from bench.identification.orientation import Orientation
+from bench.identification.resolution import resolve
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
 _LEAST_MOVE = 0.005
 # Moves from this part of the range on make cycles.
 _LEAST_CYCLE = 0.02
+# Rank of the regressor by coefficients, from which the data determine a model.
+_DETERMINED = 0.9
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,8 @@ class Evaluation:
         CPU time, s.
     failure : str
         Why it could not be evaluated.
+    determined : bool
+        Whether the rows determine all coefficients; known only where there is one kind of cycle.
     """
 
     candidate: Candidate
@@ -151,6 +156,7 @@ class Evaluation:
     free: float = float("nan")
     seconds: float = 0.0
     failure: str = ""
+    determined: bool = True
 
     @property
     def rms(self) -> float:
@@ -223,6 +229,17 @@ def _evaluate(
     )
 
 
+def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Evaluation]:
+    """Return an evaluation with whether the rows tested determine its coefficients: nine tenths of them or more.
+
+    Signs and penalties, which choose among what fits alike, are left out of account.
+    """
+    trial = _Trial(measured, evaluated.candidate)
+    found = resolve(trial.problem.regressor, measured.tested.astype(np.float64), trial.problem.skip)
+    count = trial.problem.regressor.shape[1]
+    return [replace(evaluated, determined=found is None or found.rank >= _DETERMINED * count)]
+
+
 def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
     """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
     trial = _Trial(measured, candidate)
@@ -284,5 +301,6 @@ class _Trial:
             tested=float(errors[fold.tested].mean()),
             training=float(np.sqrt(errors[trained].mean())),
             start=float(np.sqrt(errors[first].mean())) if first.any() else 0.0,
-            free=effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive,
+            free=len(problem.template.shape_parameters().values)
+            + (effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive),
         )

@@ -92,10 +92,7 @@ def unit_folds(inputs: Floats, usable: Flags, *, folds: int = 5, gap: int = 0) -
         Rows next to those left out that are left out of the fit as well.
     """
     unit, amplitudes = excitation_units(inputs)
-    span = float(np.ptp(inputs))
-    present = np.flatnonzero(
-        (amplitudes < _MAJOR * span) & (np.bincount(unit[usable], minlength=amplitudes.size) > 0)
-    )
+    present = _minor_units(inputs, usable, unit, amplitudes)
     if present.size < 2:
         return ()
     number = np.full(amplitudes.size, -1)
@@ -104,6 +101,16 @@ def unit_folds(inputs: Floats, usable: Flags, *, folds: int = 5, gap: int = 0) -
     made = tuple(_fold((number[unit] == k) & usable, usable, gap) for k in range(count))
     # A fit needs rows: of short branches the gaps may take all.
     return made if all(fold.trained.sum() >= 0.3 * usable.sum() for fold in made) else ()
+
+
+def has_one_kind(inputs: Floats, usable: Flags) -> bool:
+    """Return whether the input has fewer than two kinds of cycles beside its major loop; see `unit_folds`."""
+    return _minor_units(inputs, usable, *excitation_units(inputs)).size < 2
+
+
+def _minor_units(inputs: Floats, usable: Flags, unit: NDArray[np.int64], amplitudes: Floats) -> NDArray[np.intp]:
+    counted = np.bincount(unit[usable], minlength=amplitudes.size) > 0
+    return np.flatnonzero((amplitudes < _MAJOR * float(np.ptp(inputs))) & counted)
 
 
 def excitation_units(inputs: Floats) -> tuple[NDArray[np.int64], Floats]:

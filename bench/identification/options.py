@@ -13,6 +13,9 @@ import numpy as np
 
 from bench.hysteresis import ModelSpec, find_model
 
+_OF_ALL = ("weights", "skip", "initial", "orientation")
+"""Keywords of a fit in time that are no options of one model."""
+
 
 @dataclass(frozen=True)
 class OptionHelp:
@@ -53,8 +56,12 @@ class ModelOption:
 
 
 def model_options(spec: ModelSpec) -> tuple[ModelOption, ...]:
-    """Return the options of a model, as its template takes them; the units, which the columns give, are left out."""
-    return tuple(option for option in _all_options(spec.template) if not option.name.endswith("_unit"))
+    """Return the options of a model, as its template takes them, or its fit if it is one with time.
+
+    What the columns give, and what every model takes, is left out.
+    """
+    given = _all_options(spec.template) if spec.template is not None else _all_options(spec.fit_in_time, after=3)
+    return tuple(option for option in given if not option.name.endswith("_unit") and option.name not in _OF_ALL)
 
 
 def check_options(model_name: str, options: Mapping[str, Any]) -> None:
@@ -80,12 +87,16 @@ def _unknown(name: str, known: tuple[ModelOption, ...]) -> str:
     return f"there is no {name}{question} there are: {listed or 'none'}"
 
 
-def _all_options(template: Callable[..., Any] | None) -> tuple[ModelOption, ...]:
-    if template is None:
+def _all_options(function: Callable[..., Any] | None, after: int = 1) -> tuple[ModelOption, ...]:
+    if function is None:
         return ()
-    parameters = list(inspect.signature(template).parameters.values())[1:]
+    parameters = [
+        each
+        for each in list(inspect.signature(function).parameters.values())[after:]
+        if each.kind is not inspect.Parameter.VAR_KEYWORD
+    ]
     try:
-        hints = get_type_hints(template, include_extras=True)
+        hints = get_type_hints(function, include_extras=True)
     # Annotations of another package may name what is imported for a type checker only.
     except NameError:
         hints = {}

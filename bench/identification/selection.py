@@ -20,15 +20,23 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
 from bench.hysteresis import ModelSpec, Operator, find_model
 from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
 from bench.identification.by_name import Initial
-from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate, residuals_of
-from bench.identification.folds import correlated_rows
+from bench.identification.evaluation import (
+    Candidate,
+    Evaluation,
+    Measurements,
+    evaluate,
+    judge_determined,
+    residuals_of,
+)
+from bench.identification.folds import correlated_rows, has_one_kind
 from bench.identification.orientation import Orientation, has_orientation
 
 Task: TypeAlias = Callable[[], list[Evaluation]]
@@ -56,6 +64,14 @@ _EQUAL = 1.02
 _WORSE = 1.05
 # Without units left out nothing bounds a density of either sign on other inputs: it has to be so much better.
 _UNBOUNDED = 1.2
+# Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
+_UNDETERMINED = 2.0
+# Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
+_DRIFTS, _FEWEST_OF_TREND = 0.15, 100
+# Turns of the input that say nothing of its minor loops, and moves that are none.
+_FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
+# Operators to which a linear part and a drift are added.
+_IN_TIME = 2
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
 _WARNED = 3.0
 
@@ -78,6 +94,21 @@ class Given:
     smoothing: float | None = None
 
 
+class Trend(NamedTuple):
+    """A straight line through errors over rows.
+
+    Attributes
+    ----------
+    change : float
+        From the first to the last row, output units.
+    share : float
+        Part of the variance of the errors, 0 to 1.
+    """
+
+    change: float
+    share: float
+
+
 @dataclass(frozen=True)
 class Selection:
     """What was tried, and what was chosen.
@@ -96,6 +127,12 @@ class Selection:
         Rows that were fitted and tested.
     span : float
         Range of the outputs, output units.
+    has_one_kind : bool
+        Whether the input has one kind of cycle only.
+    reversals : int or None
+        How often the input turns back, by 2 % of its range or more.
+    trend : Trend or None
+        That of the errors of the chosen model, if it is one without time.
     """
 
     evaluations: tuple[Evaluation, ...]
@@ -104,15 +141,36 @@ class Selection:
     gap: int
     rows: int
     span: float
+    has_one_kind: bool = False
+    reversals: int | None = None
+    trend: Trend | None = None
 
     def warnings(self) -> list[str]:
         """Return what the held-out errors say against the chosen model, in sentences."""
         found = []
         chosen = self.chosen
-        if not chosen.units:
+        if self.reversals is not None and self.reversals < _FEW_REVERSALS:
             found.append(
-                "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown: "
-                "record smaller cycles too, as `bench design` proposes"
+                f"the input reverses only {_times(self.reversals)}, which tells little of hysteresis: "
+                "record more cycles, of several amplitudes, as `bench design` proposes"
+            )
+        if self.trend is not None and self.trend.share > _DRIFTS:
+            part = 100.0 * abs(self.trend.change) / self.span
+            found.append(
+                f"the errors drift by {part:.1f} % of the range from the first to the last row "
+                f"({self.trend.share:.0%} of their variance): give --time COLUMN, so that models with drift and "
+                "creep take part"
+            )
+        if not chosen.units and self.has_one_kind:
+            found.append(
+                "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown; "
+                "models that the record determines were preferred: record smaller cycles too, as `bench design` "
+                "proposes"
+            )
+        elif not chosen.units:
+            found.append(
+                "the record is too short to leave whole cycles out, so that the error on other inputs is unknown: "
+                "record more cycles, as `bench design` proposes"
             )
         elif chosen.units_rms > _WARNED * chosen.rms:
             found.append(
@@ -122,8 +180,22 @@ class Selection:
         return found
 
 
+class InTime(Protocol):
+    """Evaluates operators with what may follow them in time; see `bench.timed.held_out`."""
+
+    def is_small(self, coefficients: int) -> bool:
+        """Return whether an operator of so many coefficients can be evaluated in seconds."""
+
+    def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
+        """Return the errors of a model with time with a candidate's operator; none if time tells nothing."""
+
+
 def select(
-    measured: Measurements, models: Sequence[str], given: Given | None = None, carry: Carry | None = None
+    measured: Measurements,
+    models: Sequence[str],
+    given: Given | None = None,
+    carry: Carry | None = None,
+    in_time: InTime | None = None,
 ) -> Selection:
     """Return the model that predicts best what was left out of its fit, and what else was tried.
 
@@ -137,13 +209,15 @@ def select(
         Settings that are not to be chosen.
     carry : callable, optional
         Carries tasks out, such as in worker processes; one after another in this process if not given.
+    in_time : InTime, optional
+        Adds models with time, whose operators are the best of those without.
 
     Raises
     ------
     ValueError
         If no model can be fitted: names each and why.
     """
-    return _Search(measured, models, given or Given(), carry or _one_after_another).run()
+    return _Search(measured, models, given or Given(), carry or _one_after_another, in_time).run()
 
 
 def _one_after_another(tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
@@ -169,12 +243,17 @@ class _Kind:
 
 
 class _Search:
-    def __init__(self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry) -> None:
-        self.measured, self.given, self.carry = measured, given, carry
+    def __init__(
+        self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry, in_time: InTime | None
+    ) -> None:
+        self.measured, self.given, self.carry, self.in_time = measured, given, carry, in_time
         self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
         self._has_plane: dict[_Kind, bool] = {}
+        self._has_one_kind = has_one_kind(measured.inputs, measured.tested)
+        turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
+        self._reversals = max(turns.size - 2, 0)
         self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
 
     def run(self) -> Selection:
@@ -191,7 +270,8 @@ class _Search:
         self.smooth()
         self.remember()
         finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
-        return self.choose(self.with_units(finalists))
+        judged = self.with_units(finalists)
+        return self.choose(judged + self.with_time(judged))
 
     def screen(self) -> dict[_Kind, Evaluation]:
         """Return each kind at its coarsest, with its best orientation and memory."""
@@ -296,10 +376,17 @@ class _Search:
             self.done[kind] += found
 
     def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
-        """Return the finalists, those near the best with whole units of the excitation left out too."""
+        """Return the finalists, those near the best with whole units of the excitation left out too.
+
+        Where there is one kind of cycle, it is found instead whether the rows determine their coefficients.
+        """
+        least = min(each.rms for each in finalists)
+        if self._has_one_kind:
+            near = [each for each in finalists if each.rms <= _UNDETERMINED * least]
+            checks = [(each.candidate.model, partial(judge_determined, self.measured, each)) for each in near]
+            return [one for (one,) in self.carry(checks)] + [each for each in finalists if each not in near]
         if not self.measured.units():
             return finalists
-        least = min(each.rms for each in finalists)
         near = [each for each in finalists if each.rms <= _NEAR * least]
         tasks = [
             (each.candidate.model, partial(evaluate, self.measured, [each.candidate], with_units=True))
@@ -311,18 +398,99 @@ class _Search:
         ]
         return found + [each for each in finalists if each not in near]
 
+    def with_time(self, judged: list[Evaluation]) -> list[Evaluation]:
+        """Return models with time with the best operators, each of another model; none if times are not known."""
+        if self.in_time is None:
+            return []
+        best: dict[str, Evaluation] = {}
+        # The one that would be chosen without time, then the best of each model.
+        for each in (self._decide(judged)[1], *sorted(judged, key=lambda one: one.rms)):
+            if self._in_time_too(each.candidate):
+                best.setdefault(each.candidate.model, each)
+        gap = self.measured.gap
+        tasks: list[tuple[str, Task]] = [
+            ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap))
+            for each in list(best.values())[:_IN_TIME]
+        ]
+        found = [one for each in self.carry(tasks) for one in each]
+        determined = {name: each.determined for name, each in best.items()}
+        self.given_up += [each for each in found if each.failure]
+        # What is left out of the others decides.
+        units = bool(self.measured.units())
+        return [
+            replace(
+                each,
+                determined=determined[each.candidate.options["static"]],
+                units=each.units if units else (),
+            )
+            for each in found
+            if not each.failure
+        ]
+
+    def _in_time_too(self, candidate: Candidate) -> bool:
+        """Return whether a candidate can be the operator of a model with time: a free plane would need penalties."""
+        assert self.in_time is not None
+        template = find_model(candidate.model).template
+        assert template is not None
+        operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
+        bounded = find_model(candidate.model).constrained or not operator.densities()
+        return bounded and self.in_time.is_small(operator.coefficients.size)
+
     def choose(self, finalists: list[Evaluation]) -> Selection:
         """Return the table with what is chosen."""
-        judged = [each for each in finalists if each.units] or self._bounded(finalists)
-        best = min(judged, key=lambda each: _score(each).mean())
-        within = [each for each in judged if is_within_one_standard_error(each, best)]
-        chosen = min(within, key=lambda each: (each.free, _score(each).mean()))
+        best, chosen = self._decide(finalists)
         others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
         table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
         measured = self.measured
         return Selection(
-            tuple(table), best, chosen, measured.gap, int(measured.tested.sum()), float(np.ptp(measured.outputs))
+            tuple(table),
+            best,
+            chosen,
+            measured.gap,
+            int(measured.tested.sum()),
+            float(np.ptp(measured.outputs)),
+            self._has_one_kind,
+            self._reversals,
+            self._trend(chosen) if "static" not in chosen.candidate.options else None,
         )
+
+    def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
+        """Return the one of the least error, and the simplest near it, of those that may be chosen."""
+        judged = [each for each in finalists if each.units] or self._without_units(finalists)
+        best = min(judged, key=lambda each: _score(each).mean())
+        within = [each for each in judged if is_within_one_standard_error(each, best)]
+        return best, min(within, key=lambda each: (each.free, _score(each).mean()))
+
+    def _trend(self, chosen: Evaluation) -> Trend | None:
+        """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
+        rows = np.flatnonzero(self.measured.tested)
+        errors = residuals_of(self.measured, chosen.candidate)[rows]
+        if rows.size < _FEWEST_OF_TREND or not np.ptp(errors) > 0.0:
+            return None
+        place = (rows - rows.mean()) / max(int(np.ptp(rows)), 1)
+        slope = float(place @ errors / (place @ place))
+        return Trend(slope, float(slope**2 * (place @ place) / np.sum((errors - errors.mean()) ** 2)))
+
+    def _without_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists that may be chosen where no cycles could be left out.
+
+        Of one kind of cycle, these are what the record determines and signs bound, else what it determines, unless
+        they err many times more.
+        """
+        least = min(each.rms for each in finalists)
+        determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
+        if not self._has_one_kind or not determined:
+            return self._bounded(finalists)
+        return [each for each in determined if self._is_bounded(each)] or determined
+
+    def _is_bounded(self, each: Evaluation) -> bool:
+        """Return whether signs bound the answer to other inputs, or it has no memory."""
+        # A model without signs has no orientation.
+        if each.candidate.orientation != "auto":
+            return True
+        operator = find_model(each.candidate.options.get("static", each.candidate.model)).model
+        # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
+        return bool(operator.memoryless and (self._reversals >= _FEW_REVERSALS or each.free <= 1.0))
 
     def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists without those of a plane and free signs, unless these are clearly better."""
@@ -393,12 +561,19 @@ class _Search:
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
 
 
+def _times(number: int) -> str:
+    return "once" if number == 1 else f"{number} times"
+
+
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
     """Return whether an error is within one standard error of the best, or 2 %, and at most 5 % above it.
 
     The standard error is that of the differences fold by fold: what is hard to predict is so for both.
     """
     first, second = _score(simple), _score(best)
+    if first.size != second.size:
+        # Rows between those of the others make other folds of units; blocks are the same.
+        first, second = np.array(simple.blocks), np.array(best.blocks)
     difference = first - second
     allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
     allowed = min(max(allowed, (_EQUAL**2 - 1.0) * second.mean()), (_WORSE**2 - 1.0) * second.mean())

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Operator, find_model, identifiable_models
+from bench.hysteresis import Operator, find_model, identifiable_models, timed_models
 from bench.identification import Comparison, compare
 from bench.identification.evaluation import Evaluation, Measurements
 from bench.identification.selection import Given, Selection, Task, select
@@ -20,6 +20,8 @@ from bench.results.data import FEWEST_ROWS, check_excitation
 from bench.results.joined_files import fitted_rows, is_rows, overwritten_from, parse_rows, read_files
 from bench.results.models import IdentifiedFile, errors_json
 from bench.results.reading.options import ReadingOptions
+from bench.results.times import bind_times, read_times
+from bench.timed.held_out import HeldOutInTime
 from bench.workers import Workers
 
 MOST_ROWS = 4000
@@ -63,6 +65,11 @@ class SelectedModel:
     def model(self) -> str:
         """Name of the chosen model."""
         return self.selection.chosen.candidate.model
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the chosen model is one with time."""
+        return self.model in timed_models()
 
     def settings(self) -> dict[str, Any]:
         """Return the chosen settings as `identify_file` takes them."""
@@ -152,6 +159,7 @@ def select_model(
     console: Console,
     skip: int = 0,
     train: slice | None = None,
+    time_column: str | None = None,
     reading: ReadingOptions | None = None,
 ) -> SelectedModel:
     """Compare models on measurements by what is left out of their fits.
@@ -172,6 +180,8 @@ def select_model(
         First rows that are neither fitted nor tested.
     train : slice or None
         Rows that are fitted and tested; all if None.
+    time_column : str or None
+        Column of times, with which models with time take part; of one file.
     reading : ReadingOptions, optional
         What is known of the layout of the files.
 
@@ -182,7 +192,10 @@ def select_model(
     ConfigurationError
         If no model can be fitted.
     """
-    files = read_files(paths, (input_column, output_column), at_least=FEWEST_ROWS, options=reading)
+    if time_column is not None and len(paths) > 1:
+        raise ConfigurationError(f"--time: expected one file, as times are those of one record; got {len(paths)}")
+    names = (input_column, output_column, *([time_column] if time_column else ()))
+    files = read_files(paths, names, at_least=FEWEST_ROWS, options=reading)
     inputs, outputs = (files.columns.values[name] for name in (input_column, output_column))
     check_excitation(files.columns, input_column)
     fitted, _ = fitted_rows(files, inputs, train)
@@ -195,9 +208,13 @@ def select_model(
     whole = Measurements.of(inputs, outputs, fitted)
     measured = whole.thinned(MOST_ROWS)
     few = measured.inputs.size <= _FEW_ROWS
+    in_time = None
+    if time_column is not None:
+        # A linear part needs the rows between.
+        in_time = HeldOutInTime(whole, read_times(files.columns, time_column), measured.inputs.size)
     try:
         with Workers(1 if few else None, console, "models") as workers:
-            selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks))
+            selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks), in_time)
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None
     return SelectedModel(
@@ -277,17 +294,19 @@ def evaluate_on_test(
     ConfigurationError
         If there is no such row.
     """
-    model: Operator[Any] = found.file.operator
     if is_rows(test):
         rows = parse_rows("--test", test)
-        predicted = model.evaluate(found.inputs, found.identification.initial_state)[rows]
+        predicted = (found.outputs - found.identification.residuals)[rows]
         if not predicted.size:
             raise ConfigurationError(f"--test {test}: there are {found.inputs.size} rows")
         return TestedModel(f"rows {test}", _compared(found.outputs[rows], predicted), 0)
     path = Path(test)
-    values = read_files([path], columns, at_least=FEWEST_ROWS, options=reading).columns.values
-    inputs, outputs = (values[name] for name in columns)
-    skip = 0 if model.memoryless else overwritten_from(inputs)
+    time_column = found.file.provenance.get("time")
+    names = (*columns, *([time_column] if time_column else ()))
+    read = read_files([path], names, at_least=FEWEST_ROWS, options=reading).columns
+    inputs, outputs = (read.values[name] for name in columns)
+    model = bind_times(found.file, read_times(read, time_column) if time_column else None)
+    skip = 0 if isinstance(model, Operator) and model.memoryless else overwritten_from(inputs)
     if skip > inputs.size // 2:
         skip = 0
     state = {"model": found.identification.initial_state}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Operator, TimedModel, find_model, identifiable_models, timed_models
 from bench.hysteresis.timed import TimedSequence
 from bench.model_file import ModelFile
-from bench.results.data import Columns, Floats
+from bench.results.data import Columns, Floats, read_columns
 from bench.results.predictions import Quantity
+from bench.results.reading.options import ReadingOptions
 
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+# Heads that name a column of times.
+_NAMES = ("time", "t", "Time", "time_s", "t_s", "Time_s")
 
 
 def check_model_name(model: str, time_column: str | None) -> None:
@@ -69,6 +73,22 @@ def read_times(columns: Columns, name: str) -> Floats:
 def time_quantity(times: Floats | None) -> Quantity | None:
     """Return times, shape (N,) in s, as a column of results; None without them."""
     return None if times is None else Quantity("time", "s", times)
+
+
+def find_times(path: Path, reading: ReadingOptions | None) -> str | None:
+    """Return the column of a file that by its name holds times, and increases; None if there is none.
+
+    A run has its own.
+    """
+    if path.is_dir() or path.suffix == ".sqlite":
+        return None
+    for name in _NAMES:
+        try:
+            read_times(read_columns(path, [name], options=reading), name)
+        except (DataError, ConfigurationError):
+            continue
+        return name
+    return None
 
 
 def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSequence:

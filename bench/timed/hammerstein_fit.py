@@ -9,7 +9,7 @@ leaves free, in turns with that fit, from several starts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, Literal, NamedTuple
@@ -58,8 +58,28 @@ class _Parameter:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """Everything but the elements: the measured sequence, and the operator's columns."""
+class Search:
+    """Everything but the elements: the measured sequence, and the operator's columns.
+
+    Attributes
+    ----------
+    times : ndarray, shape (N,)
+        s.
+    static : FitProblem
+        The problem of the operator alone.
+    columns : ndarray, shape (N, K)
+        Its regressor.
+    roots : ndarray, shape (N,)
+        Square roots of the weights, 0 for rows left out.
+    signs : tuple
+        Signs of the operator's coefficients that are tried.
+    elapsed : ndarray, shape (N,)
+        Since the first row, s.
+    principal : ndarray, shape (N, r)
+        Principal columns of the regressor.
+    step : float
+        Median step of time, s.
+    """
 
     times: Floats
     static: FitProblem
@@ -80,6 +100,7 @@ class _Search:
 
     @property
     def span(self) -> float:
+        """Length of the record, s."""
         return float(self.elapsed[-1])
 
     @property
@@ -135,28 +156,33 @@ class _Search:
         shape = self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time)
         return shape[:, None]
 
+    def responses(self, elements: Sequence[str], values: Floats) -> tuple[Floats, Floats]:
+        """Return the filtered columns of the operator, shape (N, K), and those of the drift for given parameters."""
+        part, time = self.linear(self.parameters(elements), values)
+        return part.respond(self.times, self.columns)[0], self.drifts(elements, time)
+
     def fit(self, elements: Sequence[str], values: Floats) -> Fit:
         """Return the coefficients of operator and drift for given parameters, of the sign that fits better."""
-        part, time = self.linear(self.parameters(elements), values)
-        drifts = self.drifts(elements, time)
-        columns, problem = part.respond(self.times, self.columns)[0], self.static
+        columns, drifts = self.responses(elements, values)
+        fits = [self.fit_columns(columns, drifts, self.static.weights, sign) for sign in self.signs]
+        return min(fits, key=lambda each: self.cost(elements, values, each)) if len(fits) > 1 else fits[0]
+
+    def fit_columns(self, columns: Floats, drifts: Floats, weights: Floats, sign: Literal[1, -1]) -> Fit:
+        """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
+        problem = self.static
         if not problem.spec.constrained:
             regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
-            return fit_minimum_norm(regressor, problem.outputs, weights=problem.weights, skip=problem.skip)
-        constrained = np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)])
-        fits = []
-        for sign in self.signs:
-            found = fit(
-                Regressor.of_columns(np.column_stack([sign * columns, drifts])),
-                problem.outputs,
-                nonnegative=constrained,
-                weights=problem.weights,
-                skip=problem.skip,
-            )
-            turned = found.coefficients.copy()
-            turned[: columns.shape[1]] *= sign
-            fits.append(replace(found, coefficients=turned))
-        return min(fits, key=lambda each: self.cost(elements, values, each))
+            return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)
+        found = fit(
+            Regressor.of_columns(np.column_stack([sign * columns, drifts])),
+            problem.outputs,
+            nonnegative=np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)]),
+            weights=weights,
+            skip=problem.skip,
+        )
+        turned = found.coefficients.copy()
+        turned[: columns.shape[1]] *= sign
+        return replace(found, coefficients=turned)
 
     def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
         """Return the weighted sum of squares of a fit."""
@@ -175,7 +201,7 @@ class _Search:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class Found:
     """Elements with their parameters and the fit."""
 
     elements: tuple[str, ...]
@@ -198,7 +224,7 @@ class _Point(NamedTuple):
 class _Projection:
     """Residuals and Jacobian of variable projection over given columns."""
 
-    def __init__(self, search: _Search, elements: Sequence[str], basis: Floats) -> None:
+    def __init__(self, search: Search, elements: Sequence[str], basis: Floats) -> None:
         self._search, self._elements, self._basis = search, elements, basis
         self._parameters = search.parameters(elements)
         self._at: _Point | None = None
@@ -318,23 +344,12 @@ def identify_hammerstein(
     """
     moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
     chosen = None if dynamics is None else _elements(dynamics)
-    if static == "preisach":
-        options = {"reversible": "linear", **options}
-    problem = set_up_problem(
-        static, sequence, measured, weights, skip, 0.0, initial, options, orientation=orientation
+    problem, search = set_up_search(
+        moments, sequence, measured, weights, skip, initial, orientation, static=static, options=options
     )
-    if math.prod(problem.regressor.shape) > _LARGEST:
-        rows, count = problem.regressor.shape
-        size = 8e-9 * rows * count
-        raise ValueError(
-            f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer levels, or every nth row"
-        )
-    # The output of a lag may fall while the operator rises: the sign is found with the linear part.
-    oriented = has_orientation(problem.spec, problem.template)
-    search = _set_up(moments, problem, (1, -1) if oriented and orientation == "auto" else (problem.orientation,))
     warnings = list(problem.warnings())
     with one_thread():
-        found = _choose(search) if chosen is None else _best(search, chosen)
+        found = choose_elements(search) if chosen is None else _best(search, chosen)
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
         # A delay or creep of 0 is an answer; a time at its bound is not.
@@ -363,7 +378,7 @@ def identify_hammerstein(
         skip=problem.skip,
         initial_state=state,
         warnings=tuple(warnings),
-        orientation=NAMES[sign] if oriented else None,
+        orientation=NAMES[sign] if has_orientation(problem.spec, problem.template) else None,
     )
 
 
@@ -381,13 +396,39 @@ def _elements(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _set_up(times: Floats, problem: FitProblem, signs: tuple[Literal[1, -1], ...]) -> _Search:
+def set_up_search(
+    times: Floats,
+    inputs: Floats,
+    outputs: Floats,
+    weights: ArrayLike | None,
+    skip: int,
+    initial: Initial | None,
+    orientation: Orientation,
+    *,
+    static: str,
+    options: Mapping[str, Any],
+) -> tuple[FitProblem, Search]:
+    """Return the problem of the operator alone, and the search for what follows it; see `identify_hammerstein`."""
+    if static == "preisach":
+        options = {"reversible": "linear", **options}
+    problem = set_up_problem(
+        static, inputs, outputs, weights, skip, 0.0, initial, dict(options), orientation=orientation
+    )
+    if math.prod(problem.regressor.shape) > _LARGEST:
+        rows, count = problem.regressor.shape
+        size = 8e-9 * rows * count
+        raise ValueError(
+            f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer levels, or every nth row"
+        )
+    # The output of a lag may fall while the operator rises: the sign is found with the linear part.
+    oriented = has_orientation(problem.spec, problem.template)
+    signs: tuple[Literal[1, -1], ...] = (1, -1) if oriented and orientation == "auto" else (problem.orientation,)
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    return _Search(times, problem, problem.regressor.dense(), roots, signs)
+    return problem, Search(times, problem, problem.regressor.dense(), roots, signs)
 
 
-def _choose(search: _Search) -> _Found:
+def choose_elements(search: Search) -> Found:
     """Return the elements that are worth it, one after the other, with the rest."""
     found = _best(search, ())
     used = max(int(np.count_nonzero(search.roots)), 1)
@@ -413,12 +454,12 @@ def _choose(search: _Search) -> _Found:
     return min(_best(search, found.elements), found, key=lambda each: each.cost)
 
 
-def _best(search: _Search, elements: tuple[str, ...], before: _Found | None = None, rounds: int = _ROUNDS) -> _Found:
+def _best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
     """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
     parameters = search.parameters(elements)
     if not parameters:
         found = search.fit(elements, np.empty(0))
-        return _Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
+        return Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
     first = _best(search, ()) if before is None else before
     trials = [
         replace(
@@ -437,34 +478,34 @@ def _best(search: _Search, elements: tuple[str, ...], before: _Found | None = No
             values, deviations, found, cost = moved, wider, refit, lower
         if not gained > _GAIN * cost:
             break
-    return _Found(elements, values, found, cost, deviations)
+    return Found(elements, values, found, cost, deviations)
 
 
 def _ends(
-    search: _Search,
+    search: Search,
     elements: tuple[str, ...],
-    before: _Found,
+    before: Found,
     basis: Floats,
     starts: int = _STARTS,
     evaluations: int = _EVALUATIONS,
-) -> list[_Found]:
+) -> list[Found]:
     """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit."""
     parameters = search.parameters(elements)
     if not parameters:
         none = np.empty(0)
         cost = float(np.sum(_Projection(search, elements, basis).residuals(none) ** 2))
-        return [_Found(elements, none, before.fit, cost, none)]
+        return [Found(elements, none, before.fit, cost, none)]
     names = [p.name for p in search.parameters(before.elements)]
     known = dict(zip(names, before.values.tolist(), strict=True))
     found = []
     for start in _starts(search, elements, parameters, known, before.fit)[:starts]:
         values, deviations, cost = _search(search, elements, parameters, start, basis, evaluations)
-        found.append(_Found(elements, values, before.fit, cost, deviations))
+        found.append(Found(elements, values, before.fit, cost, deviations))
     return found
 
 
 def _starts(
-    search: _Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
+    search: Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
 ) -> list[Floats]:
     """Return the best few of a grid, judged with the fit of the smaller model and the principal columns."""
     grids = [(known[p.name],) if p.name in known else p.starts for p in parameters]
@@ -485,7 +526,7 @@ def _starts(
 
 
 def _search(
-    search: _Search,
+    search: Search,
     elements: Sequence[str],
     parameters: Sequence[_Parameter],
     start: Floats,

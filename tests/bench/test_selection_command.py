@@ -158,3 +158,59 @@ def test_a_ratcheting_output_is_warned_of(bench, record, tmp_path):
     assert code == 0
     assert "no return-point memory" in err
     assert "may not be used" in " ".join(err.split())
+
+
+def drifting(path: Path) -> None:
+    """Write the record of `measure` with times, and a drift of a tenth of the range."""
+    measure(path)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    times = 0.1 * np.arange(len(rows))
+    rows[:, 1] += 0.1 * np.ptp(rows[:, 1]) * times / times[-1]
+    content = np.column_stack([times, rows])
+    np.savetxt(path, content, header="time [s],voltage [V],travel [mm]", delimiter=",", comments="")
+
+
+def test_a_drift_is_warned_of_and_with_times_a_model_with_time_is_chosen(bench, tmp_path):
+    file, out, result = tmp_path / "drifting.csv", tmp_path / "model.json", tmp_path / "result.json"
+    drifting(file)
+    code, text, err = bench("identify", file, *COLUMNS, *SOME)
+    assert code == 0, err
+    assert "the errors drift by" in (text + err).replace("\n", " ")
+    assert "with --time time rate, creep and drift would take part" in text
+    code, text, err = bench(
+        "identify", file, *COLUMNS, *SOME, "--time", "time", "--test", "150:", "--out", out, "--json", result
+    )
+    assert code == 0, err
+    assert "would take part" not in text
+    content = json.loads(result.read_text())
+    assert content["model"] == load_model(out).name == "hammerstein"
+    assert content["test"]["raw"]["rms_percent"] < 1.0
+    predicted = tmp_path / "predicted.json"
+    code, _, err = bench(
+        "predict", out, file, *COLUMNS, "--time", "time", "--out", tmp_path / "p.csv", "--json", predicted
+    )
+    assert code == 0, err
+    assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
+    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--time", "time", "--test", file)
+    assert code == 0, err
+    assert "on drifting.csv" in text
+
+
+def test_each_row_of_the_table_is_one_line_under_a_head_with_its_unit(bench, record):
+    code, text, err = bench("identify", record, *COLUMNS, *SOME)
+    assert code == 0, err
+    lines = text.splitlines()
+    head = next(place for place, line in enumerate(lines) if "held out" in line)
+    assert lines[head].split() == ["training", "held", "out", "%", "of", "other", "CPU"]
+    assert lines[head + 1].split() == ["model", "free", "mm", "mm", "±", "range", "cycles,", "mm", "s"]
+    rows = lines[head + 2 : next(k for k, line in enumerate(lines) if line.startswith("* chosen"))]
+    assert sum(row.startswith("*") for row in rows) == 1
+    for row in rows:
+        assert len(row) <= 120
+        assert float(row.split()[-1]) >= 0.0
+
+
+def test_options_of_a_model_with_time_go_with_its_name(bench, record):
+    code, _, err = bench("identify", record, *COLUMNS, *SOME, "--dynamics", "lag")
+    assert code == 2
+    assert "--model hammerstein" in err

@@ -106,6 +106,30 @@ def test_one_kind_of_cycle_is_warned_of():
     assert any("4.0 times" in text for text in ratio.warnings())
 
 
+def test_of_one_kind_of_cycle_a_model_is_chosen_that_the_record_determines():
+    turns = np.array([0.0, *[1.0, -1.0] * 8])
+    inputs = np.interp(np.arange(17 * 30 - 29), np.arange(17) * 30, turns)
+    measured = Measurements.of(inputs, noisy(settled(duhem, inputs), 0.01))
+    found = select(measured, ("preisach", "generalized-prandtl-ishlinskii"), Given({"levels": 10}))
+    assert found.has_one_kind
+    assert found.chosen.candidate.model == "generalized-prandtl-ishlinskii"
+    planes = [each for each in found.evaluations if each.candidate.model == "preisach" and len(each.blocks) == 5]
+    assert min(each.rms for each in planes) < found.chosen.rms
+    assert not any(each.determined for each in planes if each.rms < 1.5 * found.chosen.rms)
+
+
+def test_few_reversals_and_a_trend_of_the_errors_are_warned_of():
+    rise = np.interp(np.arange(60), [0, 50, 59], [0.0, 1.0, 0.8])
+    found = select(Measurements.of(rise, noisy(rise)), ("polynomial",))
+    assert any("reverses only once" in text for text in found.warnings())
+    still = select(Measurements.of(INPUTS, noisy(INPUTS)), ("polynomial",))
+    assert not any("drift" in text or "reverses" in text for text in still.warnings())
+    drifting = noisy(INPUTS) + np.linspace(0.0, 0.1, INPUTS.size)
+    moved = select(Measurements.of(INPUTS, drifting), ("polynomial",))
+    assert any("drift by 4.4 %" in text and "--time" in text for text in moved.warnings())
+    assert moved.trend.change == pytest.approx(0.1, rel=0.15)
+
+
 def test_a_model_of_another_package_takes_part_and_one_that_fails_says_so(monkeypatch):
     def template(inputs, *, order: int = 2):
         if order == 3:
