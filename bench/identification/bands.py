@@ -26,6 +26,7 @@ from bench.identification.by_name import FitProblem
 from bench.identification.cell_layout import Flags, Indices
 from bench.identification.covariance import PredictionVariance, prediction_variance
 from bench.identification.excitation_class import LEAST_SWING, ExcitationClass
+from bench.identification.folds import near
 from bench.identification.least_squares import Fit
 
 LEVEL = 0.9
@@ -308,15 +309,13 @@ def _with_gap(left_out: Flags, lag: int, turns: Indices) -> Flags:
 
     A branch of which a part is left out is left out altogether: what was measured on the rest of it tells it.
     """
-    counted = np.concatenate([[0], np.cumsum(left_out)])
-    rows = np.arange(left_out.size)
-    near = counted[np.minimum(rows + lag + 1, rows.size)] > counted[np.maximum(rows - lag, 0)]
-    branch = np.searchsorted(turns, rows, side="right")
+    close = near(left_out, lag)
+    branch = np.searchsorted(turns, np.arange(left_out.size), side="right")
     touched = np.zeros(turns.size + 1, dtype=bool)
-    touched[branch[near]] = True
+    touched[branch[close]] = True
     whole = touched[branch]
     # Turns may be far apart: most samples must remain.
-    return whole if whole.mean() <= 0.5 else near
+    return whole if whole.mean() <= 0.5 else close
 
 
 def _extrapolated(problem: FitProblem, found: Fit, other: Fit, weights: Floats, scale: float) -> Flags:

@@ -153,11 +153,11 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
     DataError
         If the lines can be read in several ways: names the option that decides.
     """
-    found: list[tuple[tuple[bool, int, int, float], Layout]] = []
+    found: list[tuple[tuple[int, int, float], Layout]] = []
     for delimiter in [options.delimiter] if options.delimiter else list(_DELIMITERS):
         assert delimiter is not None
         rows = list(split_rows(lines, delimiter, first))
-        signs: list[tuple[tuple[bool, int, int, float], Layout]] = []
+        signs: list[tuple[tuple[int, int, float], Layout]] = []
         for decimal in [options.decimal] if options.decimal else [".", ","]:
             assert decimal is not None
             header = find_header(rows, decimal, delimiter)
@@ -171,10 +171,9 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             comments = sum(is_comment(line, comment_marks(delimiter)) for line in lines[: header.start - first])
             notes = _notes(lines[: header.start - first], comments, header, delimiter, decimal)
             layout = Layout(delimiter, decimal, header.start, header.heads, header.columns, notes, comments)
-            # Where one delimiter makes numbers of all, numbers that stay together with another are no heads.
-            signs.append(((numbers == len(filled), header.fit, numbers, numbers / len(filled)), layout))
+            signs.append(((header.fit, numbers, numbers / len(filled)), layout))
         # The decimal sign is the one with which more are numbers, whether or not a header fits.
-        found += sorted(signs, key=lambda entry: -entry[0][2])[:1]
+        found += sorted(signs, key=lambda entry: -entry[0][1])[:1]
     if not found:
         return None
     # Of equals the first: the point before the comma, the stronger delimiter before the weaker.
@@ -186,7 +185,7 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             if same == rank and other.columns != layout.columns and "," in (layout.delimiter, other.delimiter)
         ]
         cells = [row for row in split_rows(lines, layout.delimiter, first) if row.line > layout.start]
-        if rivals or (layout.delimiter == "," and rank[1] < 2 and _may_be_decimal(cells, layout)):
+        if rivals or (layout.delimiter == "," and rank[0] < 2 and _may_be_decimal(cells, layout)):
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
                 "--delimiter comma, or --decimal comma; where it is both, save the file with another delimiter"
@@ -218,6 +217,7 @@ def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",") -> Head
     if (
         begin == 0
         and len(rows) > 1
+        and not masks[0][0]
         and any(one is False and two for one, two in zip(masks[0], pattern, strict=False))
     ):
         # Such as `time, 1, 2`.
