@@ -24,6 +24,7 @@ from bench.cli.patience import show_patience
 from bench.cli.selection import Comparing, choose_model, is_comparison, offer_comparing, print_test
 from bench.cli.written import print_figures, write_fit, write_rows
 from bench.errors import ConfigurationError
+from bench.printing import print_plain
 from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
@@ -210,7 +211,7 @@ def identify_(
     tested = print_test(found, comparing, columns, reading)
     if out is not None:
         found.file.save(out)
-        console.print(f"model: {out}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"model: {out}")
     write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
     more = {"test": tested.to_json()} if tested else {}
     more |= {"selection": selected.to_json()} if selected else {}

@@ -13,6 +13,7 @@ from bench.cli.console import check_outputs, console, print_rows, warn
 from bench.cli.data_options import offer_options
 from bench.cli.model_options import ModelOptions
 from bench.errors import ConfigurationError
+from bench.printing import print_plain
 from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:
@@ -142,15 +143,10 @@ def choose_model(
     for warning in found.warnings:
         warn(warning)
     if time_column is None and len(files) == 1 and (name := find_times(files[0], reading)) is not None:
-        console.print(
-            f"column {name} holds times: with --time {name} rate, creep and drift would take part",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        print_plain(console, f"column {name} holds times: with --time {name} rate, creep and drift would take part")
     if comparing.table_out is not None:
         found.save(comparing.table_out)
-        console.print(f"table: {comparing.table_out}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"table: {comparing.table_out}")
     return found
 
 

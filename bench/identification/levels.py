@@ -6,8 +6,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from bench.hysteresis import _checks, uniform_levels
+from bench.hysteresis import uniform_levels
 from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
 
 Spacing: TypeAlias = Literal["uniform", "quantiles"]
 
@@ -15,15 +16,6 @@ Spacing: TypeAlias = Literal["uniform", "quantiles"]
 _UNIFORM_SHARE = 0.5
 # Least distance of two levels, as part of the mean distance.
 _LEAST = 0.1
-
-
-def reversals(inputs: Floats) -> Floats:
-    """Return the inputs at which a sequence, shape (N,), turns, with its first and its last one."""
-    moved = np.concatenate([[True], np.diff(inputs) != 0.0])
-    path = inputs[moved]
-    turns = np.sign(np.diff(path[:-1])) != np.sign(np.diff(path[1:]))
-    kept = np.concatenate([[True], turns, [True]]) if path.size > 2 else np.ones(path.size, dtype=bool)
-    return np.asarray(path[kept], dtype=np.float64)
 
 
 def quantile_levels(inputs: Floats, plane: tuple[float, float], count: int) -> Floats:
@@ -43,7 +35,7 @@ def quantile_levels(inputs: Floats, plane: tuple[float, float], count: int) -> F
     """
     uniform = uniform_levels(*plane, count)
     low, high = plane
-    turns = reversals(_checks.samples("inputs", inputs))
+    turns = inputs[turning_points(inputs)]
     inside = np.sort(turns[(turns > low) & (turns < high)])
     if not inside.size or count < 2:
         return uniform

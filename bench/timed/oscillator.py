@@ -62,6 +62,19 @@ State: TypeAlias = OscillatorState | Start
 """After a sample, or before the first one: at rest, or the steady state of a sequence that repeats itself."""
 
 
+def check_fields(model: Any, *numbers: str) -> None:  # noqa: ANN401 - either oscillator
+    """Make numbers of the fields of an oscillator; raise ValueError if one is wrong."""
+    for name in numbers:
+        object.__setattr__(model, name, _checks.number(name, getattr(model, name)))
+    if model.mass == 0.0:
+        raise ValueError("mass: expected a number other than 0")
+    low, high = (_checks.number("input_range", value) for value in model.input_range)
+    object.__setattr__(model, "input_range", (low, high))
+    words = get_args(Interpolation)
+    if model.interpolation not in words:
+        raise ValueError(f"interpolation: expected one of {', '.join(words)}, got {model.interpolation!r}")
+
+
 @dataclass(frozen=True, eq=False)
 class BoucWenOscillator(TimedModel[State]):
     """A mass on a spring, a damper and a Bouc-Wen force; equations at the head of this module.
@@ -105,15 +118,7 @@ class BoucWenOscillator(TimedModel[State]):
     output_unit: str = ""
 
     def __post_init__(self) -> None:
-        for name in (*_NAMES, "offset"):
-            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        if self.mass == 0.0:
-            raise ValueError("mass: expected a number other than 0")
-        low, high = (_checks.number("input_range", value) for value in self.input_range)
-        object.__setattr__(self, "input_range", (low, high))
-        words = get_args(Interpolation)
-        if self.interpolation not in words:
-            raise ValueError(f"interpolation: expected one of {', '.join(words)}, got {self.interpolation!r}")
+        check_fields(self, *_NAMES, "offset")
 
     @property
     def vector(self) -> Floats:

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import Identification
-from bench.identification.least_squares import Certificate
+from bench.identification.least_squares import Certificate, counted_weights
 from bench.identification.measures import measure_errors
 from bench.timed.oscillator import BoucWenOscillator, Drive, Interpolation, Start, respond, substeps_for
 
@@ -118,24 +117,13 @@ def identify_bouc_wen_oscillator(
     ValueError
         If an option is wrong or the data are unfit.
     """
-    clock, u, y = check_sequence(times, inputs=inputs, outputs=outputs)
-    if initial not in (None, "rest", "periodic"):
-        raise ValueError(f"initial: expected 'rest', 'periodic' or None, got {initial!r}")
+    clock, u, y, w, starts = check_record(times, inputs, outputs, weights, skip, initial)
     if orientation != "auto":
         raise ValueError(f"orientation: an oscillator finds it from the data; expected 'auto', got {orientation!r}")
-    if u.size - skip < 50:
-        raise ValueError(f"inputs: expected at least 50 samples, got {u.size - skip}")
-    if np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
-        raise ValueError("inputs and outputs: expected sequences that vary")
-    w = np.ones(u.size) if weights is None else _checks.samples("weights", weights)
-    if w.size != u.size or (w < 0.0).any() or not w[skip:].any():
-        raise ValueError(f"weights: expected {u.size} values >= 0, some above 0")
     roots = np.sqrt(w)
-    roots[:skip] = 0.0
     linear = linear_start(clock, u, y)
     substeps = substeps_for(np.array([*linear, 0.0, 0.0, 0.0]), clock)
     ends: dict[Start, tuple[_Simulation, Any]] = {}
-    starts: tuple[Start, ...] = ("rest", "periodic") if initial is None else (initial,)  # type: ignore[assignment]
     for start in starts:
         try:
             drives = [
@@ -222,6 +210,29 @@ def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats
     tries = [coarse.search(grid[place], 12) for place in order.tolist()]
     best = min(tries, key=lambda each: float(each.cost))
     return fine, fine.search(np.asarray(best.x), 100)
+
+
+def check_record(
+    times: ArrayLike,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    weights: ArrayLike | None,
+    skip: int,
+    initial: str | None,
+) -> tuple[Floats, Floats, Floats, Floats, tuple[Start, ...]]:
+    """Return times, inputs, outputs and weights (0 for what is skipped), shape (N,), and the starts to be tried.
+
+    Raises ValueError if they are no record that an oscillator can be identified from, or `initial` is unknown.
+    """
+    clock, u, y = check_sequence(times, inputs=inputs, outputs=outputs)
+    if initial not in (None, "rest", "periodic"):
+        raise ValueError(f"initial: expected 'rest', 'periodic' or None, got {initial!r}")
+    if u.size - skip < 50:
+        raise ValueError(f"inputs: expected at least 50 samples, got {u.size - skip}")
+    if np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
+        raise ValueError("inputs and outputs: expected sequences that vary")
+    starts: tuple[Start, ...] = ("rest", "periodic") if initial is None else (initial,)  # type: ignore[assignment]
+    return clock, u, y, counted_weights(u.size, weights, skip), starts
 
 
 def linear_start(times: Floats, inputs: Floats, outputs: Floats) -> Floats:

@@ -20,7 +20,7 @@ from bench.hysteresis._checks import Floats
 from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Parts
 from bench.hysteresis.timed import TimedModel, check_sequence
-from bench.timed.oscillator import Drive, Interpolation, Start, substeps_for
+from bench.timed.oscillator import Drive, Interpolation, Start, check_fields, substeps_for
 
 
 class PreisachOscillatorState(NamedTuple):
@@ -89,17 +89,9 @@ class PreisachOscillator(TimedModel[State]):
     output_unit: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("mass", "damping", "offset"):
-            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        if self.mass == 0.0:
-            raise ValueError("mass: expected a number other than 0")
+        check_fields(self, "mass", "damping", "offset")
         if self.force.kind != Preisach.kind:
             raise ValueError("force: expected a Preisach operator")
-        low, high = (_checks.number("input_range", value) for value in self.input_range)
-        object.__setattr__(self, "input_range", (low, high))
-        words = get_args(Interpolation)
-        if self.interpolation not in words:
-            raise ValueError(f"interpolation: expected one of {', '.join(words)}, got {self.interpolation!r}")
 
     @property
     def stiffness(self) -> float:

@@ -17,16 +17,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Preisach, QuadraticTerm, Regressor, _checks, uniform_levels
+from bench.hysteresis import Preisach, QuadraticTerm, Regressor, uniform_levels
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import Identification
 from bench.identification.least_squares import Fit, fit
 from bench.identification.measures import measure_errors
 from bench.identification.orientation import NAMES, Orientation
 from bench.timed.linear_parts import LinearPart
 from bench.timed.oscillator import Interpolation, Start
-from bench.timed.oscillator_fit import linear_start
+from bench.timed.oscillator_fit import check_record, linear_start
 from bench.timed.preisach_oscillator import PreisachOscillator, demagnetised
 
 Sign = Literal[1, -1]
@@ -166,25 +165,14 @@ def identify_preisach_oscillator(
     ValueError
         If an option is wrong or the data are unfit.
     """
-    clock, u, y = check_sequence(times, inputs=inputs, outputs=outputs)
-    if initial not in (None, "rest", "periodic"):
-        raise ValueError(f"initial: expected 'rest', 'periodic' or None, got {initial!r}")
+    clock, u, y, w, starts = check_record(times, inputs, outputs, weights, skip, initial)
     if orientation not in ("auto", "rising", "falling"):
         raise ValueError(f"orientation: expected 'auto', 'rising' or 'falling', got {orientation!r}")
     if not 2 <= levels <= _MOST_LEVELS:
         raise ValueError(f"levels: expected 2 to {_MOST_LEVELS}, got {levels}")
-    if u.size - skip < 50:
-        raise ValueError(f"inputs: expected at least 50 samples, got {u.size - skip}")
-    if np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
-        raise ValueError("inputs and outputs: expected sequences that vary")
-    w = np.ones(u.size) if weights is None else _checks.samples("weights", weights).copy()
-    if w.size != u.size or (w < 0.0).any() or not w[skip:].any():
-        raise ValueError(f"weights: expected {u.size} values >= 0, some above 0")
-    w[:skip] = 0.0
     linear = linear_start(clock, u, y)
     signs: tuple[Sign, ...] = {"auto": (1, -1), "rising": (1,), "falling": (-1,)}[orientation]  # type: ignore[assignment]
     begun: list[tuple[_Search, _Trial, Sign]] = []
-    starts: tuple[Start, ...] = ("rest", "periodic") if initial is None else (initial,)  # type: ignore[assignment]
     for start in starts:
         search = _Search(clock, u, y, w, skip, start, linear)
         offset = float(y[0]) if start == "rest" else float(np.average(y, weights=w))

@@ -7,6 +7,8 @@ import threading
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from bench.printing import print_plain
+
 
 class TasksDisplay:
     """Progress of tasks; nothing is drawn if the console is no terminal.
@@ -82,7 +84,7 @@ class TasksDisplay:
 
     def say(self, text: str) -> None:
         """Print above the lines."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        print_plain(self._console, text)
 
     def _draw_whole(self) -> None:
         self._progress.update(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from bench.hysteresis import identifiable_models, timed_models
-from bench.identification.levels import quantile_levels, reversals
+from bench.identification.branches import turning_points
+from bench.identification.levels import quantile_levels
 from bench.identification.options import check_options, model_options
 from bench.model_file import load_model
 
@@ -168,7 +169,7 @@ def test_an_option_of_the_wrong_kind_is_refused():
 
 def test_quantile_levels_follow_the_reversals():
     inputs = np.concatenate([[0.0, 10.0], *[[2.0 + 0.01 * k, 3.0] for k in range(40)], [10.0]])
-    assert reversals(inputs).tolist()[:3] == [0.0, 10.0, 2.0]
+    assert inputs[turning_points(inputs)].tolist()[:3] == [0.0, 10.0, 2.0]
     levels = quantile_levels(inputs, (0.0, 10.0), 20)
     assert levels.size == 21
     assert (levels[0], levels[-1]) == (0.0, 10.0)
