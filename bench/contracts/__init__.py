@@ -10,7 +10,8 @@ between the two values of `--set-points`, but is asked to refuse values just bey
 the rig anew, and afterwards makes its devices safe and closes them.
 
 To go further, subclass a contract of `bench.contracts.devices`, `roles` or `faults` in a test module, or that of
-`bench.contracts.operators` for a model of your own, and provide its fixtures: the classes say which ones they need, and which others a subclass may override.
+`bench.contracts.operators` for a model of your own, and provide its fixtures: the classes say which ones they need,
+and which others a subclass may override.
 
 Needs pytest; nothing else of the bench does.
 """

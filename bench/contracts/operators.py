@@ -97,8 +97,11 @@ class OperatorContract:
 
     def test_an_input_that_is_no_number_is_refused(self, operator: Operator[Any]) -> None:
         """Neither `step` nor `evaluate` takes a nan."""
-        for refused in (lambda: operator.step(operator.initial_state(), math.nan), lambda: operator.evaluate([math.nan])):
-            with pytest.raises(ValueError, match="finite|nan"):
+        for refused in (
+            lambda: operator.step(operator.initial_state(), math.nan),
+            lambda: operator.evaluate([math.nan]),
+        ):
+            with pytest.raises(ValueError, match=r"finite|nan"):
                 refused()
 
     def test_the_inverse_meets_what_can_be_reached(

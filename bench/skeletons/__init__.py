@@ -21,6 +21,12 @@ Part = Literal["device", "protocol", "model", "rig"]
 """What there is a skeleton of."""
 PARTS: tuple[Part, ...] = get_args(Part)
 
+_GROUPS: dict[Part, registry.Group] = {
+    "device": "devices",
+    "protocol": "protocols",
+    "model": "models",
+    "rig": "rigs",
+}
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
@@ -52,10 +58,10 @@ def write_skeleton(part: Part, name: str, parent: Path) -> tuple[Path, ...]:
             f"name {name!r} is not allowed: expected lower-case letters and digits, with hyphens between words, such "
             f"as micro-balance"
         )
-    group: registry.Group = f"{part}s"  # type: ignore[assignment] - each part has a group of its plural
-    if name in registry.entries(group):
+    registered = registry.entries(_GROUPS[part])
+    if name in registered:
         raise ConfigurationError(
-            f"name {name!r} is that of a {part} of the package {registry.entries(group)[name].package}; choose another"
+            f"name {name!r} is that of a {part} of the package {registered[name].package}; choose another"
         )
     folder = parent / name
     if folder.exists():
