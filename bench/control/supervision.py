@@ -58,6 +58,7 @@ class Supervised:
         self._fallback = fallback
         self._judged: deque[tuple[float, float]] = deque(maxlen=TARGETS)
         self._target = self._output = math.nan
+        self._finished = False
         self._notice = ""
         self.gave_up = False
         """Whether the fallback is at work."""
@@ -66,7 +67,7 @@ class Supervised:
         """Aim at the next target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
         if why := self._judge():
             self._give_up(why)
-        self._target, self._output = target, output
+        self._target, self._output, self._finished = target, output, False
         command: Command = self._controller.aim(target, t, measured_input, output, *others)
         return self._watched(command, t, measured_input, output, others)
 
@@ -102,6 +103,7 @@ class Supervised:
     def _watched(
         self, command: Command, t: float, measured_input: float, output: float, others: tuple[float, ...]
     ) -> Command:
+        self._finished = self._finished or command.done
         if self.gave_up:
             return command
         self._watch.note(command.setpoint, self._target)
@@ -117,7 +119,7 @@ class Supervised:
 
     def _judge(self) -> str:
         """Judge how the last target was met; return why the controller does not converge, or nothing."""
-        if self.gave_up or math.isnan(self._target) or self.reach is not Reach.MET:
+        if self.gave_up or not self._finished or self.reach is not Reach.MET:
             return ""
         error, without = self._output - self._target, self.trace.disturbance
         if not math.isfinite(without):

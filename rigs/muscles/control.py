@@ -175,7 +175,7 @@ class _Modelled(MuscleController):
             )
             for factor in factors
         ]
-        self._believed = self._hypotheses[len(factors) // 2]
+        self._likeliest = len(factors) // 2
         self._setpoint = self._clip(start.voltage)
         self._plausible_input = widened(*model.first.input_range)
         self._plausible_output = widened(*task.output_range())
@@ -189,7 +189,12 @@ class _Modelled(MuscleController):
     @property
     def time_constant(self) -> float:
         """Time constant that agrees best with the readings so far, s."""
-        return self._believed.lag.time_constant
+        return self._hypotheses[self._likeliest].lag.time_constant
+
+    @property
+    def _believed(self) -> _Hypothesis:
+        """The time constant by which the muscle is led."""
+        return self._hypotheses[min(self._likeliest + self._parameters.search.margin, len(self._hypotheses) - 1)]
 
     def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
         low, high = self._plausible_input
@@ -208,9 +213,10 @@ class _Modelled(MuscleController):
                     kept = math.exp(-passed / (search.memory * self._parameters.period))
                     each.score = kept * each.score + (error - each.error) ** 2
                 each.error = error
-        best = min(self._hypotheses, key=lambda each: each.score)
-        if best.score < search.advantage * self._believed.score:
-            self._believed = best
+        scores = [each.score for each in self._hypotheses]
+        best = scores.index(min(scores))
+        if scores[best] < search.advantage * scores[self._likeliest]:
+            self._likeliest = best
 
     def _modelled(self) -> float:
         return self._task.output(self._believed.state)

@@ -108,6 +108,9 @@ class LagSearch:
     """Ratio of neighbouring time constants."""
     steps: int = 8
     """Number of time constants above, and of those below the identified one; 0 for that alone."""
+    margin: int = 2
+    """How many steps above the likeliest the time constant is by which the muscle is led: the model is flat after a
+    reversal where the muscle is not, which makes it seem faster than it is."""
     memory: float = 250.0
     """Number of readings after which a change of the error is forgotten."""
     advantage: float = 0.8
@@ -117,8 +120,8 @@ class LagSearch:
         check_positive(self, "memory", "advantage")
         if not 1.0 < self.factor < math.inf:
             raise ValueError(f"factor: expected a number above 1, got {self.factor}")
-        if self.steps < 0:
-            raise ValueError(f"steps: expected at least 0, got {self.steps}")
+        if self.steps < 0 or self.margin < 0:
+            raise ValueError(f"steps, margin: expected at least 0, got {self.steps} and {self.margin}")
 
     def factors(self) -> list[float]:
         """Return the multiples of the identified time constant that are tried, in order."""

@@ -494,7 +494,7 @@ def test_lasts_its_time_and_then_holds(inverse, name):
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, duration=math.inf), "duration: expected a positive"),
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, 3.0), "power: expected 1 or 2"),
         (lambda: LagSearch(factor=1.0), "factor: expected a number above 1"),
-        (lambda: LagSearch(steps=-1), "steps: expected at least 0"),
+        (lambda: LagSearch(steps=-1), "steps, margin: expected at least 0"),
         (lambda: ProportionalIntegralParameters(0.0, 4.0, 1.0), "gain: expected a number other than 0"),
         (lambda: ProportionalIntegralParameters(1.0, 0.0, 1.0), "integral_time: expected a positive"),
         (
