@@ -414,7 +414,7 @@ class _ActiveSet:
             self.gram[:size, place] = rows.T
 
     def _make_room(self, columns: Indices, more: int) -> None:
-        """Make room for the Gram entries of more columns; forget those neither passive nor asked for, if they are many."""
+        """Make room for Gram entries of more columns; if many are neither passive nor asked for, forget those."""
         asked = columns[self.place[columns] >= 0]
         needed = np.union1d(self.passive, asked)
         stay = needed if needed.size < 0.9 * self.known.size else self.known
