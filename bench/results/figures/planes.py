@@ -33,8 +33,8 @@ def plot_densities(
 ) -> None:
     """Draw Preisach densities on their planes, side by side, under their titles.
 
-    A cell whose density is zero is light grey; one that the excitation never swept is hatched: a density there does not
-    come from the data.
+    A cell whose density is zero is light grey; one that the excitation never swept is hatched: a density there
+    does not come from the data.
 
     Parameters
     ----------
