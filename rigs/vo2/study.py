@@ -17,8 +17,9 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
+from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
@@ -323,15 +324,20 @@ def _draw_models(
     temperature, curvature, error = "temperature / °C", "curvature / (1/m)", "error / (1/m)"
     proposed = models["nonmonotonic"]
     residuals = {key: model.identification.residuals for key, model in models.items()}
+    names = {model.title: model.model for model in MODELS.values()}
+    title = MODELS["nonmonotonic"].title
     paths = [
         campaign.draw(
             "figure-05a-loops",
-            plot_loops,
+            plot_fit,
             proposed.inputs,
             proposed.outputs,
-            proposed.outputs - residuals["nonmonotonic"],
-            input_label=temperature,
+            {title: proposed.outputs - residuals["nonmonotonic"]},
+            horizontal_label=temperature,
             output_label=curvature,
+            error_label=error,
+            titles={title: errors_text(proposed.identification.errors, "1/m")},
+            names=names,
         )
     ]
     for errors_figure, density_figure, key in (
@@ -340,10 +346,25 @@ def _draw_models(
         ("figure-09-error-polynomial", None, "polynomial"),
     ):
         paths.append(
-            campaign.draw(errors_figure, plot_errors, {MODELS[key].title: residuals[key]}, error_label=error)
+            campaign.draw(
+                errors_figure,
+                plot_errors,
+                {MODELS[key].title: residuals[key]},
+                error_label=error,
+                names=names,
+                published={MODELS[key].title: MODELS[key].identification},
+            )
         )
         if density_figure is not None:
-            paths.append(campaign.draw(density_figure, plot_densities, models[key].file.operator.densities()))
+            swept = models[key].coverage
+            paths.append(
+                campaign.draw(
+                    density_figure,
+                    plot_densities,
+                    models[key].file.operator.densities(),
+                    None if swept is None else swept.swept,
+                )
+            )
     paths.append(
         campaign.draw(
             "figure-10-validation",
@@ -356,6 +377,8 @@ def _draw_models(
             },
             input_label=temperature,
             error_label=error,
+            names=names,
+            published={model.title: model.validation for model in MODELS.values()},
         )
     )
     return paths
@@ -365,6 +388,8 @@ def _draw_control(
     campaign: Campaign, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
 ) -> list[Path]:
     output, error = "curvature / (1/m)", "error / (1/m)"
+    names = {title: key.replace("_", "-") for key, (title, *_) in CONTROLLERS.items()}
+    largest = {title: float(value) for title, value, _ in CONTROLLERS.values() if value != "–"}
     paths = []
     for name, keys in (
         ("figure-12-open-loop", ("open_loop_inverse", "polynomial")),
@@ -372,7 +397,18 @@ def _draw_control(
     ):
         outputs = {CONTROLLERS[key][0]: reached[key].outputs for key in keys}
         targets = reached[keys[0]].targets
-        paths.append(campaign.draw(name, plot_tracking, targets, outputs, output_label=output, error_label=error))
+        paths.append(
+            campaign.draw(
+                name,
+                plot_tracking,
+                targets,
+                outputs,
+                output_label=output,
+                error_label=error,
+                names=names,
+                published=largest,
+            )
+        )
     for period in PERIODS:
         results = {key: followed[period, key] for key in FOLLOWERS}
         times = results["closed_loop_inverse"].times
@@ -386,6 +422,7 @@ def _draw_control(
                 horizontal_label="time / s",
                 output_label=output,
                 error_label=error,
+                names=names,
             )
         )
     return paths
