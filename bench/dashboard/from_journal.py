@@ -40,6 +40,7 @@ def rebuild(record: Record, path: Path) -> None:
         writer.write(models)
         if "status" in meta:
             writer.write([End(str(meta["status"]), str(meta.get("reason", "")))])
+        writer.arrange(in_file=True)
     finally:
         writer.recording.close()
 

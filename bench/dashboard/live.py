@@ -148,6 +148,7 @@ class Dashboard:
             self._hand_over()
         # What came between the last look and the closing.
         self._hand_over()
+        self._writer.arrange(in_file=True)
         self._writer.recording.close()
 
     def _hand_over(self) -> None:
@@ -160,6 +161,7 @@ class Dashboard:
                 if change := self._writer.recording.follow_viewer(len(entries)):
                     self._writer.warn(change)
                 self._writer.write(entries)
+                self._writer.arrange(in_file=False)
                 if (missing := self.dropped - self._reported) > 0:
                     self._writer.warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
                     self._reported += missing

@@ -30,9 +30,7 @@ class Recording:
     Raises a ConfigurationError if the file exists or cannot be made, or no port is free.
     """
 
-    def __init__(
-        self, run_id: str, title: str, path: Path | None, port: int | None, blueprint: rrb.Blueprint
-    ) -> None:
+    def __init__(self, run_id: str, title: str, path: Path | None, port: int | None) -> None:
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         self.uri: str | None = None
         """Address for a viewer, None without a live view."""
@@ -51,7 +49,7 @@ class Recording:
         for sink in sinks:
             stream = rr.RecordingStream("bench", recording_id=run_id)
             try:
-                stream.set_sinks(sink, default_blueprint=blueprint)
+                stream.set_sinks(sink)
             except RuntimeError as error:
                 raise ConfigurationError(f"the recording cannot be made: {error}") from error
             stream.send_recording_name(title)
@@ -94,11 +92,20 @@ class Recording:
         unseen, self._unseen = self._unseen, 0
         return f"the viewer has resumed; {unseen} entries are missing in the live view"
 
-    def send(self, path: str, times: list[rr.TimeColumn], columns: Iterable[rr.ComponentColumn]) -> None:
-        """Write columns of an entity at their times."""
+    def send(
+        self, path: str, times: list[rr.TimeColumn], columns: Iterable[rr.ComponentColumn], only: str = ""
+    ) -> None:
+        """Write columns of an entity at their times; `only` to the `file`, or `live` to viewers."""
         columns = list(columns)
         for stream in self._streams:
-            stream.send_columns(path, times, columns)
+            if only in ("", "live" if stream is self._live else "file"):
+                stream.send_columns(path, times, columns)
+
+    def arrange(self, blueprint: rrb.Blueprint, *, in_file: bool) -> None:
+        """Arrange the views anew; in the file as well where it is worth its bytes."""
+        for stream in self._streams:
+            if in_file or stream is self._live:
+                stream.send_blueprint(blueprint)
 
     def send_vectors(self, path: str, times: list[rr.TimeColumn], vectors: Floats) -> None:
         """Write one vector a time, shape (times, components)."""
