@@ -31,6 +31,7 @@ from bench.cli import (
     runs,
     twin,
     upkeep,
+    watch,
 )
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
@@ -66,6 +67,7 @@ for group in (
     designs.app,
     comparisons.app,
     records.app,
+    watch.app,
     journals.app,
     twin.app,
 ):
