@@ -70,11 +70,11 @@ def blueprint(views: Arranged) -> rrb.Blueprint:
     if drawn:
         columns.append(rrb.Grid(*drawn, grid_columns=1 if len(drawn) <= 2 else 2))
     numbers = rrb.TextDocumentView(origin="/numbers", name=f"Now: {views.state}")
-    columns.append(rrb.Vertical(numbers, below, row_shares=[3, 2]))
+    columns.append(rrb.Vertical(numbers, below, row_shares=[2, 1]))
     state = rrb.StateTimelineView(origin="/state", name=f"Protocol: {views.state}", time_view=whole_run())
     widths = [4, 3 if len(drawn) <= 2 else 5, 3][-len(columns) :] if len(columns) == 3 else [3, 2]
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(*columns, column_shares=widths), state, row_shares=[6, 1]),
+        rrb.Vertical(rrb.Horizontal(*columns, column_shares=widths), state, row_shares=[11, 2]),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline="t", play_state="following"),

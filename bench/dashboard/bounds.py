@@ -108,7 +108,7 @@ class BoundLines:
         self._since: float | None = None
         self._drawn: dict[int, float] = {}
 
-    def write(self, recording: Recording, t: Floats, step: Sequence[int], values: Floats) -> None:
+    def write(self, recording: Recording, t: Sequence[float], step: Sequence[int], values: Floats) -> None:
         """Draw what is near to values, shape (times, signals), in the unit of the signals."""
         if not self._bounds or not np.isfinite(values).any():
             return

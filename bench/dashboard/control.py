@@ -29,11 +29,14 @@ LAST_TARGETS = 10
 _RECENT_TICKS = 2000
 """Ticks that they are taken from where there are no targets."""
 
-_ROOM = 4.0
+_ROOM = 2.4
 """Scale of the error to either side, in RMS of the last targets."""
 
 _ROOM_OF_TICKS = 1.25
 """The same in magnitudes of the error that 19 of 20 ticks do not pass."""
+
+_ROUND = (1.5, 2, 3, 4, 15)
+"""Ends of axes, in powers of ten, between which the viewer writes more numbers than a zero."""
 
 _OUTPUT: Colour = (236, 100, 46)
 _PREDICTED: Colour = (150, 110, 190)
@@ -243,4 +246,4 @@ def _round_up(value: float) -> float:
     if not (value > 0.0 and math.isfinite(value)):
         return 0.0
     magnitude = 10.0 ** math.floor(math.log10(value))
-    return next(each * magnitude for each in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if each * magnitude >= value * (1 - 1e-9))
+    return next(each * magnitude for each in _ROUND if each * magnitude >= value * (1 - 1e-9))

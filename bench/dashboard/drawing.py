@@ -139,7 +139,7 @@ def texts(places: Sequence[tuple[float, float]], labels: Sequence[str]) -> rr.Po
 def xy_view(path: str, name: str, past: Mapping[str, float] = MappingProxyType({})) -> rrb.Spatial2DView:
     """Return the view of what a `Frame` frames; of the entities of `past` it shows so many seconds of history."""
     now = rrb.TimeRangeBoundary.cursor_relative()
-    overrides: dict[str, Any] = {}
+    overrides: dict[Any, rrb.VisibleTimeRanges] = {}
     for entity, seconds in past.items():
         forever = rrb.TimeRangeBoundary.infinite()
         since = forever if math.isinf(seconds) else rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds)

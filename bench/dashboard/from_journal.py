@@ -30,7 +30,7 @@ def rebuild(record: Record, path: Path) -> None:
         _write(writer, _Tail().entries(record))
         writer.write(models)
         writer.write(_end_of(record))
-        writer.arrange(in_file=True)
+        writer.arrange()
     finally:
         writer.recording.close()
 
@@ -101,7 +101,7 @@ class JournalView:
     def _show(self, entries: Sequence[Entry]) -> None:
         if entries:
             _write(self._writer, entries)
-            self._writer.arrange(in_file=False)
+            self._writer.arrange()
         self._writer.recording.follow_viewer(len(entries))
 
 

@@ -19,8 +19,8 @@ from bench.journal import Event, StepRecord, expected_steps
 from bench.remaining_time import Expectation
 from bench.units import fitting_prefix, format_duration, format_numbers
 
-_LIVE_SECONDS = 1.0
-_FILE_SECONDS = 10.0
+LIVE_SECONDS = 1.0
+FILE_SECONDS = 10.0
 """Laboratory time between two panels for viewers, and in the file."""
 
 
@@ -57,8 +57,10 @@ class Numbers:
         self._state, self._phase, self._steps, self._reason = "running", "", 0, ""
         self._values: Sequence[float] = ()
         self._t, self._step = 0.0, 0
-        self._last = {"live": -math.inf, "file": -math.inf}
-        self._pending: dict[str, list[tuple[float, int, str]]] = {"live": [], "file": []}
+        self.interval = FILE_SECONDS
+        """Laboratory time between two panels, s."""
+        self._last = -math.inf
+        self._pending: list[tuple[float, int, str]] = []
 
     @property
     def state(self) -> str:
@@ -80,22 +82,20 @@ class Numbers:
                 self._state = "paused" if entry.kind == "pause" else "running"
         elif isinstance(entry, End):
             self._state, self._reason = entry.status, entry.reason
-            self._last = {"live": -math.inf, "file": -math.inf}
+            self._last = -math.inf
         else:
             return
-        for kind, interval in (("live", _LIVE_SECONDS), ("file", _FILE_SECONDS)):
-            if self._t - self._last[kind] >= interval:
-                self._last[kind] = self._t
-                self._pending[kind].append((self._t, self._step, self._text()))
+        if self._t - self._last >= self.interval:
+            self._last = self._t
+            self._pending.append((self._t, self._step, self._text()))
 
     def write(self, recording: Recording) -> None:
         """Write the panels that were kept."""
-        for kind, panels in self._pending.items():
-            if panels:
-                t, step, text = zip(*panels, strict=True)
-                columns = rr.TextDocument.columns(text=text, media_type=[rr.MediaType.MARKDOWN] * len(text))
-                recording.send("numbers", times(t, step), columns, only=kind)
-                panels.clear()
+        if self._pending:
+            t, step, text = zip(*self._pending, strict=True)
+            columns = rr.TextDocument.columns(text=text, media_type=[rr.MediaType.MARKDOWN] * len(text))
+            recording.send("numbers", times(t, step), columns)
+            self._pending.clear()
 
     def _text(self) -> str:
         done = f"step {self._steps}" + (f" of {self._steps_expected}" if self._steps_expected else "")

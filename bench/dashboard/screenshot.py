@@ -44,6 +44,7 @@ class Camera:
         options = ["--headless", "--hide-welcome-screen", "--bind", LOOPBACK, "--port", str(port)]
         self._viewer = start_viewer([*options, "--window-size", f"{size[0]}x{size[1]}"])
         self._clock = WallClock()
+        self._is_used = False
         try:
             wait_until_it_listens(
                 self._viewer,
@@ -82,7 +83,9 @@ class Camera:
         if not rrd.is_file():
             raise DataError(f"there is no recording {rrd}")
         client = self._client
-        self._patiently(client.close_recordings)
+        if self._is_used:
+            self._patiently(lambda: client.close("all"))
+        self._is_used = True
         self._patiently(lambda: client.open(str(rrd.absolute())))
         if at is None:
             self._patiently(lambda: client.set_time("t", play_state="following"))

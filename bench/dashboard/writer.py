@@ -17,7 +17,7 @@ from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
 from bench.dashboard.control import TRACE_NAMES, ControlPlots, Errors
 from bench.dashboard.entries import End, Entry, ModelDensity, Tick
-from bench.dashboard.numbers import Numbers
+from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.recording import Floats, Recording, times
 from bench.dashboard.signal_plots import plots_by_unit
@@ -87,7 +87,9 @@ class Writer:
         if self._plots is not None and self._planes is not None:
             self._plots.draw(self.recording)
             self._planes.draw(self.recording)
-        self.arrange(in_file=False)
+        if path is None:
+            self._numbers.interval = LIVE_SECONDS
+            self.arrange()
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Write entries in the order in which they happened."""
@@ -111,7 +113,7 @@ class Writer:
         self._numbers.write(self.recording)
         self._timeline.write(self.recording, entries)
 
-    def arrange(self, *, in_file: bool) -> None:
+    def arrange(self) -> None:
         """Arrange the views anew if what they have to show has changed."""
         wanted = (
             frozenset(self._filled),
@@ -119,9 +121,9 @@ class Writer:
             math.inf if self._errors is None else seldom(self._errors.seconds_bright(self._timeline.t)),
             self._numbers.state,
         )
-        if wanted != self._arranged or in_file:
+        if wanted != self._arranged:
             self._arranged = wanted
-            self.recording.arrange(self._blueprint(*wanted), in_file=in_file)
+            self.recording.arrange(self._blueprint(*wanted))
 
     def warn(self, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
@@ -158,7 +160,8 @@ class Writer:
     def _blueprint(
         self, filled: frozenset[str], error_range: float | None, bright: float, state: str
     ) -> rrb.Blueprint:
-        over_time, others = [], []
+        over_time: list[rrb.TimeSeriesView] = []
+        others: list[rrb.TimeSeriesView] = []
         for plot in self._signals:
             if filled and f"signals/{plot.path}" not in filled:
                 continue
