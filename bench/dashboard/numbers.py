@@ -19,6 +19,9 @@ from bench.journal import Event, StepRecord, expected_steps
 from bench.remaining_time import Expectation
 from bench.units import fitting_prefix, format_duration, format_numbers
 
+_SHORT = 10.0
+"""Durations below are shown in s."""
+
 LIVE_SECONDS = 1.0
 FILE_SECONDS = 10.0
 """Laboratory time between two panels for viewers, and in the file."""
@@ -102,7 +105,7 @@ class Numbers:
         is_over = self._state not in ("running", "paused")
         lines = [f"# {self._state if is_over or self._state == 'paused' else self._phase or self._state}"]
         phase = [self._phase] if is_over and self._phase else []
-        lines.append(" · ".join([*phase, done, format_duration(self._t)]))
+        lines.append(" · ".join([*phase, done, _duration(self._t)]))
         if self._reason:
             lines.append(self._reason)
         for name, number in self._numbers():
@@ -128,7 +131,7 @@ class Numbers:
             margin = bound.margin(self._values[bound.column])
             yield f"to the interlock {bound.name}", self._show(margin, bound.column)
         if is_over:
-            yield "in all", format_duration(self._t)
+            yield "in all", _duration(self._t)
         elif self._expected is not None:
             left = max(self._expected.seconds - self._expected.end_of(self._steps), 0.0)
             at = max(self._expected.seconds - self._t, 0.0) if self._steps == 0 else left
@@ -149,7 +152,11 @@ class Numbers:
 def _small(value: float, unit: str) -> str:
     """Return an error with its unit, to three digits."""
     factor, shown = fitting_prefix(unit, value)
-    return f"{factor * value:#.3g} {shown}".replace("-", "−")
+    return f"{f'{factor * value:#.3g}'.removesuffix('.')} {shown}".replace("-", "−")
+
+
+def _duration(seconds: float) -> str:
+    return format_duration(seconds) if seconds >= _SHORT else f"{seconds:.3g} s"
 
 
 def _expectation(meta: Mapping[str, Any]) -> Expectation | None:

@@ -34,7 +34,8 @@ class Recording:
     def __init__(self, run_id: str, title: str, path: Path | None, port: int | None) -> None:
         self.uri: str | None = None
         """Address for a viewer, None for a file."""
-        self._stream = rr.RecordingStream("bench", recording_id=run_id)
+        # A viewer keeps one arrangement of views for each application, and each run has its own.
+        self._stream = rr.RecordingStream(f"bench {run_id}", recording_id=run_id)
         try:
             self._stream.set_sinks(_file(path) if path is not None else self._server(port or 0))
         except RuntimeError as error:
