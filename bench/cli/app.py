@@ -25,6 +25,7 @@ from bench.cli import (
     designs,
     journals,
     models,
+    new,
     records,
     rehearse,
     repeat,
@@ -61,6 +62,7 @@ _PARTS = (
     watch.app,
     journals.app,
     twin.app,
+    new.app,
 )
 
 
