@@ -87,7 +87,8 @@ def short_run(rig: str, protocol: str, out: Path, models: dict[str, Path]) -> Pa
         table = out / f"{rig}-setpoints.csv"
         role = load_rig(rig).roles["drive"]
         values = [role.at(0.5 + 0.5 * math.cos(0.4 * n) * math.exp(-n / 60)) for n in range(80)]
-        table.write_text("setpoint\n" + "\n".join(map(str, values)) + "\n", encoding="utf-8")
+        rows = [f"{value},{role.dwell}" for value in values]
+        table.write_text("\n".join(["input,dwell", *rows, ""]), encoding="utf-8")
         settings["setpoints"] = str(table)
     return Path(bench.run(protocol, rig, out=out, clock="virtual", **settings).folder)
 
@@ -199,26 +200,21 @@ def main() -> int:
     runs = study_runs(studies)
     models: dict[str, Path] = {}
     catalogue = Catalogue.of_installed()
-    pairs = [
-        (rig, protocol)
-        for rigs, protocols in catalogue.by_protocols()
-        for rig in rigs
-        for protocol in protocols
-        if load_rig(rig).emulated
-    ]
+    pairs = [(rig, name) for rig in catalogue.rigs if load_rig(rig).emulated for name in catalogue.fitting(rig)]
     wanted: dict[str, tuple[str, str, dict[str, Any]]] = {
         f"{rig}-{protocol}": (rig, protocol, {}) for rig, protocol in pairs
     }
     if options.readme:
         wanted = dict(README)
+    wanted = {name: each for name, each in wanted.items() if options.only in name}
+    if not wanted:
+        sys.exit(f"--only {options.only}: there is no such picture")
     problems: list[str] = []
     with ExitStack() as stack:
         camera = stack.enter_context(Camera(SIZE))
         browser = stack.enter_context(Browser.opened()) if "light" in options.themes else None
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for name, (rig, protocol, parameters) in wanted.items():
-            if options.only not in name:
-                continue
             try:
                 found = runs.get((rig, protocol))
                 run = choose(found, parameters) if found else short_run(rig, protocol, options.out, models)

@@ -79,8 +79,10 @@ class ControlPlots:
         output, *traces = (find_column(signals, "controls", name) for name in (controls, *TRACE_NAMES))
         signal = signals[output]
         unit = fitting_prefix(signal.unit, *(extent or [likely_magnitude(signal)]))
-        # A few of the last digits that are worth showing: what an error comes down to.
-        error_unit = fitting_prefix(signal.unit, 10.0 ** (1 - signal.precision))
+        # What an error comes down to: a thousandth of the range, or the last digits that are worth showing.
+        error_unit = fitting_prefix(
+            signal.unit, 1e-3 * (extent[1] - extent[0]) if extent else 10.0 ** (1 - signal.precision)
+        )
         return cls(output, tuple(traces), extent, *unit, *error_unit)
 
     def is_at_work(self, values: Sequence[float]) -> bool:

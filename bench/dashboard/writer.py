@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 from pydantic import ValidationError
@@ -19,7 +20,7 @@ from bench.dashboard.control import TRACE_NAMES, ControlPlots, Errors
 from bench.dashboard.entries import End, Entry, ModelDensity, Tick
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
-from bench.dashboard.recording import Floats, Recording, times
+from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import plots_by_unit
 from bench.dashboard.timeline import Timeline
 from bench.dashboard.xy_plots import Point, XYPlots
@@ -142,9 +143,10 @@ class Writer:
         if self._control is not None and kind == "signals":
             for name, series in self._control.series(table).items():
                 self.recording.send_vectors(f"control/{name}", when, series)
-                self._note(name, series)
+                # Of the tracking the reference, as there is an output always.
+                self._note(name, np.isfinite(series[:, 0]) if name == "tracking" else series)
 
-    def _note(self, name: str, values: Floats) -> None:
+    def _note(self, name: str, values: npt.NDArray[Any]) -> None:
         """Note whether a plot has something to show: numbers that are not all zero."""
         if name not in self._filled and np.any(np.nan_to_num(values)):
             self._filled.add(name)
