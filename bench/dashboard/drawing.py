@@ -27,7 +27,7 @@ Colour = tuple[int, int, int] | tuple[int, int, int, int]
 
 # The viewer's own background is nearly black or nearly white: each colour is legible on both.
 INK: Colour = (124, 132, 142)
-FAINT: Colour = (124, 132, 142, 70)
+FAINT: Colour = (104, 110, 118)
 MARKER: Colour = (22, 168, 150)
 ALARM: Colour = (214, 58, 56)
 CAUTION: Colour = (206, 142, 20)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 import socket
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -34,8 +36,7 @@ class Recording:
     def __init__(self, run_id: str, title: str, path: Path | None, port: int | None) -> None:
         self.uri: str | None = None
         """Address for a viewer, None for a file."""
-        # A viewer keeps one arrangement of views for each application, and each run has its own.
-        self._stream = rr.RecordingStream(f"bench {run_id}", recording_id=run_id)
+        self._stream = rr.RecordingStream(_application(run_id), recording_id=run_id)
         try:
             self._stream.set_sinks(_file(path) if path is not None else self._server(port or 0))
         except RuntimeError as error:
@@ -104,6 +105,12 @@ class Recording:
         """Complete the file, or let go of the viewers."""
         self._is_written = False
         self._stream.disconnect()
+
+
+def _application(run_id: str) -> str:
+    """Return a name that Rerun takes for an application: of each run, as a viewer keeps one arrangement for each."""
+    digest = hashlib.sha256(run_id.encode()).hexdigest()[:8]
+    return f"bench {re.sub('[^A-Za-z0-9]+', '-', run_id)[:40]} {digest}"
 
 
 def _file(path: Path) -> rr.FileSink:

@@ -24,8 +24,8 @@ _REDRAW_SECONDS = 0.1
 _VISIBLE = 0.002
 """Visible part of an axis; a controller at its target moves by less."""
 
-_PALE = 64
-"""How opaque the lines to old targets are, of 255."""
+_PALE = 0.35
+"""Part of their colour in that of the lines to old targets; the rest is grey."""
 
 _RISING: Colour = (236, 100, 46)
 _FALLING: Colour = (58, 132, 232)
@@ -114,7 +114,7 @@ class XYPlots:
             if self._fades:
                 recent = rr.LineStrips2D.columns(strips=strips, colors=colours)
                 recording.send(f"{track.path}/data/recent", when, recent)
-                colours = [(*colour[:3], _PALE) for colour in colours]
+                colours = [_pale(colour) for colour in colours]
             recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=strips, colors=colours))
             ends = [line[-1] for line in strips]
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
@@ -130,6 +130,11 @@ class XYPlots:
     def _past(self, path: str, bright: float) -> dict[str, float]:
         past = {f"/{path}/data/path": math.inf}
         return past | {f"/{path}/data/recent": bright} if self._fades else past
+
+
+def _pale(colour: Colour) -> Colour:
+    red, green, blue = (round(_PALE * part + (1 - _PALE) * 128) for part in colour[:3])
+    return red, green, blue
 
 
 class _Track:
