@@ -13,7 +13,7 @@ from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
 from protocols.session import SessionParameters, begin_session, session_kinds
 
 
@@ -40,7 +40,7 @@ class Parameters(SessionParameters):
     timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
     """Bring the response to a sequence of targets.
 

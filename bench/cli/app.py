@@ -34,6 +34,7 @@ from bench.cli import (
     runs,
     twin,
     upkeep,
+    watch,
 )
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
@@ -58,6 +59,7 @@ _PARTS = (
     designs.app,
     comparisons.app,
     records.app,
+    watch.app,
     journals.app,
     twin.app,
     new.app,
