@@ -1,5 +1,6 @@
 """What the tests of several folders share."""
 
+import gc
 import json
 import os
 import select
@@ -14,6 +15,7 @@ from itertools import chain, groupby
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
 # wait for one another, and a product of small matrices takes ten times as long.
@@ -32,13 +34,37 @@ for _name in ("SIGHUP", "SIGQUIT"):
         signal.signal(getattr(signal, _name), signal.SIG_DFL)
 
 
+# Chosen by `make test`; `make test-all` looks at all examples.
+settings.register_profile("brief")
+_BRIEF, _FEWEST = 3, 20
+"""What examples are divided by then, and how few there are at least."""
+_SETTINGS = "_hypothesis_internal_use_settings"
+
+
+def _take_fewer_examples(items):
+    """Divide the examples of each property: the default of a profile would not reach those that say their number."""
+    for test in {getattr(item.obj, "__func__", item.obj) for item in items if hasattr(item.obj, "hypothesis")}:
+        own = getattr(test, _SETTINGS, settings.default)
+        fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))
+        setattr(test, _SETTINGS, settings(own, max_examples=fewer))
+
+
+def pytest_collection_finish():
+    """Leave what collecting the tests has made out of each further garbage collection: a million objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 50)
+
+
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Spread the whole studies over the first half of the tests.
 
     One that came last would leave all workers but its own idle. Of two workers the second begins in the middle, with
     tests that compile little, and finds in the cache what the first has compiled for its studies.
     """
+    if config.getoption("hypothesis_profile") == "brief":
+        _take_fewer_examples(items)
     studies = [item for item in items if getattr(item, "originalname", "") == "test_campaign"]
     for study in studies:
         # Two minutes on an idle machine; a busy one may take its time.
