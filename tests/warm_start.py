@@ -59,7 +59,7 @@ def begin(request, outputs):
     else:
         sys.path.insert(0, str(Path.cwd()))
     importlib.invalidate_caches()
-    registry.entries.cache_clear()
+    registry.forget()
 
 
 def carry_out(option, program, *rest):
