@@ -8,6 +8,7 @@ safe state, each independently; the outcome is recorded.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,11 +33,13 @@ from bench.errors import (
 )
 from bench.interrupts import Interrupts
 from bench.past import Resumption, reprime
-from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
+from bench.protocol.changes import PARAMETER, ParameterChange
+from bench.protocol.parameters import OpenParameters, ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
 from bench.protocol.vocabulary import PROMPT, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
+from bench.questions import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.rig import Look
-from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, RunRecord, traced
+from bench.running import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
 from bench.safety import SAFE
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.station.interface import Station
@@ -79,7 +82,15 @@ class Outcome:
 
 
 class Engine:
-    """Carries protocols out at a station; its parameters are those of `RunAtHand`."""
+    """Carries protocols out at a station.
+
+    Parameters
+    ----------
+    station, journal, observers, interrupts, ask, zero, messages
+        As of `RunAtHand`.
+    changes : iterable of ParameterChange
+        Parameters that the run which is repeated had changed, in their order.
+    """
 
     def __init__(
         self,
@@ -87,14 +98,17 @@ class Engine:
         journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
-        ask: Callable[[str], str] | None = None,
+        ask: Callable[[Question], str] | None = None,
         zero: float | None = None,
+        messages: Notices | None = None,
+        changes: Iterable[ParameterChange] = (),
     ) -> None:
         self._station = station
         self._clock = station.clock
         self._journal = journal
         self._interrupts = interrupts
-        self._run = RunAtHand(station, journal, observers, interrupts, ask, zero)
+        self._run = RunAtHand(station, journal, observers, interrupts, ask, zero, messages)
+        self._changes = deque(changes)
         self._patience = station.description.file.safety.patience
         self._work: dict[type[Message], Callable[[Any], Reading]] = {
             Step: self._step,
@@ -145,6 +159,7 @@ class Engine:
         run.judge(self._clock.now(), self._station.look(Look.GLANCE))
         slots = self._station.description.slots(definition)
         messages = definition.start(parameters, slots) if past is None else past.fed.messages
+        run.parameters = OpenParameters(definition, parameters, self._station.description.file.roles)
         waiting = None if past is None else past.fed.message
         reading: Reading | None = None
         try:
@@ -153,6 +168,10 @@ class Engine:
                 reprime(run, past, self._settle_or_raise)
             while True:
                 self._station.promise(self._patience, "the protocol computes")
+                while self._changes and self._changes[0].step < run.steps:
+                    change = self._changes.popleft()
+                    definition.change(parameters, change.name, change.value)
+                    run.event("WARN", PARAMETER, str(change))
                 try:
                     # The first `send` of a generator has to be that of None.
                     message = waiting or messages.send(reading)  # type: ignore[arg-type]
@@ -266,10 +285,13 @@ class Engine:
         started = self._clock.now()
         if self._station.has_operator:
             self._station.operate(message.task, message.value)
-        elif run.ask is None:
-            raise AbortError(f"no operator is present to do it: {message.text}")
-        elif run.await_answer(run.ask, f"{message.text}; then") != RESUME:
-            raise AbortError("ended by the operator at a prompt")
+        else:
+            question = Question(message.text, AT_A_PROMPT, "BY HAND")
+            answer = NOBODY if run.ask is None else run.await_answer(run.ask, question)
+            if answer == NOBODY:
+                raise AbortError(f"no operator is present to do it: {message.text}")
+            if answer != RESUME:
+                raise AbortError("ended by the operator at a prompt")
         # Kept in any case: it shows what was wrong.
         self._station.apply({})
         reading = self._settle_and_read(message.settle, self._clock.now(), started, PROMPT, {})
@@ -350,6 +372,7 @@ class Engine:
             if pace is not None:
                 self._run.event("INFO", "clock", str(pace))
             self._run.event("INFO" if error is None else "WARN", "end", status)
+            self._run.finish_messages()
             self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
         # A full disk must not hide whether the devices are safe.
         except Exception as failure:

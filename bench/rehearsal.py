@@ -21,9 +21,10 @@ from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.protocol.plan import LONGEST
+from bench.questions import ABORT, RESUME
 from bench.rig import Rig
 from bench.rig_file import RigFile
-from bench.running import ABORT, RESUME, Observer
+from bench.running import Observer
 from bench.station.local import LocalStation
 
 LONGEST_DAYS = 30.0

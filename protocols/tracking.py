@@ -33,8 +33,12 @@ class Parameters(SessionParameters):
     )
     count: int = parameter(60, unit="1", low=2, high=10000, help="number of generated targets")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
-    readings: int = parameter(10, unit="1", low=1, high=1000, help="readings at each target once it is reached")
-    timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
+    readings: int = parameter(
+        10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
+    )
+    timeout: float = parameter(
+        300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
+    )
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")

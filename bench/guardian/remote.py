@@ -215,6 +215,10 @@ class RemoteStation(Station):
         sent = self._ask("apply", setpoints={name: float(value) for name, value in setpoints.items()})
         self._setpoints.update(sent)
 
+    def rest(self) -> None:
+        """Bring every device into its safe state for a while."""
+        self._ask("rest")
+
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
         return self._setpoints[device]
