@@ -23,7 +23,8 @@ def start(tmp_path):
 
     def begin(*arguments):
         environment = {
-            **os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])]), "TERM": "xterm", "NO_COLOR": "1",
+            **os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])]), "TERM": "xterm",
+            "NO_COLOR": "1",
         }  # fmt: skip
         child = pexpect.spawn(
             sys.executable,
