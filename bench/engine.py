@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from bench import fixed_rate
+from bench import by_hand, fixed_rate
 from bench.clock import Pace, PacedClock
 from bench.control.convergence import LimitCycleWatch
 from bench.control.estimators import DriftEstimator, agility_for
@@ -36,7 +36,7 @@ from bench.past import Resumption, reprime
 from bench.protocol.changes import PARAMETER, ParameterChange
 from bench.protocol.parameters import OpenParameters, ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
-from bench.protocol.vocabulary import PROMPT, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
+from bench.protocol.vocabulary import PROMPT, ByHand, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
 from bench.questions import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.rig import Look
 from bench.running import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
@@ -115,6 +115,7 @@ class Engine:
             Control: self._control,
             FixedRate: partial(fixed_rate.carry_out, self._run),
             Prompt: self._prompt,
+            ByHand: partial(by_hand.carry_out, self._run),
         }
 
     def warn(self, warnings: Iterable[str]) -> None:

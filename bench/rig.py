@@ -17,7 +17,7 @@ from bench.devices import Actuator, Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
 from bench.rig_file import Laboratory, RigFile
-from bench.roles import BlockPlayer, Floats, JointReader
+from bench.roles import BlockPlayer, Floats, JointReader, LoadCell
 from bench.safety import SAFE, make_safe
 
 
@@ -113,6 +113,14 @@ class Rig:
         """Return a device that takes a set-point; raises ConfigurationError if there is none of that name."""
         self.description.limits_of(name)
         return self.actuators[name]
+
+    def load_cell(self, name: str) -> LoadCell:
+        """Return a load cell; raises ConfigurationError if there is none of that name."""
+        device = self.devices.get(name)
+        if not isinstance(device, LoadCell):
+            known = ", ".join(name for name, each in self.devices.items() if isinstance(each, LoadCell)) or "none"
+            raise ConfigurationError(f"{name} is not a load cell; there are: {known}")
+        return device
 
     @property
     def setpoints(self) -> dict[str, float]:

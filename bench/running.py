@@ -293,6 +293,12 @@ class RunAtHand:
         """Whether the operator or an interlock has asked for a pause, or an interlock holds the set-points."""
         return self._interrupts.pause_requested or self._is_demanded
 
+    def take_pause(self) -> tuple[bool, str]:
+        """Return whether the operator or the system asks for a pause, and why an interlock does; each once."""
+        asked, self._interrupts.pause_requested = self._interrupts.pause_requested, False
+        why, self._pause_reason = self._pause_reason, ""
+        return asked, why
+
     def pause_if_asked(self) -> float:
         """Pause if the operator or an interlock has asked for it; return for how long, s.
 
@@ -330,7 +336,7 @@ class RunAtHand:
             elif command == SET:
                 problem = self._change(rest)
             elif command == OFF:
-                off = off or self._switch_off()
+                off = off or self.switch_off()
                 text = "the outputs are off until the run is resumed"
             else:
                 break
@@ -356,7 +362,7 @@ class RunAtHand:
         self.event("WARN", PARAMETER, str(change))
         return ""
 
-    def _switch_off(self) -> dict[str, float]:
+    def switch_off(self) -> dict[str, float]:
         """Switch every output off; return the set-points that there were."""
         setpoints = {name: self.station.setpoint(name) for name in self.station.description.limits}
         self.station.promise(max(self.station.description.devices[name].safe_within for name in setpoints), "rest")

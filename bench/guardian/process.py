@@ -336,6 +336,11 @@ class Guardian:
 
         self._start(BENCH, calls, done, partial(self._refuse, message))
 
+    def _tare(self, message: Message) -> None:
+        name = message["device"]
+        calls = {name: self._rig.load_cell(name).tare}
+        self._start(BENCH, calls, lambda _: self._reply(message), partial(self._refuse, message))
+
     def _check(self, message: Message) -> None:
         self._rig.check(message["setpoints"])
         self._reply(message)
@@ -587,6 +592,7 @@ _REQUESTS: Mapping[str, Callable[[Guardian, Message], None]] = {
     "apply": Guardian._apply,
     "check": Guardian._check,
     "rest": Guardian._rest,
+    "tare": Guardian._tare,
     "arrivals": Guardian._arrivals,
     "can-play": Guardian._can_play,
     "play": Guardian._play,

@@ -118,7 +118,8 @@ class Event:
         `INFO`, `WARN` or `ERROR`.
     kind : str
         `phase`, `note`, `pause`, `remark` (of the operator), `parameter` (a change), `off`, `resume`, `resumed` (by
-        another process), `observer`, `notify`, `suspended`, `warning` (near an interlock), `interlock`, `error`, `safe-state`, `clock`, `end`.
+        another process), `observer`, `notify`, `suspended`, `warning` (near an interlock), `interlock`,
+        `error`, `safe-state`, `clock`, `end`.
     text : str
         One sentence.
     """

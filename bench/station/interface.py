@@ -170,6 +170,18 @@ class Station(ABC):
         """
 
     @abstractmethod
+    def tare(self, device: str) -> None:
+        """Make the present force of a load cell read zero.
+
+        Raises
+        ------
+        ConfigurationError
+            If the device is no load cell.
+        DeviceError
+            If it does not take the tare.
+        """
+
+    @abstractmethod
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
 

@@ -154,6 +154,10 @@ class LocalStation(Station):
         self._core.raise_if_over()
         raise_if_unsafe(self._made_safe())
 
+    def tare(self, device: str) -> None:
+        """Make the present force of a load cell read zero."""
+        self._ask(device, self._rig.load_cell(device).tare)
+
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
         return self._rig.actuator(device).setpoint
