@@ -25,6 +25,7 @@ from bench.cli import (
     designs,
     journals,
     models,
+    new,
     panel,
     records,
     rehearse,
@@ -64,6 +65,7 @@ _PARTS = (
     records.app,
     journals.app,
     twin.app,
+    new.app,
 )
 
 
