@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,7 @@ from bench.errors import (
     SettleTimeoutError,
 )
 from bench.interrupts import Interrupts
+from bench.lateness import Lateness
 from bench.past import Resumption, reprime
 from bench.protocol.changes import PARAMETER, ParameterChange
 from bench.protocol.parameters import OpenParameters, ProtocolDefinition, ProtocolParameters
@@ -65,6 +66,8 @@ class Outcome:
         What ended the run, when it was not completed.
     pace : Pace or None
         How fast the run went, on a paced clock.
+    lateness : mapping of str to mapping
+        How late the samples of loops were, by label; see `bench.lateness`.
     """
 
     status: str
@@ -74,6 +77,7 @@ class Outcome:
     safe_state: Mapping[str, str]
     error: Exception | None
     pace: Pace | None = None
+    lateness: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def is_safe(self) -> bool:
@@ -235,10 +239,15 @@ class Engine:
         command: Command | None = None
         watch = LimitCycleWatch(low, high)
         seen: list[float] = []
+        lateness = Lateness(None)
+        due: float | None = None
         try:
             while True:
-                latest += run.pause_if_asked()
+                paused = run.pause_if_asked()
+                latest += paused
                 asked = self._clock.now()
+                if due is not None and not paused:
+                    lateness.add(asked - due)
                 values = run.look(Look.SAMPLE, wanted)
                 now = self._clock.now()
                 ask = message.task.begin if command is None else message.task.update
@@ -277,8 +286,11 @@ class Engine:
                         f"within {message.timeout:g} s"
                     )
                 run.hold_until(end, asked)
+                due = end
         finally:
             run.trace = NOT_AT_WORK
+            if lateness.samples:
+                run.keep_lateness(message.label, lateness)
 
     def _prompt(self, message: Prompt) -> Reading:
         run = self._run
@@ -361,6 +373,7 @@ class Engine:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
         finished = self._clock.now() - self._run.zero
+        late = {label: each.to_json() for label, each in self._run.lateness.items()}
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
             self._journal.make_room()
@@ -374,12 +387,14 @@ class Engine:
                 self._run.event("INFO", "clock", str(pace))
             self._run.event("INFO" if error is None else "WARN", "end", status)
             self._run.finish_messages()
-            self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
+            self._journal.finish(
+                status=status, reason=reason, finished=finished, safe_state=safe_state, lateness=late
+            )
         # A full disk must not hide whether the devices are safe.
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace)
+        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace, late)
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:

@@ -13,6 +13,7 @@ from bench.devices import Signal
 from bench.errors import AbortError, ConfigurationError
 from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
+from bench.lateness import Lateness
 from bench.protocol.changes import PARAMETER, ParameterChange
 from bench.protocol.vocabulary import LATENESS, TRACES, Reading
 from bench.questions import ABORT, AT_A_PAUSE, NOBODY, NOTE, OFF, RESUME, SET, STEP, Question
@@ -48,8 +49,16 @@ class RunRecord(Protocol):
     def make_room(self) -> None:
         """Give back the space that is kept for the end of the run."""
 
-    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
-        """Keep how the run ended."""
+    def finish(
+        self,
+        *,
+        status: str,
+        reason: str,
+        finished: float,
+        safe_state: Mapping[str, str],
+        lateness: Mapping[str, object],
+    ) -> None:
+        """Keep how the run ended, and how late its loops were."""
 
 
 class Observer(Protocol):
@@ -120,6 +129,8 @@ class RunAtHand:
         What a controller thinks, for the record.
     zero : float
         Time of the clock at which the record begins to count, s.
+    lateness : dict of str to Lateness
+        How late the samples of loops were, by label.
     parameters : ParametersAtHand or None
         The parameters of the protocol, for changes at a pause.
     """
@@ -148,11 +159,19 @@ class RunAtHand:
         self._observers = tuple(observers)
         self._interrupts = interrupts
         self._messages = messages
+        self.lateness: dict[str, Lateness] = {}
         self.parameters: ParametersAtHand | None = None
         self._pause_reason = ""
         self._is_demanded = False
         self._one_step = False
         self._on_again = -math.inf
+
+    def keep_lateness(self, label: str, lateness: Lateness) -> None:
+        """Add to what the record says of how late the samples of loops were, by their label."""
+        if label in self.lateness:
+            self.lateness[label].merge(lateness)
+        else:
+            self.lateness[label] = lateness
 
     def expect_ticks(self, what: str) -> None:
         """Promise the station a request with each tick."""

@@ -261,7 +261,7 @@ def carry_out(
             engine.warn(warnings)
         outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
-            dashboard.finish(outcome.status, outcome.reason)
+            dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
 

@@ -39,7 +39,7 @@ def rebuild(record: Record, path: Path) -> None:
             writer.write(entries[start : start + CHUNK_ROWS])
         writer.write(models)
         if "status" in meta:
-            writer.write([End(str(meta["status"]), str(meta.get("reason", "")))])
+            writer.write([End(str(meta["status"]), str(meta.get("reason", "")), meta.get("lateness", {}))])
     finally:
         writer.recording.close()
 

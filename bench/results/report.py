@@ -16,6 +16,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.extras import needed_for
 from bench.hysteresis import MemoryCurve
 from bench.journal import Record, Table, expected_steps, run_card
+from bench.lateness import lateness_lines
 from bench.model_file import ModelFile
 from bench.printing import print_plain
 from bench.results.data import write_csv
@@ -92,6 +93,8 @@ def report_run(
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
         _print_events(record, console)
+        for line in lateness_lines(record.meta.get("lateness", {})):
+            print_plain(console, line)
         figures = _draw_run(record, steps, folder, figure_format)
         applied = apply_models(record, steps, [*models_of(record), *models]) if len(steps) else []
         comparison = {
@@ -118,6 +121,7 @@ def report_run(
         "safe_state": record.meta.get("safe_state", {}),
         "extremes": extremes,
         "models": comparison,
+        "lateness": record.meta.get("lateness", {}),
         **control,
         "figures": [str(path) for path in [*figures, *more]],
         "page": None if page is None else str(page),
