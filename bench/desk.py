@@ -97,7 +97,8 @@ def parse_command(line: str) -> Command:
         elif word == "note" and rest:
             return Remark(" ".join(rest))
         elif not rest and word in ("hold", "safe", "off", "quit", "q"):
-            return {"hold": HoldAll(), "safe": Rest(), "off": Rest()}.get(word, Leave())
+            commands: dict[str, Command] = {"hold": HoldAll(), "safe": Rest(), "off": Rest()}
+            return commands.get(word, Leave())
     except ValueError:
         pass
     expected = SYNTAX.get(word)

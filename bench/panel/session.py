@@ -15,10 +15,11 @@ from bench.protocol.vocabulary import ByHand
 from bench.runs import Run, RunResult, carry_out
 
 
-class _Log(io.TextIOBase):
+class _Log(io.StringIO):
     """Takes what a run prints for the log of the panel."""
 
     def __init__(self, desk: Desk) -> None:
+        super().__init__()
         self._desk = desk
 
     def write(self, text: str) -> int:

@@ -1,4 +1,4 @@
-"""The rate of a loop against the number of devices in it: CPU time in process, and the rate on the wall clock over ptys.
+"""The rate of a loop against the number of its devices: CPU time in process, and the rate over ptys.
 
 Prints a table; asserts that a device costs as much as any other, not how much.
 """
