@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
 from bench.control.opposite_output import OppositeOutput
+from bench.control.supervision import Supervised
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
@@ -123,6 +124,51 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
         known = ", ".join(controller_names(task)) or "none"
         raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
     return registry.load("controllers", f"{task}.{name}").make(replace(setup, name=name))
+
+
+Fallback = Literal["none", "open-loop"]
+"""What takes the place of a controller that does not converge: nothing, which ends the run, or the open loop."""
+
+
+def make_supervised(
+    task: str,
+    name: str,
+    setup: ControllerSetup,
+    *,
+    span: float,
+    fallback: Fallback = "none",
+    **options: Any,  # noqa: ANN401
+) -> Supervised:
+    """Return a target controller by name, which is given up when it does not converge.
+
+    Parameters
+    ----------
+    task, name, setup
+        As in `make_controller`.
+    span : float
+        Range of the targets, output units.
+    fallback : {"none", "open-loop"}
+        See `Fallback`.
+    options
+        Numbers of the open loop in place of its defaults.
+
+    Raises
+    ------
+    ConfigurationError, DataError
+        As `make_controller`, for the controller or for its fallback.
+    """
+    controller = make_controller(task, name, setup)
+    if fallback == "none":
+        return Supervised(controller, setup.limits, span)
+    opened = replace(setup, options=options)
+    # What it needs of the model is known before anything moves.
+    make_controller(task, _OPEN, opened)
+    return Supervised(
+        controller, setup.limits, span, lambda state: make_controller(task, _OPEN, replace(opened, state=state))
+    )
+
+
+_OPEN = "open-loop-inverse"
 
 
 @dataclass(frozen=True)
