@@ -17,6 +17,7 @@ from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
+from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
@@ -46,6 +47,8 @@ class ControllerSetup:
         Which answer of the inverse is taken where there are several.
     options : mapping
         Numbers of the controller in place of its defaults, and others that the task has.
+    adaptation : {"off", "session", "density"}
+        How the model is corrected while it is used.
     """
 
     name: str = ""
@@ -54,6 +57,7 @@ class ControllerSetup:
     state: Any = None
     policy: Policy = "nearest"
     options: Mapping[str, Any] = field(default_factory=dict)
+    adaptation: AdaptationName = "off"
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -76,6 +80,16 @@ class ControllerSetup:
         inverse.invert(operator.initial_state(), 0.5 * sum(operator.output_range()))
         return inverse
 
+    def model_filter(self) -> ModelFilter | None:
+        """Return what corrects the model while it is used, None if nothing does.
+
+        Raises DataError if the model is not of the kind that this needs.
+        """
+        try:
+            return model_filter(self.adaptation, self.model.operator)
+        except ValueError as error:
+            raise DataError(f"controller {self.name}: {error}") from None
+
     @property
     def spans(self) -> Spans:
         """Widths of the model's ranges."""
@@ -96,11 +110,12 @@ class ControllerSetup:
 class ControllerSpec:
     """An entry of the group `bench.controllers`: a one-line summary, and what makes the controller of a setup.
 
-    `make` raises a DataError that says what kind of model it needs.
+    `make` raises a DataError that says what kind of model it needs. One that `adapts` can correct its model.
     """
 
     summary: str
     make: Callable[[ControllerSetup], Any]
+    adapts: bool = False
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -115,14 +130,21 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
     Raises
     ------
     ConfigurationError
-        If there is none of this name for the task.
+        If there is none of this name for the task, or it cannot adapt its model as is asked for.
     DataError
         If the model is not of the kind that the controller needs.
     """
     if name not in controller_names(task):
         known = ", ".join(controller_names(task)) or "none"
         raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
-    return registry.load("controllers", f"{task}.{name}").make(replace(setup, name=name))
+    spec = registry.load("controllers", f"{task}.{name}")
+    if setup.adaptation != "off" and not spec.adapts:
+        others = [each for each in controller_names(task) if registry.load("controllers", f"{task}.{each}").adapts]
+        raise ConfigurationError(
+            f"controller {name} does not adapt a model (adaptation = {setup.adaptation}); these do: "
+            f"{', '.join(others) or 'none'}"
+        )
+    return spec.make(replace(setup, name=name))
 
 
 @dataclass(frozen=True)
@@ -167,22 +189,30 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
 
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s)),
+    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
+    adapts=True,
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled)),
+    lambda s: ClosedLoopInverse(
+        s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled), s.model_filter()
+    ),
+    adapts=True,
 )
 LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
 INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits, _integral(s)))
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()),
+    adapts=True,
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: ClosedLoopFollower(
+        s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()
+    ),
+    adapts=True,
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
     "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))

@@ -34,7 +34,18 @@ from bench.interrupts import Interrupts
 from bench.past import Resumption, reprime
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
-from bench.protocol.vocabulary import PROMPT, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
+from bench.protocol.vocabulary import (
+    PROMPT,
+    Control,
+    FixedRate,
+    KeptModel,
+    Message,
+    Note,
+    Phase,
+    Prompt,
+    Reading,
+    Step,
+)
 from bench.rig import Look
 from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, RunRecord, traced
 from bench.safety import SAFE
@@ -167,6 +178,8 @@ class Engine:
                     run.event("INFO", "phase", message.name)
                 elif isinstance(message, Note):
                     run.event("INFO", "note", message.text)
+                    if isinstance(message, KeptModel):
+                        run.keep_model(message.name, message.content)
                 elif type(message) in self._work:
                     run.pause_if_asked()
                     run.expect_ticks("a step is carried out")
