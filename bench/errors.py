@@ -108,7 +108,7 @@ class AgreementError(BenchError):
 
 
 class ConvergenceError(BenchError):
-    """A controller drove its actuator to and fro without end; the run was ended in the safe state."""
+    """A controller drove its actuator to and fro without end, or past its target; the run ended in the safe state."""
 
     exit_code = 10
 

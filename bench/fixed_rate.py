@@ -53,7 +53,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     read = run.station.quick_reader((*inputs, *message.watched))
     measured = row_of(inputs)
     move = run.station.mover(message.actuators)
-    samples = max(1, round(message.duration * message.rate))
+    samples = message.samples
     started = clock.now()
     values = run.tick()
     start = clock.now()
@@ -68,7 +68,8 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             values = run.tick()
             next_tick = run.tick_after(next_tick)
         run.sleep_until(due)
-        if k == samples:
+        # The controller may have put the end off.
+        if k >= samples and k >= (samples := message.samples):
             break
         if run.pause_requested:
             # The loop goes on where it stood, as if no time had passed.
@@ -115,7 +116,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     assert isinstance(controller, BlockController)
     setpoints = [f"{name}_setpoint" for name in message.actuators]
     signals = (*message.inputs, *message.watched)
-    samples = max(1, round(message.duration * message.rate))
+    samples = message.samples
     if message.block * period > run.period:
         raise ConfigurationError(
             f"a block of {message.block} samples takes {message.block * period:g} s; interlocks wait for its "
@@ -196,7 +197,7 @@ def _finish(
 ) -> Reading:
     """Tell how a loop went, of which the sum and the largest of all lateness are known, and take the reading."""
     run.trace = NOT_AT_WORK
-    samples = max(1, round(message.duration * message.rate))
+    samples = message.samples
     total, latest = lateness
     run.event(
         "INFO",

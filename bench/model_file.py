@@ -17,6 +17,10 @@ A file of version 2 is an object with these keys:
     Its state before the first row of these data, written alike; may be missing: the model's own initial state.
 `band`
     The prediction band (`Band` of `bench.identification.bands`); left out if there is none.
+`dynamics`
+    Actuator, response and noise as the transients of the data show them (`bench.control.dynamics`): objects
+    `actuator`, `response`, `noise` and `uncertainties`, the number `fastest` and the text `source`; left out if not
+    known.
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped` (first rows that did not count), `initial` (what was asked for),
     `input_sha256` (of the input column), `orientation`, errors and certificate of the fit, `bench` (version).
@@ -35,6 +39,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import DataError
 from bench.hysteresis import Operator, TimedModel, model_class, model_from_json
 
@@ -67,6 +72,8 @@ class ModelFile:
         for the operator's own initial state, and for other models.
     band : Band or None
         How far predictions may be from what is measured, if that was calibrated.
+    dynamics : IdentifiedDynamics or None
+        How actuator and response follow a set-point, and their noise, if that was identified.
     """
 
     name: str
@@ -75,6 +82,7 @@ class ModelFile:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     initial: Any = None
     band: Band | None = None
+    dynamics: IdentifiedDynamics | None = None
 
     @property
     def operator(self) -> Operator[Any]:
@@ -106,6 +114,7 @@ class ModelFile:
             "memory": None if self.memory is None else self.response.state_to_json(self.memory),
             "initial": None if self.initial is None else self.response.state_to_json(self.initial),
             **({} if self.band is None else {"band": self.band.to_json()}),
+            **({} if self.dynamics is None else {"dynamics": self.dynamics.to_json()}),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -128,7 +137,9 @@ class ModelFile:
                 f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
             )
         again = parse_model(json.loads(text), str(path)).to_json()
-        if any(again.get(key) != content.get(key) for key in ("kind", "model", "memory", "initial", "band")):
+        if any(
+            again.get(key) != content.get(key) for key in ("kind", "model", "memory", "initial", "band", "dynamics")
+        ):
             raise DataError(
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
@@ -214,7 +225,9 @@ def parse_model(content: object, source: str) -> ModelFile:
         elif memory is not None or initial is not None:
             raise ValueError(f"memory: expected none, as a {model.kind} model keeps none, got {memory or initial!r}")
         band = None if content.get("band") is None else _read_band(content["band"])
-        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial, band)
+        known = content.get("dynamics")
+        dynamics = None if known is None else IdentifiedDynamics.from_json(known)
+        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial, band, dynamics)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:

@@ -8,6 +8,7 @@ import numpy as np
 
 import bench
 from bench.control.adaptation import Adapter
+from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.hysteresis import (
     BoucWen,
     Duhem,
@@ -24,7 +25,7 @@ from bench.identification import identify
 from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
 from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, PreisachOscillator
-from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Specimen
+from bench.twin.specimen import Dynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
 from rigs.hybrid.model import identify_polynomial

@@ -50,6 +50,15 @@ class SampledController(Protocol):
 
 
 @runtime_checkable
+class DelayedController(Protocol):
+    """A `SampledController` that may need more time than was planned, as only its first readings tell."""
+
+    @property
+    def delay(self) -> float:
+        """Time by which the end of its reference is put off, s, known from the first complete reading on."""
+
+
+@runtime_checkable
 class BlockController(Protocol):
     """A controller of one or several actuators that steps a block of samples in one call, such as a compiled one."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from bench.control.play_inverse import PlayInverse
 from bench.control.references import Reference
 from bench.control.tracking import Trace, check_positive
+from bench.errors import ConvergenceError
 from bench.hysteresis import PrandtlIshlinskii, _checks
 from bench.hysteresis._checks import Floats
 
@@ -80,12 +81,28 @@ class NotchLoopParameters:
         check_positive(self)
 
 
+RESERVE = 0.05
+"""Part of the stroke that is left to the loop: a fast step lacks the creep that the slow loops of a model contain."""
+
+_JUDGED = 0.05
+"""Least step of the reference that is judged by its overshoot, as a part of the stroke."""
+_OVERSHOOT = 0.05
+"""Overshoot of a step from which on the loop is not the one that was designed, which has none."""
+_LASTING = 0.5e-3
+"""Time for which it lasts then, s; noise does not."""
+_AT_THE_END = 0.05
+"""Time at the end of the stroke after which the reference counts as out of reach, s."""
+
+
 class NotchLoop:
     """A `SampledController` of one actuator at a rate that resolves its resonance.
 
     Only the integral acts on the reference: fed forward, a step would ring. The notch stands behind the integral and
     before the inverse, so that inverse and actuator together are linear to it. The first reading is the output;
     others are ignored. A missing reading holds the set-point.
+
+    The loop watches itself: `update` raises `ConvergenceError` where a step overshoots, as it does with a sensor that
+    lags or a line that delays, and where the actuator stays at the end of its stroke.
 
     Parameters
     ----------
@@ -124,26 +141,63 @@ class NotchLoop:
         self._wanted = math.nan
         self._setpoint = self._inverse.input(0.0)
         self._measured = math.nan
+        self._height = 0.0
+        self._rate = p.rate
+        self._beyond = self._stopped = 0
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Lowest and highest reference that the loop can hold, output units from rest; a reserve is left to it."""
+        share = 1.0 - RESERVE
+        return share * self._inverse.low, share * self._inverse.high
 
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float]:
-        """Take the output (first of the readings) at a time (s) and return the set-point."""
+        """Take the output (first of the readings) at a time (s) and return the set-point.
+
+        Raises `ConvergenceError` if the loop does not do what it was designed for.
+        """
         y = measured[0]
         if not math.isfinite(y):
             return (self._setpoint,)
         if math.isnan(self._start):
             self._start = t
-        self._wanted = wanted = self._reference(t - self._start)
+        wanted = self._reference(t - self._start)
+        if wanted != self._wanted:
+            # The first reference is a start, not a step.
+            self._height = 0.0 if math.isnan(self._wanted) else wanted - self._wanted
+        self._wanted = wanted
         self._measured = y
         inverse = self._inverse
         # Held within the stroke, the integral does not wind up.
         x = self._integral + self._gain * (wanted - y)
-        x = inverse.low if x < inverse.low else inverse.high if x > inverse.high else x
-        self._integral = x
+        clipped = inverse.low if x < inverse.low else inverse.high if x > inverse.high else x
+        self._watch(y - wanted, stopped=clipped != x)
+        self._integral = x = clipped
         out = self._b0 * x + self._s1
         self._s1 = self._b1 * x - self._a1 * out + self._s2
         self._s2 = self._b2 * x - self._a2 * out
         self._setpoint = inverse.input(out)
         return (self._setpoint,)
+
+    def _watch(self, error: float, *, stopped: bool) -> None:
+        """Raise `ConvergenceError` if a step overshoots, or the actuator stays at the end of its stroke."""
+        self._stopped = self._stopped + 1 if stopped else 0
+        if self._stopped > _AT_THE_END * self._rate:
+            raise ConvergenceError(
+                f"the actuator is at the end of its stroke, {abs(error):.3g} short of the reference "
+                f"{self._wanted:g}; the loop reaches {self.reach[0]:.3g} to {self.reach[1]:.3g}"
+            )
+        height = self._height
+        if abs(height) < _JUDGED * (self._inverse.high - self._inverse.low):
+            return
+        overshoot = error / height
+        self._beyond = self._beyond + 1 if overshoot > _OVERSHOOT else 0
+        if self._beyond > _LASTING * self._rate:
+            raise ConvergenceError(
+                f"the output is {100.0 * overshoot:.1f} % beyond a step of {height:g}, for which the loop is "
+                f"designed without overshoot (at most {100.0 * _OVERSHOOT:g} %): the sensor lags or the line delays "
+                "by more than the loop bears, or the model is that of another specimen; lower its integral gain"
+            )
 
     @property
     def trace(self) -> Trace:

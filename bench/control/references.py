@@ -216,6 +216,41 @@ class AddedSine:
         return self._base(t) + self._amplitude * _blend(0.5 * periods) * math.sin(2.0 * math.pi * periods)
 
 
+class ApproachedReference:
+    """A reference that begins where the output is, where that is far from its own beginning.
+
+    Parameters
+    ----------
+    reference : callable
+        The other reference.
+    near : float
+        Distance from its beginning, output units, up to which it is left as it is.
+    speed : float
+        Top speed of the move to its beginning, output units per second.
+    """
+
+    def __init__(self, reference: Reference, near: float, speed: float) -> None:
+        self._reference = reference
+        self._near = near
+        self._speed = speed
+        self._approach: SmoothMoves | None = None
+        self.delay = 0.0
+        """Time by which the other reference is put off, s."""
+
+    def begin(self, output: float) -> None:
+        """Begin at the output of the moment (output units)."""
+        first = self._reference(0.0)
+        if abs(output - first) > self._near:
+            self._approach = SmoothMoves([output, first], self._speed, hold=0.0)
+            self.delay = self._approach.duration
+
+    def __call__(self, t: float) -> float:
+        """Return the position at a time (s), output units."""
+        if self._approach is not None and t < self.delay:
+            return self._approach(t)
+        return self._reference(t - self.delay)
+
+
 @dataclass(frozen=True)
 class Slope:
     """How fast the input must move for a reference.

@@ -28,7 +28,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.control.loops import BlockController, ControlTask, SampledController
+from bench.control.loops import BlockController, ControlTask, DelayedController, SampledController
 from bench.devices import Signal
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
 
@@ -176,6 +176,9 @@ class FixedRate(Message):
         Samples in a second, Hz.
     duration : float
         How long it goes on, s.
+    put_off : float
+        Longest time by which the controller may put the end off, s: it does so by its `delay`, if it is a
+        `DelayedController`; 0 for not at all.
     inputs : tuple of str
         Signals that the controller sees, in its order.
     actuators : tuple of str
@@ -205,8 +208,16 @@ class FixedRate(Message):
     record_every: int = 1
     label: str = ""
     block: int = 0
+    put_off: float = 0.0
 
     def __post_init__(self) -> None:
+        if not (0 <= self.put_off < math.inf) or (
+            self.put_off and (self.block or not isinstance(self.controller, DelayedController))
+        ):
+            raise ValueError(
+                "FixedRate: expected put_off ≥ 0, and without blocks a controller with a delay where it is not 0, "
+                f"got {self.put_off}"
+            )
         if self.block < 0 or (self.block and not isinstance(self.controller, BlockController)):
             raise ValueError(
                 f"FixedRate: expected block ≥ 0, and a controller with step_block where it is not 0, got {self.block}"
@@ -221,12 +232,18 @@ class FixedRate(Message):
                 f"FixedRate: expected limits for each of {len(self.actuators)} actuators, got {len(self.limits)}"
             )
 
+    @property
+    def samples(self) -> int:
+        """Number of samples as far as is known: more once the controller has put the end off."""
+        delay = self.controller.delay if isinstance(self.controller, DelayedController) and self.put_off else 0.0
+        return max(1, round((self.duration + min(delay, self.put_off)) * self.rate))
+
     def plan(self) -> Planned:
         """Return the limits of its set-points and its duration."""
         setpoints = (f"{name}_setpoint" for name in self.actuators)
         return Planned(
             seconds=self.duration,
-            at_most=self.duration,
+            at_most=self.duration + self.put_off,
             extremes=dict(zip(self.actuators, self.limits, strict=False)),
             watched=frozenset({*self.inputs, *self.watched, *setpoints}),
         )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import (
     Coverage,
@@ -46,6 +47,7 @@ from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
 from bench.results.times import bind_times, check_model_name, read_times, time_quantity
 from bench.timed import identify_in_time
+from bench.transients.identification import identify_dynamics, read_transients
 
 Floats = npt.NDArray[np.float64]
 
@@ -334,7 +336,8 @@ def identify_file(
         "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
-    file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated)
+    dynamics = None if times is not None else _dynamics(paths, input_column, output_column, found.model)
+    file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated, dynamics)
     return IdentifiedFile(
         file,
         found,
@@ -348,6 +351,13 @@ def identify_file(
         columns.assumptions,
         times,
     )
+
+
+def _dynamics(paths: Sequence[Path], drive: str, response: str, model: Operator[Any]) -> IdentifiedDynamics | None:
+    """Return the dynamics that the transients of runs show; None of tables, which have none."""
+    runs = [path for path in paths if path.is_dir() or path.suffix == ".sqlite"]
+    found = [recording for path in runs if (recording := read_transients(path, drive, response)) is not None]
+    return identify_dynamics(found, [model.evaluate] * len(found)) if found else None
 
 
 def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
-from bench.twin.actuator import MEDIAN_OF_DIFFERENCES, at_rows, latency
-from bench.twin.recording import Recording
+from bench.transients.actuator import MEDIAN_OF_DIFFERENCES, at_rows, latency
+from bench.transients.recording import Recording
 from bench.twin.specimen import Dynamics, Specimen, Wander
 
 _LAGS = (0.3, 1.0, 3.0, 8.0, 20.0, 60.0)

@@ -17,10 +17,11 @@ from bench.hysteresis import Operator
 from bench.identification import cross_validate, identify
 from bench.model_file import load_model
 from bench.rig_file import RigFile
-from bench.twin.actuator import IdentifiedActuator, grid_step, identify_actuator
+from bench.transients.actuator import IdentifiedActuator, grid_step, identify_actuator
+from bench.transients.recording import Recording
 from bench.twin.disturbances import Noise, identify_disturbances, noise_of
 from bench.twin.reading_time import ReadingTime, time_readings
-from bench.twin.recording import Recording, read_recording, slots_of_twin
+from bench.twin.recording import read_recording, slots_of_twin
 from bench.twin.response import IdentifiedResponse, identify_response
 from bench.twin.specimen import Dynamics, Unevenness, Wander
 from bench.twin.unevenness import identify_unevenness

@@ -15,7 +15,7 @@ from bench.errors import BenchError
 from bench.journal import StepRecord
 from bench.protocol import Dwell, Note, Phase, Reading, Step, find_protocol
 from bench.rig_file import RigFile
-from bench.twin.recording import Recording
+from bench.transients.recording import Recording
 
 _FEWEST = 3
 

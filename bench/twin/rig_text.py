@@ -165,7 +165,7 @@ def _comments(twin: IdentifiedTwin) -> Iterator[str]:
 
 
 def _grid(twin: IdentifiedTwin) -> float:
-    from bench.twin.actuator import grid_step
+    from bench.transients.actuator import grid_step
 
     return grid_step(twin.actuator.dynamics)
 

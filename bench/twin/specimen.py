@@ -8,80 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.deferred import DeferredModule
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 
 if TYPE_CHECKING:
-    from bench.twin import _kernels
+    from bench.transients import _kernels
 else:
-    _kernels = DeferredModule("bench.twin._kernels")
-
-
-@dataclass(frozen=True)
-class ActuatorDynamics:
-    """How the drive follows its set-point.
-
-    The position x follows the set-point by x'' = frequency² (set-point - x) - 2 damping frequency x', or by
-    x' = frequency (set-point - x) if the damping is 0, or at once if the frequency is 0; |x'| is at most `rate`. What
-    the drive does is offset + gain x.
-
-    Attributes
-    ----------
-    delay : float
-        From the set-point to its first effect, s.
-    frequency : float
-        Natural frequency, or the inverse of the time constant, rad/s.
-    damping : float
-        Damping ratio.
-    rate : float
-        Fastest change, input units per s; infinite if none was found.
-    gain, offset : float
-        Drive against set-point at rest; 1 and 0 for an ideal one.
-    """
-
-    delay: float = 0.0
-    frequency: float = 0.0
-    damping: float = 0.0
-    rate: float = math.inf
-    gain: float = 1.0
-    offset: float = 0.0
-
-    @property
-    def order(self) -> int:
-        """Order of the differential equation: 0, 1 or 2."""
-        return 0 if self.frequency == 0.0 else 1 if self.damping == 0.0 else 2
-
-    @property
-    def overshoot(self) -> float:
-        """Overshoot of a small step, as a share of it."""
-        if self.order < 2 or self.damping >= 1.0:
-            return 0.0
-        return math.exp(-math.pi * self.damping / math.sqrt(1.0 - self.damping**2))
-
-
-@dataclass(frozen=True)
-class ResponseDynamics:
-    """How the response follows the drive, beside the hysteresis.
-
-    Attributes
-    ----------
-    lag : float
-        Time constant between drive and hysteresis, s; 0 for none. It acts on |x|^power: 2 is that of heat by a
-        current or voltage.
-    power : {1, 2}
-        See `lag`.
-    gain : float
-        Part of what the hysteresis gives that comes at once.
-    shares, times : tuple of float
-        Parts of it that come late, and their time constants, s.
-    """
-
-    lag: float = 0.0
-    power: float = 1.0
-    gain: float = 1.0
-    shares: tuple[float, ...] = ()
-    times: tuple[float, ...] = ()
+    _kernels = DeferredModule("bench.transients._kernels")
 
 
 @dataclass(frozen=True)

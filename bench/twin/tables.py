@@ -7,10 +7,11 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.devices import Signal
 from bench.hysteresis import Operator, operator_from_json
 from bench.rig_file import LaboratorySettings
-from bench.twin.specimen import ActuatorDynamics, Dynamics, ResponseDynamics, Unevenness, Wander
+from bench.twin.specimen import Dynamics, Unevenness, Wander
 
 
 class _Table(BaseModel):

@@ -16,8 +16,8 @@ import numpy as np
 
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
+from bench.transients.recording import Recording
 from bench.twin.disturbances import Noise, Part
-from bench.twin.recording import Recording
 from bench.twin.specimen import Dynamics, Unevenness
 
 _GAPS = (1, 3, 10, 30, 100)

@@ -18,6 +18,8 @@ ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
 
 REST = 5.0
 """Time at the start before the reference begins to move, s."""
+APPROACH = 200.0
+"""Longest time in which the tip comes from where it rests to the beginning of the reference, s."""
 REACH = 199e-6
 """Farthest position of either sign, m; the displacement sensor sees no farther."""
 
@@ -51,7 +53,7 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
 
     The thermal part takes the range, the piezo part the accuracy. References are smooth moves from position to
     position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
-    a hold at 0.
+    a hold at 0. Where the tip rests far from 0, as in a warm room, a smooth move to 0 comes first.
     """
     reference, duration = _reference(parameters)
     controller = make_controller("hybrid", parameters.controller, _setup(parameters, reference))
@@ -65,6 +67,7 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
         watched=_watched(parameters, slots),
         record_every=max(1, round(parameters.rate / parameters.record_rate)),
         label=parameters.reference,
+        put_off=APPROACH,
     )
 
 
@@ -78,6 +81,7 @@ class StepParameters(ProtocolParameters):
     rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
     duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")
     rate: float = parameter(20e3, unit="Hz", low=2000, high=1e6, help="samples in a second")
+    integral: float = parameter(300.0, unit="1/s", low=1, high=1000, help="gain of the loop's integral")
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
@@ -86,10 +90,19 @@ def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 
     The notch lies at the resonance of the model; the hysteresis is inverted. The rate is for an emulated rig on the
-    virtual clock.
+    virtual clock. A step beyond the stroke, less a reserve for the loop, is refused; one that overshoots ends the
+    run.
     """
-    setup = _setup(parameters, lambda t: parameters.step if t >= parameters.rest else 0.0)
+    setup = _setup(
+        parameters, lambda t: parameters.step if t >= parameters.rest else 0.0, integral=parameters.integral
+    )
     controller = make_controller("hybrid-fine", "notch", setup)
+    low, high = controller.reach
+    if not low <= parameters.step <= high:
+        raise ValueError(
+            f"step: the piezo part of {Path(parameters.model).name} reaches {low:.3g} to {high:.3g} m within a fast "
+            f"loop, got {parameters.step:g} m"
+        )
     yield Phase("fine step")
     yield FixedRate(
         controller=controller,
@@ -110,11 +123,11 @@ def _watched(parameters: Parameters | StepParameters, slots: Slots) -> tuple[str
     return (slots["witness"].signal,)
 
 
-def _setup(parameters: Parameters | StepParameters, reference: Reference) -> ControllerSetup:
+def _setup(parameters: Parameters | StepParameters, reference: Reference, **options: float) -> ControllerSetup:
     return ControllerSetup(
         model=load_model(Path(parameters.model), "hybrid"),
         limits=(-math.inf, math.inf),
-        options={"reference": reference, "rate": parameters.rate},
+        options={"reference": reference, "rate": parameters.rate, **options},
     )
 
 

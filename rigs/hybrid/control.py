@@ -21,7 +21,7 @@ import numpy as np
 from bench.control.loops import SampledController
 from bench.control.notch_loop import NotchLoop, NotchLoopParameters
 from bench.control.play_inverse import PlayInverse
-from bench.control.references import Reference
+from bench.control.references import ApproachedReference, Reference
 from bench.control.tracking import Trace, check_positive
 from bench.controllers import ControllerSpec
 from rigs.hybrid.estimates import (
@@ -37,6 +37,10 @@ from rigs.hybrid.model import HybridModel
 
 STROKE = 9e-6
 """Largest deflection of either sign that the piezo part is asked for, m."""
+_NEAR = 0.5
+"""Part of the stroke within which the piezo part takes the tip to the beginning of the reference at once."""
+_AT_REST = 0.2
+"""Difference of base and tip below which the rig counts as having rested before the start, K."""
 _ROOM = 4
 """Room for the reference that comes, in lengths of the known one."""
 _THERMAL_GAIN = 3e4
@@ -108,6 +112,8 @@ class MidRangingParameters:
     """Gain of the piezo part's integral, 1/s, below half the rate of the calls."""
     stroke: float = STROKE
     """Greatest deflection of either sign that the piezo part is asked for, m."""
+    approach: float = 3e-6
+    """Top speed of the move to the beginning of the reference, where that is far from the start, m/s."""
 
     def __post_init__(self) -> None:
         check_positive(self)
@@ -142,13 +148,12 @@ class _MidRanging:
         integral: float = 0.0,
     ) -> None:
         self._p = parameters
-        self._reference = reference
-        self._celsius = model.reference
-        self._bending, self._network = Bending(model.polynomial), ReducedNetwork(model.network, model.reference)
-        self._estimate = estimate(self._bending, self._network)
-        self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
+        self._model = model
+        self._make_estimate = estimate
+        self._reference = ApproachedReference(reference, _NEAR * parameters.stroke, parameters.approach)
         self._step = parameters.period * parameters.every
-        self._preview = _Preview(reference, parameters.window, parameters.lead, self._step)
+        self._prepare(model.reference)
+        self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
         self._integral_gain = integral * parameters.period
         self._integral = 0.0
         self._fed_back = 0.0
@@ -158,6 +163,28 @@ class _MidRanging:
         self._voltage = 0.0 if inverse is None else inverse.input(0.0)
         self._wanted = math.nan
         self._base = self._tip = math.nan
+
+    def _prepare(self, room: float) -> None:
+        """Make all that depends on the temperature of the room (°C) and on where the reference begins."""
+        model, p = self._model, self._p
+        self._celsius = room
+        self._bending = Bending(model.polynomial, room - model.reference)
+        self._network = ReducedNetwork(model.network, room)
+        self._estimate = self._make_estimate(self._bending, self._network)
+        self._preview = _Preview(self._reference, p.window, p.lead, self._step)
+
+    @property
+    def delay(self) -> float:
+        """Time by which the reference is put off, as its beginning has to be approached first, s."""
+        return self._reference.delay
+
+    def _begin(self, t: float, deflection: float, base: float, tip: float) -> None:
+        """Begin at the first readings: deflection without the piezo part (m), temperatures (°C)."""
+        self._start = t
+        self._reference.begin(deflection)
+        # A rig that has rested is as warm as the room. Otherwise the room is that of the model.
+        self._prepare(0.5 * (base + tip) if abs(base - tip) < _AT_REST else self._model.reference)
+        self._estimate.begin(deflection, base - self._celsius, tip - self._celsius)
 
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
         """Take deflection (m) and temperatures of base and tip (°C) at a time (s); return current and voltage.
@@ -169,11 +196,10 @@ class _MidRanging:
         deflection, base, tip = measured
         complete = math.isfinite(deflection + base + tip)
         if complete:
-            self._base, self._tip = base - self._celsius, tip - self._celsius
             piezo = 0.0 if self._inverse is None else self._inverse.output
             if math.isnan(self._start):
-                self._start = t
-                self._estimate.begin(deflection - piezo, self._base, self._tip)
+                self._begin(t, deflection - piezo, base, tip)
+            self._base, self._tip = base - self._celsius, tip - self._celsius
             self._estimate.sample(deflection - piezo)
         elif math.isnan(self._start):
             return self._current, self._voltage
@@ -319,4 +345,7 @@ HYBRID_LOW_PASS = _mid_ranging(
 )
 OPEN_LOOP = _mid_ranging("the inverse of the model, without the deflection sensor", OpenLoopHybrid)
 THERMAL_FEEDBACK = _mid_ranging("feedback to the thermal part alone", ThermalFeedback, gain=_THERMAL_GAIN)
-NOTCH = _spec("the piezo part alone, with a notch at its resonance", make_fine)
+NOTCH = ControllerSpec(
+    "the piezo part alone, with a notch at its resonance",
+    lambda s: make_fine(s.model.model, s.options["reference"], s.options["rate"], integral=s.options["integral"]),
+)

@@ -1,6 +1,6 @@
 """Estimates of the thermal deflection: the model in single numbers, and the filters that the controllers choose from.
 
-Units are SI; rises are temperatures above the reference of the model, in K, and a positive current heats.
+Units are SI; rises are temperatures above that of the room at the start, in K, and a positive current heats.
 
 Sources: Rakotondrabe and Ivan, "Development and dynamic modeling of a new hybrid thermo-piezoelectric
 micro-actuator", IEEE Transactions on Robotics 26(6), 2010 (the model); Julier and Uhlmann, "Unscented filtering and
@@ -24,19 +24,28 @@ _TABLE = 2001
 
 
 class Bending:
-    """The thermal deflection and its inverse for single values, beyond the fitted range along the end's tangent."""
+    """The thermal deflection and its inverse for single values, beyond the fitted range along the end's tangent.
 
-    def __init__(self, polynomial: Polynomial) -> None:
-        self.low, self.high = polynomial.input_range
-        self._rises = np.linspace(self.low, self.high, _TABLE)
-        self._deflections = polynomial.evaluate(self._rises) - polynomial.evaluate([0.0])[0]
-        falls = np.diff(self._deflections)
+    Parameters
+    ----------
+    polynomial : Polynomial
+        Deflection (m) over the rise above the reference of the model (K).
+    zero : float
+        Rise above that reference from which rises are counted here, K.
+    """
+
+    def __init__(self, polynomial: Polynomial, zero: float = 0.0) -> None:
+        low, high = polynomial.input_range
+        self.low, self.high = low - zero, high - zero
+        rises = np.linspace(low, high, _TABLE)
+        deflections = polynomial.evaluate(rises) - polynomial.evaluate([0.0])[0]
+        falls = np.diff(deflections)
         if not (falls < 0.0).all() and not (falls > 0.0).all():
             raise ValueError(
-                f"polynomial: expected one that rises or falls all over its range, {self.low:g} to {self.high:g} K"
+                f"polynomial: expected one that rises or falls all over its range, {low:g} to {high:g} K"
             )
         order = slice(None) if falls[0] > 0.0 else slice(None, None, -1)
-        self._sorted: tuple[list[float], list[float]] = self._deflections[order].tolist(), self._rises[order].tolist()
+        self._sorted: tuple[list[float], list[float]] = deflections[order].tolist(), (rises[order] - zero).tolist()
         # Powers of the rise mapped to [-1, 1].
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         series = np.append(polynomial.bias - polynomial.evaluate([0.0])[0], polynomial.series)
@@ -76,10 +85,17 @@ class ReducedNetwork:
     """The thermal network in single numbers, reduced to base and tip, with one node for the block.
 
     The block is ten times slower than the rest. It is simulated from the current, in open loop, and not estimated.
+
+    Parameters
+    ----------
+    network : ThermalNetwork
+        The whole network.
+    room : float
+        Temperature of the air, and of everything at the start, from which rises are counted, °C.
     """
 
-    def __init__(self, network: ThermalNetwork, reference: float) -> None:
-        self.kelvin = reference - ABSOLUTE_ZERO
+    def __init__(self, network: ThermalNetwork, room: float) -> None:
+        self.kelvin = room - ABSOLUTE_ZERO
         self._network = network
         self.base_capacity, self.tip_capacity = (float(c) for c in network.capacities[2:])
         self.base_air, self.tip_air = (float(g) for g in network.air_conductances[2:])

@@ -66,6 +66,12 @@ FaultName = Literal[
 class HybridLaboratorySettings(LaboratorySettings):
     """Settings of this laboratory in a rig file."""
 
+    ambient: float = Field(
+        default=HybridParameters.ambient_temperature,
+        ge=5,
+        le=45,
+        description="mean temperature of the room in which the rig stands from long before the start, °C",
+    )
     ambient_deviation: float = Field(
         default=HybridParameters.ambient_sd, ge=0, le=5, description="standard deviation of the room temperature, K"
     )
@@ -111,7 +117,12 @@ class HybridLaboratory(EmulatedLaboratory):
         plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
         self._settings = settings
         self.plant = HybridCantilever(
-            HybridParameters(ambient_sd=settings.ambient_deviation, resonance_offset=settings.resonance_offset), plant
+            HybridParameters(
+                ambient_temperature=settings.ambient,
+                ambient_sd=settings.ambient_deviation,
+                resonance_offset=settings.resonance_offset,
+            ),
+            plant,
         )
         compile_loops(self.plant, _use)
         self.world = World(self.plant, clock)

@@ -120,13 +120,13 @@ def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> 
         If a run did not complete, or a model cannot be identified.
     """
     folders = {protocol: run.result().folder for protocol, run in runs.items()}
-    *sources, verification = folders.values()
     resting = read_resting(folders["force-voltage"])
-    series = [*read_series(folders["length-voltage"]), *read_series(folders["length-force"])]
+    lengths = [folders["length-voltage"], folders["length-force"]]
+    series = [one for run in lengths for one in read_series(run)]
     models = {name: identify_muscle(name, resting, series) for name in MODELS}
     for name, found in models.items():
-        muscle_file(name, found, sources).save(campaign.folder / f"{name}.json")
-    return Characterization(resting, series, read_series(verification), models)
+        muscle_file(name, found, folders["force-voltage"], lengths).save(campaign.folder / f"{name}.json")
+    return Characterization(resting, series, read_series(folders["length-verification"]), models)
 
 
 def errors_table(title: str, path: str = "{}", *, beside_paper: bool = False) -> ResultTable:

@@ -8,6 +8,7 @@ Everything is in V, N and m.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,8 +16,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import DataError
-from bench.hysteresis import PrandtlIshlinskii
+from bench.hysteresis import PrandtlIshlinskii, TwoStage
 from bench.identification import Errors
 from bench.identification.two_stage import (
     CoupledIdentification,
@@ -27,11 +29,13 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.model_file import ModelFile
+from bench.transients.identification import identify_dynamics, noise_of, read_transients
 from protocols.muscles.parts import SAMPLE
 
 Floats = npt.NDArray[np.float64]
 
 VOLTAGE = "supply_setpoint"
+VOLTAGE_READING = "supply_voltage"
 FORCE = "load_cell_force"
 LENGTH = "wire_end_position"
 
@@ -125,17 +129,51 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         raise DataError(f"model {name} cannot be identified: {error}") from error
 
 
-def muscle_file(name: ModelName, found: CoupledIdentification[Any], sources: Sequence[Path]) -> ModelFile:
-    """Return the model file of an identification; `sources` are the runs that it comes from."""
+def identify_muscle_dynamics(
+    model: TwoStage, force_run: Path, length_run: Path | None = None
+) -> IdentifiedDynamics | None:
+    """Identify how a muscle follows its voltage, from the transients of a run with held ends.
+
+    There the force has least error of the model. A run under weights tells the noise of the length. None if the run
+    has no quick readings between its steps.
+    """
+    recording = read_transients(force_run, VOLTAGE_READING, FORCE)
+    if recording is None:
+        return None
+    samples = [step for step in recording.steps if step.label == SAMPLE]
+    part = recording.within(samples[0].started, samples[-1].finished)
+    found = identify_dynamics([part], [model.first.evaluate], ("voltage", "force"))
+    lengths = None if length_run is None else read_transients(length_run, VOLTAGE_READING, LENGTH)
+    if lengths is None:
+        return found
+    return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
+
+
+def muscle_file(
+    name: ModelName, found: CoupledIdentification[Any], force_run: Path, length_runs: Sequence[Path]
+) -> ModelFile:
+    """Return the model file of an identification from runs, with the dynamics if the model is of two stages."""
+    sources = [force_run, *length_runs]
+    under_weights = [run for run in length_runs if protocol_of(run) == "length-voltage"]
+    dynamics = None
+    if isinstance(found.model, TwoStage):
+        dynamics = identify_muscle_dynamics(found.model, force_run, next(iter(under_weights), None))
     return ModelFile(
         name,
         found.model,
+        dynamics=dynamics,
         provenance={
             "sources": [source.name for source in sources],
             "errors": {kind: errors_json(errors) for kind, errors in found.errors.items()},
             "kkt": {stage: certificate.kkt_residual for stage, certificate in found.certificates.items()},
         },
     )
+
+
+def protocol_of(run: Path) -> str:
+    """Return the protocol of a run; empty if its record does not say it."""
+    with Record(run) as record:
+        return str(record.meta.get("protocol", ""))
 
 
 def errors_json(errors: Errors) -> dict[str, float]:

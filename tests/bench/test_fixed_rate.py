@@ -90,6 +90,14 @@ def define(*messages):
     return protocol(needs=(), controls="probe_temperature")(go)
 
 
+class Late(Controller):
+    """Puts its end off by half a second, as its first reading tells."""
+
+    @property
+    def delay(self):
+        return 0.5 if self.seen else 0.0
+
+
 class Bench:
     """A rig with its journal and engine, as a run has them."""
 
@@ -689,3 +697,22 @@ class TestTwentyKilohertz:
         ringing = samples["displacement_position"][800:4800]
         spectrum = np.abs(np.fft.rfft((ringing - ringing.mean()) * np.hanning(4000)))
         assert np.fft.rfftfreq(4000, 1 / 20e3)[20 + np.argmax(spectrum[20:])] == pytest.approx(693.7, abs=5.0)
+
+
+def test_a_controller_may_put_the_end_off(bench):
+    controllers = [Late(), Late(), Late()]
+    bench().run(
+        loop(controllers[0], put_off=2.0),
+        loop(controllers[1], put_off=0.2),
+        loop(controllers[2]),
+    )
+    assert [len(each.seen) for each in controllers] == [15, 12, 10]
+    assert np.diff(controllers[0].times) == pytest.approx(0.1)
+
+
+def test_only_a_controller_with_a_delay_puts_the_end_off():
+    assert loop(Late(), put_off=2.0).plan().at_most == 3.0
+    with pytest.raises(ValueError, match="put_off"):
+        loop(Controller(), put_off=2.0)
+    with pytest.raises(ValueError, match="put_off"):
+        loop(Late(), put_off=-1.0)

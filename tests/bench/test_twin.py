@@ -9,15 +9,16 @@ import pytest
 
 import bench
 from bench.cli import main
+from bench.control.dynamics import ActuatorDynamics
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import PrandtlIshlinskii
 from bench.journal import Record
 from bench.rig_file import load_rig
-from bench.twin import _kernels
-from bench.twin.actuator import identify_actuator
+from bench.transients import _kernels
+from bench.transients.actuator import identify_actuator
+from bench.transients.recording import Recording
 from bench.twin.disturbances import noise_of
-from bench.twin.recording import Recording
-from bench.twin.specimen import ActuatorDynamics, Dynamics, Specimen, Unevenness, Wander
+from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from bench.control.notch_loop import NotchLoopParameters, notch
+from bench.control.notch_loop import NotchLoop, NotchLoopParameters, notch
+from bench.errors import ConvergenceError
+from bench.hysteresis import PrandtlIshlinskii
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 
@@ -55,3 +57,51 @@ def test_notch_takes_the_resonance_out_of_the_step():
 def test_wrong_input_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+RATE = 2e4
+STIFF = PrandtlIshlinskii(
+    np.array([0.0]), np.array([1.0]), input_range=(-10.0, 10.0), input_unit="V", output_unit="m"
+)  # without hysteresis
+
+
+def follow(size, delay, gain=1.0, reserve=10.0, seconds=0.1):
+    """Step an ideal actuator with its resonance, seen later by a number of samples; return the deflections."""
+    parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=reserve)
+    w, damping = PUBLISHED_DYNAMICS.frequency, PUBLISHED_DYNAMICS.damping
+    loop = NotchLoop(STIFF, w, damping, lambda t: size if t >= 0.01 else 0.0, parameters)
+    count = round(seconds * RATE)
+    voltages, outputs = np.zeros(count), np.zeros(count)
+    numerator, denominator, _ = signal.cont2discrete(([w * w], [1.0, 2 * damping * w, w * w]), 1 / RATE)
+    # One sample sooner: what a voltage does until the next sample.
+    section = np.array([*numerator[0, 1:], 0.0, *denominator])
+    state = np.zeros((1, 2))
+    for k in range(count):
+        seen = outputs[k - delay] if k >= delay else 0.0
+        (voltages[k],) = loop.update(k / RATE, (seen,))
+        if k + 1 < count:
+            out, state = signal.sosfilt(section[None, :], [voltages[k]], zi=state)
+            outputs[k + 1] = gain * out[0]
+    return outputs
+
+
+def test_a_step_settles_without_overshoot():
+    outputs = follow(5.0, delay=0)
+    assert outputs.max() < 5.0 * 1.02
+    assert outputs[-1] == pytest.approx(5.0, rel=1e-3)
+
+
+def test_a_delay_that_makes_it_overshoot_ends_it():
+    with pytest.raises(ConvergenceError, match=r"% beyond a step of 5.*lower its integral gain"):
+        follow(5.0, delay=40)
+
+
+def test_an_actuator_at_the_end_of_its_stroke_ends_it():
+    with pytest.raises(ConvergenceError, match=r"at the end of its stroke, 2 short of the reference 9"):
+        follow(9.0, delay=0, gain=0.7)
+
+
+def test_the_reach_is_less_than_the_stroke():
+    parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=4.0)
+    loop = NotchLoop(STIFF, PUBLISHED_DYNAMICS.frequency, 0.0039, float, parameters)
+    assert loop.reach == pytest.approx((-3.8, 3.8))

@@ -18,7 +18,7 @@ RUNS = {
     "piezo-loops": 1,
     "piezo-step": 1,
     "hybrid-excitation": 1,
-    "hybrid-control": 8,
+    "hybrid-control": 9,
     "fine-step": 3,
 }
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")

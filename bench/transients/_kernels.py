@@ -1,4 +1,4 @@
-"""The actuator of a twin, step by step on its time grid; compiled."""
+"""An actuator, step by step on its time grid; compiled."""
 
 from __future__ import annotations
 

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.control.dynamics import ActuatorDynamics
 from bench.deferred import DeferredModule
 from bench.hysteresis._checks import Floats
-from bench.twin.recording import Recording
-from bench.twin.specimen import ActuatorDynamics
+from bench.transients.recording import Recording
 
 if TYPE_CHECKING:
-    from bench.twin import _kernels
+    from bench.transients import _kernels
 else:
-    _kernels = DeferredModule("bench.twin._kernels")
+    _kernels = DeferredModule("bench.transients._kernels")
 
 GRID = 0.02
 """Step of time with which drives are simulated, s; shorter for one of a shorter time constant."""
@@ -94,11 +94,11 @@ def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float
     return at_rows(recording, out[0], initial, step, dynamics.delay)
 
 
-def identify_actuator(recordings: Sequence[Recording]) -> IdentifiedActuator:
-    """Identify the dynamics of the drive of some runs."""
+def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_PART) -> IdentifiedActuator:
+    """Identify the dynamics of the drive of some runs, of each by as long a part, s."""
     from scipy.optimize import least_squares
 
-    ends = [min(LONGEST_PART, float(each.times[-1])) for each in recordings]
+    ends = [min(longest, float(each.times[-1])) for each in recordings]
     slow = _time_scale(recordings)
 
     def simulated(dynamics: ActuatorDynamics) -> Floats:

@@ -1,0 +1,108 @@
+"""The dynamics that a model file keeps: identified from transients, and read again."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
+from bench.errors import DataError
+from bench.hysteresis import Preisach, uniform_levels
+from bench.model_file import ModelFile, parse_model
+from bench.transients.identification import identify_dynamics, noise_of
+from bench.transients.recording import Recording
+
+LEVELS = uniform_levels(0.0, 3.0, 10)
+MODEL = Preisach(LEVELS, np.linspace(0.2, 1.0, 55), 0.0, None, (0.0, 3.0))
+QUIET = 1e-3
+"""Noise of drive and response, in their units."""
+
+
+def recording(lag, power, *, period=1.0, hold=20.0, error=0.0):
+    """A drive that follows its set-point at once, and the lagged response of a specimen beside `MODEL`."""
+    rng = np.random.default_rng(1)
+    setpoints = np.abs(3.0 * np.sin(1.3 * np.arange(1, 31)))
+    changes = hold * np.arange(30.0)
+    grid = 0.01 * np.arange(1, round(30 * hold / 0.01) + 1)
+    drive = setpoints[np.searchsorted(changes, grid - 1e-9, side="right") - 1]
+    held, level = np.empty(grid.size), 0.0
+    remains = math.exp(-0.01 / lag) if lag else 0.0
+    for k, value in enumerate((drive**power).tolist()):
+        held[k] = level = value + (level - value) * remains
+    # At rest the specimen is off by an amount of its own in each hold.
+    off = error * rng.standard_normal(30)
+    response = MODEL.evaluate(held ** (1.0 / power)) + off[np.searchsorted(changes, grid - 1e-9, side="right") - 1]
+    rows = np.arange(round(period / 0.01), grid.size, round(period / 0.01)) - 1
+    noise = QUIET * rng.standard_normal((2, rows.size))
+    return Recording(
+        path=Path("run"), meta={}, signals=(), steps=(), times=grid[rows], is_reading=np.zeros(rows.size, dtype=bool),
+        columns={"drive": drive[rows] + noise[0], "response": response[rows] + noise[1]}, changes=changes,
+        setpoints=setpoints, drive="drive", response="response", ticks=(np.empty(0), np.empty(0)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_a_lag_and_its_power_are_found_beside_errors_at_rest(power):
+    found = identify_dynamics([recording(4.0, power, error=0.05)], [MODEL.evaluate])
+    assert found.actuator.order == 0
+    assert found.response.power == power
+    assert found.response.lag == pytest.approx(4.0, rel=0.05)
+    assert 0.0 < found.uncertainties["lag"] < 0.2
+
+
+def test_a_lag_that_no_reading_shows_is_none_and_said_to_be_short():
+    found = identify_dynamics([recording(0.02, 1.0)], [MODEL.evaluate])
+    assert found.response.lag == 0.0
+    assert found.fastest == pytest.approx(1.0 / 3.0, rel=0.1)
+
+
+def test_noise_is_that_of_readings_late_in_a_hold():
+    found = recording(2.0, 1.0)
+    assert noise_of(found, found.responded) == pytest.approx(QUIET, rel=0.3)
+
+
+def test_a_part_of_a_recording_keeps_the_set_point_that_stood():
+    whole = recording(2.0, 1.0)
+    part = whole.within(50.0 + whole.zero, 90.0 + whole.zero)
+    assert part.times[0] == 0.0
+    assert part.setpoints.tolist() == whole.setpoints[2:5].tolist()
+    assert part.changes[0] == 0.0
+    np.testing.assert_array_equal(part.driven, whole.driven[(whole.times >= 50.0) & (whole.times <= 90.0)])
+
+
+DYNAMICS = IdentifiedDynamics(
+    ActuatorDynamics(delay=0.1, frequency=2.0, damping=0.9),
+    ResponseDynamics(lag=4.0, power=2.0),
+    {"input": 0.01, "output": 0.5},
+    {"lag": 0.1},
+    0.7,
+    "run",
+)
+
+
+def test_dynamics_are_kept_in_a_model_file(tmp_path):
+    ModelFile("preisach", MODEL, dynamics=DYNAMICS).save(tmp_path / "model.json")
+    content = json.loads((tmp_path / "model.json").read_text(encoding="utf-8"))
+    assert content["version"] == 2
+    assert content["dynamics"]["actuator"]["rate"] is None
+    assert parse_model(content, "here").dynamics == DYNAMICS
+    del content["dynamics"]
+    assert parse_model(content, "here").dynamics is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"response": {"lag": -1.0}}, "response.lag"),
+        ({"response": {"power": 3.0}}, "power"),
+        ({"noise": {"output": math.nan}}, "noise.output"),
+        ({"actuator": {"speed": 1.0}}, "speed"),
+    ],
+)
+def test_damaged_dynamics_are_refused(change, said):
+    content = ModelFile("preisach", MODEL, dynamics=DYNAMICS).to_json()
+    content["dynamics"] |= change
+    with pytest.raises(DataError, match=said):
+        parse_model(content, "here")
