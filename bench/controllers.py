@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
@@ -25,6 +25,9 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
 from bench.hysteresis.falling_inverse import FallingInverse
 from bench.model_file import ModelFile, load_model
+
+if TYPE_CHECKING:
+    from bench.control.predictive import PredictiveFollower
 
 T = TypeVar("T")
 
@@ -49,6 +52,8 @@ class ControllerSetup:
         Numbers of the controller in place of its defaults, and others that the task has.
     adaptation : {"off", "session", "density"}
         How the model is corrected while it is used.
+    period : float
+        Time between two set-points of a follower, s.
     """
 
     name: str = ""
@@ -58,6 +63,7 @@ class ControllerSetup:
     policy: Policy = "nearest"
     options: Mapping[str, Any] = field(default_factory=dict)
     adaptation: AdaptationName = "off"
+    period: float = 0.5
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -187,6 +193,20 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
     return setup.tuned(partial(IntegralParameters.scaled, falls=bool(high < low)))
 
 
+def _predictive(setup: ControllerSetup) -> PredictiveFollower:
+    # Heavy imports, for this one controller.
+    from bench.control.predictive import PredictionParameters, PredictiveFollower
+
+    parameters = setup.tuned(partial(PredictionParameters.scaled, period=setup.period))
+    inverse, dynamics = setup.inverse(), setup.model.dynamics
+    if dynamics is None:
+        raise DataError(
+            f"controller {setup.name} needs the dynamics of actuator and response, which model {setup.model.name} "
+            "lacks; identify it from a run, whose transients show them, not from a table"
+        )
+    return PredictiveFollower(inverse, dynamics, setup.start, setup.limits, parameters, setup.model_filter())
+
+
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
@@ -213,6 +233,9 @@ CLOSED_LOOP_FOLLOWER = ControllerSpec(
         s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()
     ),
     adapts=True,
+)
+PREDICTIVE_FOLLOWER = ControllerSpec(
+    "set-points of a horizon by model, dynamics and coming reference, within the limits", _predictive, adapts=True
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
     "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))

@@ -64,7 +64,12 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     state = model.operator.saturated_state(-1, reading[drive.signal])
     options = parameters.tuning.get(parameters.controller, {})
     setup = ControllerSetup(
-        model=model, limits=limits, state=state, options=options, adaptation=parameters.adaptation
+        model=model,
+        limits=limits,
+        state=state,
+        options=options,
+        adaptation=parameters.adaptation,
+        period=1.0 / parameters.rate,
     )
     follower = make_controller("follow", parameters.controller, setup)
 

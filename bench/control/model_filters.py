@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
@@ -41,8 +42,8 @@ FORGETTING = 0.01
 """Standard deviation by which an estimate may change from reading to reading, in parts of that at the beginning."""
 APART = 5e-3
 """Least distance of the input from that of the last reading taken, in spans: nearer ones say the same once more."""
-_LOST = 6
-"""Refused readings in a row after which the adaptation may begin anew."""
+_LATELY, _LOST = 20, 6
+"""Of so many readings, how many must have been refused for the adaptation to begin anew."""
 _BETTER = 0.5
 """What the error of the identified model in these must be less than, in errors of the adapted one."""
 
@@ -89,7 +90,8 @@ class ModelFilter(ABC):
         """Begin with the identified model."""
         self.model = self.identified
         self.uncertainty = self._last = math.nan
-        self._misfits: list[tuple[float, float]] = []
+        # Of the last readings: errors of the adapted and the identified model if it was refused, else None.
+        self._lately: deque[tuple[float, float] | None] = deque(maxlen=_LATELY)
         self._values, self._first = self._prior()
         self._covariance = self._first
         self._start = self._values
@@ -130,7 +132,7 @@ class ModelFilter(ABC):
         error = output - self.model.value(state)
         if abs(error) > GATE * math.sqrt(explained + noise):
             return self._refuse(error, output - self.identified.value(state))
-        self._misfits.clear()
+        self._lately.append(None)
         self._last = value
         self.taken += 1
         gain = seen / (explained + noise)
@@ -144,10 +146,11 @@ class ModelFilter(ABC):
 
     def _refuse(self, error: float, identified_error: float) -> bool:
         self.refused += 1
-        self._misfits.append((error, identified_error))
-        if len(self._misfits) < _LOST:
+        self._lately.append((error, identified_error))
+        refused = [errors for errors in self._lately if errors is not None]
+        if len(refused) < _LOST:
             return False
-        adapted, identified = np.sqrt(np.mean(np.square(self._misfits[-_LOST:]), axis=0)).tolist()
+        adapted, identified = np.sqrt(np.mean(np.square(refused), axis=0)).tolist()
         if not identified < _BETTER * adapted:
             return False
         self.restarts += 1
