@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
 .PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
-.PHONY: docs studies resume-trials twin-trials clean
+.PHONY: docs mutants studies resume-trials twin-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -63,6 +63,10 @@ benchmark: $(SETUP)
 docs: $(SETUP)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
+
+# Changes of controllers, engine, journal and drivers, one at a time: do the tests notice? A sample of 300.
+mutants: $(SETUP)
+	$(BIN)/python tests/mutants.py --sample 300
 
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)

@@ -25,6 +25,7 @@ from bench.cli import (
     designs,
     journals,
     models,
+    new,
     records,
     rehearse,
     repeat,
@@ -59,6 +60,7 @@ _PARTS = (
     records.app,
     journals.app,
     twin.app,
+    new.app,
 )
 
 

@@ -108,6 +108,7 @@ def check_outputs(
     out: Path | None = None,
     card: Path | None = None,
     figures: Path | None = None,
+    html: Path | None = None,
     json_file: Path | None = None,
     read: Sequence[Path] = (),
 ) -> None:
@@ -119,7 +120,8 @@ def check_outputs(
     """
     taken = {path.resolve(): "it is read" for path in read}
     for path, option, kind in (
-        (out, "--out", DataError), (card, "--card", DataError), (json_file, "--json", ConfigurationError)
+        (out, "--out", DataError), (card, "--card", DataError), (html, "--html", DataError),
+        (json_file, "--json", ConfigurationError),
     ):  # fmt: skip
         if path is None:
             continue

@@ -18,6 +18,7 @@ from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels, plot_tracking
+from bench.results.published import Published
 from bench.studies import Campaign, ResultTable, Study, StudyResult
 from rigs.hybrid.design import Design
 from rigs.hybrid.identification import (
@@ -498,10 +499,34 @@ def _draw_control(campaign: Campaign, tracked: Mapping[str, Tracking]) -> Iterat
         )
 
 
+_RESOLUTION = "resolution of the {}"
+_RANGE = "range of the {}"
+
+PUBLISHED = (
+    Published("current-sine", "thermal bandwidth", "4", "mHz", "Table III"),
+    Published("current-steps", "swing at -0.1 and 0.1 A", "> 100", "µm", "Fig. 13"),
+    Published("thermomechanical", "order of the polynomial", "4", "", "Fig. 14"),
+    Published(
+        "piezo-step", "real pole of D(s)", f"{PUBLISHED_DYNAMICS.real_pole / (2 * np.pi):.1f}", "Hz", "Fig. 16"
+    ),
+    Published(
+        "piezo-step", "resonance of D(s)", f"{PUBLISHED_DYNAMICS.frequency / (2 * np.pi):.1f}", "Hz", "Fig. 16"
+    ),
+    Published("piezo-step", "DC gain over the static one", f"{PUBLISHED_DYNAMICS.gain:.3f}", "", "Fig. 16"),
+    Published("piezo-step", "overshoot", "26.5", "%", "Fig. 16"),
+    Published("piezo-step", "bandwidth of the piezo", "> 600", "Hz", "Table III"),
+    Published("piezo-loops", _RANGE.format("piezo"), "10", "µm", "Table III"),
+    Published("hybrid-control", _RESOLUTION.format("thermal actuator"), "1", "µm", "Table III"),
+    Published("hybrid-control", _RESOLUTION.format("hybrid"), "< 100", "nm", "Table III"),
+    Published("hybrid-control", _RANGE.format("hybrid"), "> 110", "µm", "Table III"),
+)
+"""What the paper states, beside runs of the rig."""
+
 STUDY = Study(
     rig="hybrid",
     summary="Thermo-piezoelectric hybrid: parts, model of the whole, and control to nanometres over its range",
     description="Rakotondrabe and Ivan, Development and dynamic modeling of a new hybrid thermopiezoelectric "
     "microactuator, 2010.",
     carry_out=_carry_out,
+    published=PUBLISHED,
 )

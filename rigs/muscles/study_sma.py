@@ -20,9 +20,12 @@ from bench.results.figures import (
     plot_sequence_and_errors,
     plot_tracking,
 )
+from bench.results.published import Published
 from bench.results.tracking import TargetResults
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from rigs.muscles.characterization import (
+    KINDS,
+    PAPER,
     TITLES,
     Characterization,
     characterize,
@@ -36,6 +39,13 @@ from rigs.muscles.identification import FORCE, LENGTH
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
 LOAD_CHANGE = 1.96
 """What is hung on and taken off again in the session with a changing load, N."""
+_PROTOCOLS = {
+    "fv": "force-voltage",
+    "lv": "length-voltage",
+    "lf": "length-force",
+    "verification": "length-verification",
+}
+"""Protocols by the keys of `KINDS`."""
 _SHOWN = ("two-stage", "summed", "linear")
 """The paper's models, which are drawn."""
 
@@ -137,6 +147,18 @@ def carry_out(campaign: Campaign) -> StudyResult:
     )
 
 
+PUBLISHED = tuple(
+    Published(
+        _PROTOCOLS[kind],
+        f"{KINDS[kind][0]}: {TITLES[model]}, average / RMS error",
+        value,
+        "% of the range",
+        KINDS[kind][1],
+    )
+    for (kind, model), value in PAPER.items()
+)
+"""What the paper states: errors of all runs of a characterization together."""
+
 STUDY = Study(
     "sma",
     "SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.",
@@ -144,6 +166,7 @@ STUDY = Study(
     "brings length and force to 40 targets with each controller. Zhang and Yip, Three-dimensional hysteresis "
     "modeling of robotic artificial muscles with application to shape memory alloy actuators, 2017.",
     carry_out,
+    PUBLISHED,
 )
 
 

@@ -674,6 +674,11 @@ class TestReportAndExport:
         assert report["models"]["polynomial"]["rms"] > 0
         assert report["extremes"]["tec_temperature"]["high"] == pytest.approx(84, abs=0.2)
         assert all(Path(path).stat().st_size > 0 for path in report["figures"])
+        page = (tmp_path / "figures" / "report.html").read_text()
+        assert report["page"] == str(tmp_path / "figures" / "report.html")
+        # What the paper states of this protocol, beside what the model does.
+        assert "proposed model, largest error" in page
+        assert "46.8" in page
 
     @pytest.mark.parametrize("format_", ["csv", "parquet"])
     def test_export_holds_the_journal_with_units(self, bench, tmp_path, finished_run, format_):
