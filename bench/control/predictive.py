@@ -70,7 +70,7 @@ class PredictionParameters:
     reading_variance: float
     period: float = 0.5
     smoothness: float = 0.05
-    searches: int = 2
+    searches: int = 1
 
     def __post_init__(self) -> None:
         check_positive(self)
