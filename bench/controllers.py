@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
@@ -19,6 +19,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
+from bench.control.supervision import Supervised
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
@@ -151,6 +152,55 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
             f"{', '.join(others) or 'none'}"
         )
     return spec.make(replace(setup, name=name))
+
+
+Fallback = Literal["none", "open-loop"]
+"""What takes the place of a controller that does not converge: nothing, which ends the run, or the open loop."""
+
+
+def make_supervised(
+    task: str,
+    name: str,
+    setup: ControllerSetup,
+    *,
+    span: float,
+    fallback: Fallback = "none",
+    **options: Any,  # noqa: ANN401
+) -> Supervised:
+    """Return a target controller by name, which is given up when it does not converge.
+
+    Parameters
+    ----------
+    task, name, setup
+        As in `make_controller`.
+    span : float
+        Range of the targets, output units.
+    fallback : {"none", "open-loop"}
+        See `Fallback`.
+    options
+        Numbers of the open loop in place of its defaults.
+
+    Raises
+    ------
+    ConfigurationError, DataError
+        As `make_controller`, for the controller or for its fallback.
+    """
+    controller = make_controller(task, name, setup)
+    if fallback == "none":
+        return Supervised(controller, setup.limits, span, compares=setup.adaptation == "off")
+    opened = replace(setup, options=options)
+    # What it needs of the model is known before anything moves.
+    make_controller(task, _OPEN, opened)
+    return Supervised(
+        controller,
+        setup.limits,
+        span,
+        lambda state: make_controller(task, _OPEN, replace(opened, state=state)),
+        compares=setup.adaptation == "off",
+    )
+
+
+_OPEN = "open-loop-inverse"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
-from bench.controllers import ControllerSetup, controller_names, make_controller
+from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
 from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
@@ -37,6 +37,9 @@ class Parameters(SessionParameters):
     count: int = parameter(60, unit="1", low=2, high=10000, help="number of generated targets")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
     readings: int = parameter(10, unit="1", low=1, high=1000, help="readings at each target once it is reached")
+    fallback: Fallback = parameter(
+        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+    )
     timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
 
 
@@ -71,7 +74,14 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         options=options,
         adaptation=parameters.adaptation,
     )
-    controller = make_controller("target", parameters.controller, setup)
+    controller = make_supervised(
+        "target",
+        parameters.controller,
+        setup,
+        span=float(np.ptp(targets)) or 1.0,
+        fallback=parameters.fallback,
+        **parameters.tuning.get("open-loop-inverse", {}),
+    )
     yield Phase(parameters.controller)
     errors: list[float] = []
     seconds: list[float] = []
@@ -87,6 +97,8 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
             label=REACH,
         )
         seconds.append(reading.time - start)
+        if notice := controller.take_notice():
+            yield Note(notice)
         outputs: list[float] = []
         for _ in range(parameters.readings):
             reading = yield Step({}, Dwell(0.1), label=READING)

@@ -30,11 +30,24 @@ from typing import Any, NamedTuple, Protocol
 
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
+from bench.control.overshoot import Overshoot, Passing
 from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
 from bench.hysteresis.inverse_stream import InverseStream
 from bench.hysteresis.stream import Stream
 
+_LOOK = 0.25
+"""Time between two readings of an input that settles, s: the peak of one that rings at 2 rad/s is seen to 2 %."""
+_LOOK_AT_PEAK = 0.1
+"""The same on the way to a peak, s."""
+_STILL = 0.003
+"""Part of a move within one such time below which the input stands still."""
+_LONGEST_PART = 100
+"""Readings after which to go on without a peak."""
+_SIGNIFICANT = 0.01
+"""Part of the range of set-points that a move must have for its overshoot to be learned."""
+_ON_TIME = 1e-6
+"""Difference of times that are equal, s."""
 # Part of the output at stake within which a clipped answer still counts as met.
 _CLOSE = 1e-9
 
@@ -345,8 +358,20 @@ class Scripted(ControllerBase, ABC):
     _poll = 0.1
     _needs_output = True
 
+    _input = _time = math.nan
+    """Of the last complete reading."""
     _script: Script | None = None
     _done = False
+
+    def __init__(
+        self,
+        input_range: tuple[float, float],
+        limits: tuple[float, float] | None = None,
+        model: Operator[Any] | None = None,
+        state: Any = None,  # noqa: ANN401
+    ) -> None:
+        super().__init__(input_range, limits, model, state)
+        self._overshoot = Overshoot(_SIGNIFICANT * (self._high - self._low))
 
     def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
         """Start towards a new target and return the first command.
@@ -382,6 +407,7 @@ class Scripted(ControllerBase, ABC):
         if not known or (self._needs_output and not self._is_known(output)):
             return Command(self._setpoint, self._poll, self._done)
         reading = Sample(t, measured_input, output)
+        self._input, self._time = measured_input, t
         if self._script is None:
             self._script = self._run(self._reference, reading)
             command = next(self._script)
@@ -404,12 +430,32 @@ class Scripted(ControllerBase, ABC):
         while True:
             yield Command(self._setpoint, wait, done=True)
 
+    def _head_for(self, setpoint: float) -> Generator[Command, Sample, Passing]:
+        """Go the first part of the way to a set-point, to the peak there, if the input would overshoot otherwise.
+
+        Returns what goes on to note how far the input passes the set-point.
+        """
+        start, way = self._input, self._clip(setpoint) - self._input
+        share = self._overshoot.share(way)
+        if share:
+            place = 0.0
+            for _ in range(_LONGEST_PART):
+                reading = yield self._command(start + way / (1.0 + share), _LOOK_AT_PEAK)
+                before, place = place, (reading.input - start) / way
+                # At the peak it stands still for a moment.
+                if place > 0.5 and place - before < _STILL:
+                    break
+            self._overshoot.learn(way, place * (1.0 + share) - 1.0)
+        return Passing(start, start + way, self._overshoot, in_one=not share)
+
     def _arrive(self, setpoint: float, arrival: Arrival) -> Move:
         """Go to a set-point and return the reading with which the actuator has arrived."""
+        passing = yield from self._head_for(setpoint)
         # Clocks start with the first reading: until then readings may have been missing.
         started = since = math.nan
         while True:
             reading = yield self._command(setpoint, arrival.poll)
+            passing.note(reading.input)
             if math.isnan(started):
                 started = reading.time - arrival.poll
             if abs(reading.input - self._setpoint) < arrival.tolerance:
@@ -418,6 +464,7 @@ class Scripted(ControllerBase, ABC):
                 since = math.nan
             # Times are sums of floats.
             if reading.time - since >= arrival.hold - 1e-9 or reading.time - started >= arrival.patience:
+                passing.learn()
                 return reading
 
 
@@ -460,13 +507,22 @@ class OpenLoopInverse(Scripted):
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
         first, *rest = self._answer(self._inverse.invert(self.state, target), target)
-        arrived = yield self._command(first, self._wait)
-        self._learn(arrived.output)
+        yield from self._settle(first)
         if rest:
             (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
-            arrived = yield self._command(second, self._wait)
-            self._learn(arrived.output)
+            yield from self._settle(second)
         yield from self._hold(self._poll)
+
+    def _settle(self, setpoint: float) -> Generator[Command, Sample, None]:
+        """Go to a set-point and wait there; the input is read meanwhile, so that its extremes are known."""
+        started, output = self._time, math.nan
+        passing = yield from self._head_for(setpoint)
+        while (left := self._wait - (self._time - started)) > _ON_TIME:
+            reading = yield self._command(setpoint, left / max(1, round(left / _LOOK)))
+            passing.note(reading.input)
+            output = reading.output
+        passing.learn()
+        self._learn(output)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import GRID_TOLERANCE
+from sim_devices.plants.grid import GRID_TOLERANCE, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -112,6 +112,9 @@ class MuscleLaboratorySettings(LaboratorySettings, ABC):
         default=17.5e-3, gt=0, le=35e-3, description="where along its stroke the sensor sees the muscle at rest, m"
     )
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
+    plant: dict[str, float] = Field(
+        default={}, description="numbers of the muscle in place of its own; see `sim_devices.plants`"
+    )
     fault: FaultName = Field(
         default="none",
         description="fault at `fault_time`; forgotten-load (the operator hangs nothing) and heavy-load "
@@ -430,7 +433,10 @@ class SMALaboratorySettings(_ThermalSettings):
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the wire."""
-        return SMAWire(SMAParameters(specimen_seed=self.specimen_seed, ambient_sd=self.ambient_deviation), rng)
+        return SMAWire(
+            changed(SMAParameters(specimen_seed=self.specimen_seed, ambient_sd=self.ambient_deviation), self.plant),
+            rng,
+        )
 
 
 class SMALaboratory(MuscleLaboratory):
@@ -448,7 +454,7 @@ class McKibbenLaboratorySettings(MuscleLaboratorySettings):
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the muscle."""
-        return McKibbenMuscle(McKibbenParameters(supply_sd=self.pressure_deviation), rng)
+        return McKibbenMuscle(changed(McKibbenParameters(supply_sd=self.pressure_deviation), self.plant), rng)
 
 
 class McKibbenLaboratory(MuscleLaboratory):
@@ -465,7 +471,9 @@ class CoiledPolymerLaboratorySettings(_ThermalSettings):
 
     def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
         """Return the muscle."""
-        return CoiledPolymerMuscle(CoiledPolymerParameters(ambient_sd=self.ambient_deviation), rng)
+        return CoiledPolymerMuscle(
+            changed(CoiledPolymerParameters(ambient_sd=self.ambient_deviation), self.plant), rng
+        )
 
 
 class CoiledPolymerLaboratory(MuscleLaboratory):
