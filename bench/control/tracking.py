@@ -369,8 +369,9 @@ class Scripted(ControllerBase, ABC):
         limits: tuple[float, float] | None = None,
         model: Operator[Any] | None = None,
         state: Any = None,  # noqa: ANN401
+        adaptation: ModelFilter | None = None,
     ) -> None:
-        super().__init__(input_range, limits, model, state)
+        super().__init__(input_range, limits, model, state, adaptation)
         self._overshoot = Overshoot(_SIGNIFICANT * (self._high - self._low))
 
     def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
