@@ -423,9 +423,11 @@ def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # no
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     *parents, last = key.split(".")
-    if parents in (["telemetry"], ["safety"]):
+    if parents in (["telemetry"], ["safety"]) or (len(parents) == 2 and parents[0] == "emulation"):
         # Tables with defaults for every key, which a file may leave out.
-        content.setdefault(parents[0], {})
+        below = content if len(parents) == 1 else content.get("emulation")
+        if isinstance(below, dict):
+            below.setdefault(parents[-1], {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
