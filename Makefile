@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
 .PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
-.PHONY: studies resume-trials twin-trials clean
+.PHONY: docs studies resume-trials twin-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -58,6 +58,11 @@ all-tests: kernels
 # Side-by-side speed comparisons; run them on an idle machine.
 benchmark: $(SETUP)
 	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
+
+# The documents as a site, in docs/_build/html: reference from the code, links checked; no network is needed.
+docs: $(SETUP)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
 
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)

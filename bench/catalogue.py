@@ -83,13 +83,6 @@ class Catalogue:
         """Return the protocols that fit a rig."""
         return tuple(name for name, definition in self.protocols.items() if fits(definition, self.rigs[rig]))
 
-    def by_protocols(self) -> list[tuple[list[str], tuple[str, ...]]]:
-        """Return the rigs in groups that the same protocols fit, each with these protocols."""
-        groups: dict[tuple[str, ...], list[str]] = {}
-        for rig in self.rigs:
-            groups.setdefault(self.fitting(rig), []).append(rig)
-        return [(rigs, protocols) for protocols, rigs in groups.items()]
-
     def to_json(self) -> dict[str, Any]:
         """Return the catalogue for programs."""
         return {

@@ -84,10 +84,39 @@ class Entry:
             ) from error
 
 
+def _packages() -> list[tuple[str, metadata.Distribution]]:
+    """Return the packages that register a part, each with its name.
+
+    Of hundreds of packages few do: the entry points of the others are not parsed.
+    """
+    found = []
+    for package in metadata.distributions():
+        text = package.read_text("entry_points.txt")
+        if text is None or "[bench." not in text:
+            continue
+        name = package.name
+        # Of two of one name on the import path, the first hides the other.
+        if metadata.distribution(name).read_text("entry_points.txt") == text:
+            found.append((name, package))
+    return found
+
+
 @cache
-def _name(package: metadata.Distribution) -> str:
-    """Return the name of a package, for which all of its metadata is parsed."""
-    return package.name
+def _all_entries() -> tuple[Entry, ...]:
+    """Return everything that is registered, in all groups."""
+    groups = {f"bench.{group}": group for group in GROUPS}
+    return tuple(
+        Entry(groups[point.group], point.name, package, point.value)
+        for package, distribution in _packages()
+        for point in distribution.entry_points
+        if point.group in groups
+    )
+
+
+def forget() -> None:
+    """Look anew for what is registered, as the import path has changed."""
+    _all_entries.cache_clear()
+    entries.cache_clear()
 
 
 @cache
@@ -99,13 +128,14 @@ def entries(group: Group) -> Mapping[str, Entry]:
     if group not in GROUPS:
         raise ValueError(f"group: expected one of {', '.join(GROUPS)}, got {group!r}")
     found: dict[str, Entry] = {}
-    for point in metadata.entry_points(group=f"bench.{group}"):
-        package = _name(point.dist) if point.dist is not None else "unknown"
-        entry = Entry(group, point.name, package, point.value)
-        other = found.setdefault(point.name, entry)
+    for entry in _all_entries():
+        if entry.group != group:
+            continue
+        other = found.setdefault(entry.name, entry)
         if other != entry:
             raise ConfigurationError(
-                f"packages {other.package} and {package} both register {point.name!r} in bench.{group}; uninstall one"
+                f"packages {other.package} and {entry.package} both register {entry.name!r} in bench.{group}; "
+                "uninstall one"
             )
     return dict(sorted(found.items()))
 

@@ -49,7 +49,7 @@ def begin(request):
     os.environ.update(request["environment"])
     sys.path[:0] = [str(Path.cwd()), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     importlib.invalidate_caches()
-    registry.entries.cache_clear()
+    registry.forget()
 
 
 def carry_out(option, program, *rest):

@@ -10,11 +10,13 @@ import atexit
 import gc
 import sqlite3
 import sys
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NoReturn
 
 import typer
 from rich.markup import escape
+from typer.main import get_command_name
+from typer.models import CommandInfo
 
 from bench import registry
 from bench.cli import (
@@ -43,18 +45,7 @@ _EPILOG = (
     "operator. Try: bench list, and bench run PROTOCOL --rig RIG --clock virtual"
 )
 
-app = typer.Typer(
-    name="bench",
-    cls=RegisteredCommands,
-    help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
-    "identify hysteresis models from the measurements, and apply them.",
-    epilog=_EPILOG,
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-)
-for group in (
+_PARTS = (
     runs.app,
     rehearse.app,
     repeat.app,
@@ -68,8 +59,31 @@ for group in (
     records.app,
     journals.app,
     twin.app,
-):
-    app.add_typer(group)
+)
+
+
+class BenchCommands(RegisteredCommands):
+    """The commands of `bench`."""
+
+    own: ClassVar[Mapping[str, CommandInfo]] = {
+        info.name or get_command_name(info.callback.__name__): info
+        for part in _PARTS
+        for info in part.registered_commands
+        if info.callback is not None
+    }
+
+
+app = typer.Typer(
+    name="bench",
+    cls=BenchCommands,
+    help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
+    "identify hysteresis models from the measurements, and apply them.",
+    epilog=_EPILOG,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
 reproduce_ = typer.Typer(
     help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
     no_args_is_help=True,

@@ -52,14 +52,19 @@ def list_(
     A protocol is shown with its parameters, a rig with its file: `bench list RIG > desk.toml` gives you a copy to
     fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
     """
+    if name is None:
+        from bench.listing import listing
+
+        listed = listing()
+        _print_listing(listed)
+        write_json(json_file, listed)
+        return
+
     from bench.catalogue import Catalogue
     from bench.hysteresis import identifiable_models, timed_models
 
     catalogue = Catalogue.of_installed()
-    if name is None:
-        _print_catalogue(catalogue)
-        write_json(json_file, catalogue.to_json())
-    elif name in catalogue.rigs:
+    if name in catalogue.rigs:
         # Plain, so that it can be redirected into a file.
         typer.echo(catalogue.rigs[name].text, nl=False)
         write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
@@ -88,23 +93,22 @@ def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not
     return {"summary": spec.summary, "inverse": inverse_of(spec), "options": options_json(spec)}
 
 
-def _print_catalogue(catalogue: Any) -> None:  # noqa: ANN401 - a Catalogue, not imported at start
-    def foreign(name: str) -> str:
-        package = catalogue.packages.get(name)
-        return f" \\[{package}]" if package else ""
+def _print_listing(listed: Mapping[str, Any]) -> None:
+    def titles(group: str) -> dict[str, str]:
+        packages = {name: f" \\[{package}]" for name, package in listed["packages"].items()}
+        return {name: text + packages.get(name, "") for name, text in listed[group].items()}
 
-    for rigs, protocols in catalogue.by_protocols():
-        print_table("rigs", {name: catalogue.rigs[name].rig.title + foreign(name) for name in rigs})
-        listed = ", ".join(name + "*" * catalogue.protocols[name].needs_model for name in protocols) or "none"
-        console.print(f"    [dim]protocols (*: takes a model file):[/] {listed}\n", highlight=False)
-    titles = {name: each.summary + foreign(name) for name, each in catalogue.protocols.items()}
-    print_table("protocols", titles)
-    print_table("models", {name: text + foreign(name) for name, text in catalogue.models.items()})
-    print_table("controllers", {name: text + foreign(name) for name, text in catalogue.controllers.items()})
-    print_table(
-        "studies, for `bench reproduce`", {name: text + foreign(name) for name, text in catalogue.studies.items()}
-    )
-    for problem in catalogue.problems:
+    alike: dict[tuple[str, ...], dict[str, str]] = {}
+    for rig, title in titles("rigs").items():
+        alike.setdefault(tuple(listed["fitting"][rig]), {})[rig] = title
+    for protocols, rigs in alike.items():
+        print_table("rigs", rigs)
+        names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
+        console.print(f"    [dim]protocols (*: takes a model file):[/] {names}\n", highlight=False)
+    for group in ("protocols", "models", "controllers"):
+        print_table(group, titles(group))
+    print_table("studies, for `bench reproduce`", titles("studies"))
+    for problem in listed["problems"]:
         warn(f"left out: {problem}")
 
 

@@ -83,6 +83,8 @@ class Journal:
         try:
             store = Store(path, _READERS, flushed=flushed)
             store.create(names, entries)
+            if flushed:
+                store.extend_log()
             store.wait_for_others(0.0)
             keeper = Keeper(store)
             keeper.begin(entries)
@@ -121,6 +123,7 @@ class Journal:
             # A reader may have it for a moment.
             keeper = Keeper(Store(file, _READERS))
             keeper.store.forget(_END)
+            keeper.store.extend_log()
             keeper.store.wait_for_others(0.0)
             if not was_mirrored:
                 keeper.begin(keeper.store.entries())

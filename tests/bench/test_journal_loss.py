@@ -17,7 +17,7 @@ import pytest
 from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening, store
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import elsewhere, read_mirror
 from bench.journal.recovery import RECOVERED_NAME, recover
@@ -54,6 +54,11 @@ def add(journal, count=1):
         journal.event(Event(float(step), "INFO", "note", f"step {step}"))
         journal.step(StepRecord(step, step, step + 0.5, "", "", Settled.DWELL, {"tec": 20.0}, (20.0, float(step))))
     return journal.steps
+
+
+def log_of(folder):
+    """Return the write-ahead log of the journal in a folder."""
+    return folder / f"{FILE_NAME}-wal"
 
 
 @contextmanager
@@ -210,6 +215,23 @@ class TestNoSpace:
         assert found.is_complete
         assert_whole(found.copy, count, "failed")
 
+    def test_one_without_space_for_the_log_is_written_all_the_same(self, tmp_path, full):
+        full(1 << 20)
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, {"rig.toml": b"[rig]"})
+        assert log_of(tmp_path).stat().st_size < 1 << 17
+        count = add(journal, 5)
+        full(None)
+        journal.finish(**STATUS)
+        journal.close()
+        assert_whole(tmp_path, count)
+
+    def test_the_log_takes_no_space_of_a_disk_that_is_nearly_full(self, tmp_path, monkeypatch):
+        usage = shutil.disk_usage(tmp_path)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=store._ROOM * store._LOG_SIZE // 2))
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        assert log_of(tmp_path).stat().st_size < 1 << 17
+        journal.close()
+
     def test_space_is_kept_for_the_end(self, journal, tmp_path):
         reserve = tmp_path / keeping.RESERVE_NAME
         assert reserve.stat().st_size >= 1 << 18
@@ -324,6 +346,41 @@ class TestSlowDisk:
         gate.set()
         journal._background._thread.join(60.0)
         monkeypatch.undo()
+        journal.close()
+
+
+class TestLog:
+    """The write-ahead log does not grow while a run goes on, as commits would wait for the file's size as well."""
+
+    def test_has_its_size_from_the_beginning(self, tmp_path, monkeypatch):
+        for opened in (lambda: Journal(tmp_path / FILE_NAME, SIGNALS, {}), lambda: Journal.reopen(tmp_path)):
+            journal = opened()
+            size = log_of(tmp_path).stat().st_size
+            assert size >= store._LOG_SIZE
+            monkeypatch.setattr(keeping, "_BETWEEN_FOLDS", 1e9)
+            count = add(journal, 100)
+            monkeypatch.setattr(keeping, "_BETWEEN_FOLDS", 0.0)
+            monkeypatch.setattr(keeping, "_BETWEEN_LOOKS", 0.0)
+            count = add(journal, 20)
+            assert log_of(tmp_path).stat().st_size == size
+            journal.close()
+            assert not log_of(tmp_path).exists()
+        assert count == 240
+
+    def test_is_as_it_was_for_who_reads_meanwhile_and_after_a_death(self, journal, tmp_path, other_disk):
+        count = add(journal, 3)
+        with Record(tmp_path) as run:
+            assert len(run.steps()) == count
+        add(journal, 3)
+        copy = other_disk / "copy"
+        shutil.copytree(tmp_path, copy)
+        journal = Journal.reopen(copy)
+        assert journal.steps == count + 3
+        journal.close()
+
+    def test_does_not_grow_for_a_run_whose_commits_do_not_wait(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, flushed=False)
+        assert log_of(tmp_path).stat().st_size < 1 << 17
         journal.close()
 
 

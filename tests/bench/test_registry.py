@@ -43,7 +43,7 @@ def install(tmp_path, monkeypatch):
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)
         monkeypatch.syspath_prepend(str(site))
-        registry.entries.cache_clear()
+        registry.forget()
         return site
 
     yield install
@@ -51,7 +51,7 @@ def install(tmp_path, monkeypatch):
         if name.startswith("outside_"):
             del sys.modules[name]
     monkeypatch.undo()
-    registry.entries.cache_clear()
+    registry.forget()
 
 
 @pytest.fixture

@@ -22,8 +22,14 @@ def blocks(language):
 
 
 def commands():
-    """Yield each command line of the README, from blocks and from the text."""
-    shell = "\n".join(blocks("sh")).replace("\\\n", " ")
+    """Yield each command line of the README, from blocks and from the text, and those of tutorials for hardware."""
+    hardware = [
+        line.strip()
+        for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+        for block in re.findall(r"^ *```bash\n(.*?)^ *```$", page.read_text(), re.DOTALL | re.MULTILINE)
+        for line in block.replace("\\\n", " ").splitlines()
+    ]
+    shell = "\n".join([*blocks("sh"), *hardware]).replace("\\\n", " ")
     text = re.sub(r"^```.*?^```$", "", README, flags=re.DOTALL | re.MULTILINE)
     for line in [*shell.splitlines(), *(code.replace("\n", " ") for code in re.findall(r"`([^`]+)`", text))]:
         if line.split(maxsplit=1)[:1] in (["bench"], ["make"]):
@@ -56,7 +62,9 @@ def test_every_target_of_make_exists(target):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_leads_to_a_file(page):
-    for link in re.findall(r"\]\(([^)#]+)", page.read_text()):
+    # An equation may have a bracket before a parenthesis.
+    text = re.sub(r"\$\$.*?\$\$", "", page.read_text(), flags=re.DOTALL)
+    for link in re.findall(r"\]\(([^)#]+)", text):
         if not link.startswith("http"):
             assert (page.parent / link).exists(), link
 

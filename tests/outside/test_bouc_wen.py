@@ -38,10 +38,10 @@ def installed(tmp_path_factory):
     (site / "bouc_wen.py").write_text((PACKAGE / "bouc_wen.py").read_text())
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
-        registry.entries.cache_clear()
+        registry.forget()
         yield registry.load("models", "normalised-bouc-wen").model
     sys.modules.pop("bouc_wen")
-    registry.entries.cache_clear()
+    registry.forget()
 
 
 @pytest.fixture(scope="module")
