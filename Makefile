@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
 .PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
-.PHONY: docs studies resume-trials twin-trials clean
+.PHONY: docs mutants studies resume-trials twin-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
 demo: $(SETUP)
@@ -45,12 +45,15 @@ lint: $(SETUP)
 types: lint
 	$(BIN)/mypy
 
-# Compiled once, before the workers of the tests would each do it.
+# Compiled once, before the workers of the tests would each do it; so are the modules of the tests, with what pytest
+# makes of their assertions.
 kernels: lint
 	$(BIN)/python -P tests/compile_kernels.py
+	$(BIN)/python -m pytest --collect-only -qq > /dev/null
 
+# A third of the examples of each property.
 tests: kernels
-	$(PYTEST)
+	$(PYTEST) --hypothesis-profile=brief
 
 all-tests: kernels
 	$(PYTEST) -m 'not benchmark'
@@ -63,6 +66,10 @@ benchmark: $(SETUP)
 docs: $(SETUP)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
+
+# Changes of controllers, engine, journal and drivers, one at a time: do the tests notice? A sample of 300.
+mutants: $(SETUP)
+	$(BIN)/python tests/mutants.py --sample 300
 
 # 50 virtual runs beside 16 busy processes, compared to the last bit.
 busy: $(SETUP)
@@ -101,6 +108,11 @@ resume-trials: $(SETUP)
 # Tracking runs on twins, beside those on the plants that they were identified from: durations and errors.
 twin-trials: $(SETUP)
 	$(BIN)/python tests/bench/twin_trials.py
+
+# The dashboard of every protocol on every emulated rig, dark and light, with those of README.md; fails on an empty view.
+pictures: $(SETUP)
+	$(BIN)/python -P tests/pictures.py --out recordings/pictures
+	$(BIN)/python -P tests/pictures.py --out recordings/pictures --studies recordings/pictures/studies --readme --themes dark
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -151,7 +151,7 @@ def calibrate(
     if times is not None:
         speed = np.gradient(_smooth(y), np.asarray(times, dtype=np.float64)[good])
     most = min(MOST_COEFFICIENTS, max(1, x.size // 2))
-    columns = chebyshev.chebvander(scaled, most - 1)
+    columns: Floats = np.asarray(chebyshev.chebvander(scaled, most - 1), dtype=np.float64)
     lacking = y - x
     # Short blocks in turn, so that what is left out lies between what is not.
     few = x.size < 8 * _FOLDS**2

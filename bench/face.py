@@ -21,18 +21,20 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from bench.clock import VirtualClock, wall_time
 from bench.errors import BenchError, DeviceError
 from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
 from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
 from bench.results.models import predict as predict_file
 from bench.results.reading.options import ReadingOptions
-from bench.results.report import report_run
+from bench.results.report import PAGE_NAME, report_run
 from bench.results.run_folder import RunFolder
 from bench.rig import Rig, clock_for
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from bench.safety import SAFE
+from bench.studies import published_of
 
 Model: TypeAlias = IdentifiedFile | ModelFile | Path | str
 """What a model may be given as: the result of `identify` or `load`, or a model file."""
@@ -68,7 +70,11 @@ def open_rig(
         If a device cannot be connected; nothing has moved.
     """
     file = load_rig(str(rig), overrides)
-    return Rig(file, clock_for(file, clock or ("virtual" if file.in_process else "wall")), seed)
+    passing = clock_for(file, clock or ("virtual" if file.in_process else "wall"))
+    if isinstance(passing, VirtualClock):
+        # Time stamps that stand beside those of another program, such as bluesky's, count from today.
+        passing.go_on(wall_time(), 0.0)
+    return Rig(file, passing, seed)
 
 
 def run(
@@ -272,7 +278,7 @@ def load(path: str | Path) -> RunFolder | ModelFile:
 
 
 def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict[str, Any]:
-    """Print tables of a run and draw its figures; return the same for programs.
+    """Print tables of a run, draw its figures and write its page `report.html`; return the same for programs.
 
     Parameters
     ----------
@@ -287,7 +293,9 @@ def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict
         If the run or a model cannot be read.
     """
     folder = source.folder if isinstance(source, RunFolder) else Path(source)
-    return report_run(folder, [_model(model) for model in models], None, Console())
+    published = published_of(folder)
+    page = (folder if folder.is_dir() else folder.parent) / PAGE_NAME
+    return report_run(folder, [_model(model) for model in models], None, Console(), page=page, published=published)
 
 
 def _model(model: Model) -> ModelFile:

@@ -6,7 +6,9 @@ A package registers a `Study` as an entry point of the group `bench.studies`; `b
 from __future__ import annotations
 
 import itertools
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
@@ -14,12 +16,14 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 from rich.console import Console
 from rich.table import Table
 
+from bench import registry
 from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record
 from bench.printing import print_plain
 from bench.protocol import find_protocol
+from bench.results.published import Published
 from bench.results.tracking import TargetResults, target_results
 
 if TYPE_CHECKING:
@@ -224,12 +228,35 @@ class Study:
         For its help: what is done, and the source.
     carry_out : callable
         Runs the protocols of a campaign and evaluates them. Raises `BenchError` if a run did not complete.
+    published : tuple of Published
+        What papers state of the rig, for the pages of its runs.
     """
 
     rig: str | None
     summary: str
     description: str
     carry_out: Callable[[Campaign], StudyResult]
+    published: tuple[Published, ...] = ()
+
+
+def published_of(run: Path) -> tuple[Published, ...]:
+    """Return what studies state of the rig of a run, or of the rig that its file extends.
+
+    Raises DataError if there is no such run.
+    """
+    with Record(run) as record:
+        rigs = {record.meta["rig"]}
+        # The text of a file may be of a later version.
+        with suppress(tomllib.TOMLDecodeError, KeyError):
+            rigs.add(tomllib.loads(record.meta["rig_file"])["extends"])
+    found: list[Published] = []
+    for name in registry.entries("studies"):
+        # A study of somebody else that cannot be imported is no matter of this run.
+        with suppress(ConfigurationError):
+            study = registry.load("studies", name)
+            if isinstance(study, Study) and study.rig in rigs:
+                found += study.published
+    return tuple(found)
 
 
 def reproduce(
@@ -287,7 +314,7 @@ def reproduce(
     except MissingExtraError as error:
         print_plain(console, f"no recordings: {error}")
         recorded = False
-    from bench.results.report import export_run
+    from bench.results.export import export_run
     from bench.workers import Workers
 
     stopwatch = Stopwatch()

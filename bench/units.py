@@ -59,8 +59,9 @@ def format_duration(seconds: float) -> str:
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return the label of an axis: the name and, unless it is a plain number, the unit."""
-    return f"{name} / {unit}" if unit not in ("", "1") else name
+    """Return the label of an axis: the name and, unless it is a plain number, the unit; a fraction in parentheses."""
+    shown = f"({unit})" if "/" in unit else unit
+    return f"{name} / {shown}" if unit not in ("", "1") else name
 
 
 def header_with_unit(name: str, unit: str) -> str:
@@ -112,3 +113,23 @@ def check_unit(unit: str) -> str:
     except ValueError:
         raise ValueError("is no unit; expected one such as V, mA, °C, Pa, 1/m, or 1 for a plain number") from None
     return unit
+
+
+def per_square(output_unit: str, input_unit: str, greatest: float) -> tuple[float, str]:
+    """Return factor and unit of a density over the square of an input, such as `µm/V²` or `1/(m K²)`.
+
+    Parameters
+    ----------
+    output_unit, input_unit : str
+        Units; empty if unknown. Differences of °C are K.
+    greatest : float
+        Greatest density in these units, which decides the prefix of the output.
+    """
+    squared = f"{'K' if input_unit == '°C' else input_unit}²" if input_unit not in ("", "1") else ""
+    factor, output = fitting_prefix(output_unit, greatest)
+    above, _, below = output.partition("/")
+    if not squared:
+        return factor, output
+    if any(sign in below for sign in "/()") or "/" in squared:
+        return factor, f"({output})/({squared.removesuffix('²')})²"
+    return factor, f"{above or '1'}/({below} {squared})" if below else f"{output or '1'}/{squared}"

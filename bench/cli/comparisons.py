@@ -16,6 +16,7 @@ from bench.cli.models import InitialOption
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
+from bench.printing import print_plain
 from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ def compare_(
         typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
     ] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="For two runs: page of the comparison, in one file.")
+    ] = None,
     json_file: JsonOption = None,
     *,
     reading: ReadingOptions,
@@ -75,7 +79,7 @@ def compare_(
     output and by model `predicted` and `residual` (measured minus predicted) of every row.
 
     `bench compare RUN RUN` shows what differs in parameters, rig, instruments, versions and files, how both ended,
-    and how far each signal is apart at equal steps.
+    and how far each signal is apart at equal steps. `--html FILE` writes the same with figures as a page.
     """
     if data is None:
         of_models = (
@@ -87,9 +91,11 @@ def compare_(
                 "--input, --output, --time, --skip, --initial, --bands, --recalibrate, --out, --figures and how a "
                 "file is read are for models, with --data FILE"
             )
-        check_outputs(json_file=json_file)
-        _compare_runs(compared, json_file)
+        check_outputs(html=html, json_file=json_file, read=compared)
+        _compare_runs(compared, html, json_file)
         return
+    if html is not None:
+        raise ConfigurationError("--html is for two runs, without --data; --figures draws models")
     from bench.results.models import compare_models
     from bench.results.recalibrations import Session
 
@@ -132,7 +138,7 @@ def compare_(
     write_json(json_file, result.to_json())
 
 
-def _compare_runs(runs: list[Path], json_file: Path | None) -> None:
+def _compare_runs(runs: list[Path], html: Path | None, json_file: Path | None) -> None:
     from bench.journal import Record
     from bench.results.run_comparison import compare_runs
 
@@ -142,7 +148,13 @@ def _compare_runs(runs: list[Path], json_file: Path | None) -> None:
         raise ConfigurationError(f"expected two runs to compare, or model files with --data; got {len(runs)}")
     with Record(runs[0]) as first, Record(runs[1]) as second:
         found = compare_runs(first, second)
-    _print_runs(found)
+        _print_runs(found)
+        if html is not None:
+            from bench.results.page.comparison_page import comparison_page
+            from bench.results.page.render import write_page
+
+            write_page(html, comparison_page(first, second, found))
+            print_plain(console, f"page: {html}")
     write_json(json_file, found.to_json())
 
 

@@ -23,7 +23,18 @@ error_console = Console(stderr=True)
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
 ]
-LiveOption = Annotated[bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")]
+LiveOption = Annotated[
+    bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
+]
+NotifyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--notify",
+        metavar="COMMAND",
+        help="Command to start at a pause, a prompt, a warning, a trip and the end, with the facts in BENCH_… "
+        "variables and as JSON on its input; or mailto:ADDRESS, or https://ADDRESS of a webhook. Repeatable.",
+    ),
+]
 SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
@@ -108,6 +119,7 @@ def check_outputs(
     out: Path | None = None,
     card: Path | None = None,
     figures: Path | None = None,
+    html: Path | None = None,
     json_file: Path | None = None,
     read: Sequence[Path] = (),
 ) -> None:
@@ -119,7 +131,8 @@ def check_outputs(
     """
     taken = {path.resolve(): "it is read" for path in read}
     for path, option, kind in (
-        (out, "--out", DataError), (card, "--card", DataError), (json_file, "--json", ConfigurationError)
+        (out, "--out", DataError), (card, "--card", DataError), (html, "--html", DataError),
+        (json_file, "--json", ConfigurationError),
     ):  # fmt: skip
         if path is None:
             continue

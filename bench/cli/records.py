@@ -14,6 +14,14 @@ from bench.printing import print_plain
 app = typer.Typer()
 
 
+class FigureFormat(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    PDF = "pdf"
+    SVG = "svg"
+
+
 @app.command()
 @show_compilation()
 def report(
@@ -24,18 +32,29 @@ def report(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder for figures; the folder `report` of the run if not given."),
+        typer.Option(
+            metavar="DIR",
+            help="Folder for figures and page; if not given, `report` and `report.html` in the folder of the run.",
+        ),
     ] = None,
+    figures: Annotated[
+        FigureFormat, typer.Option(help="Format of the figures; pdf and svg for papers.")
+    ] = FigureFormat.PNG,
     json_file: JsonOption = None,
 ) -> None:
-    """Tables and figures of a run: what happened, the extremes of every signal, and how models do on it.
+    """Tables, figures and a page of a run: what happened, extremes, margins, and how models do on it.
 
-    Models that were identified from this run are compared without being named. Works while the run goes on.
+    The page is one HTML file that needs nothing else: for a log book, or to hand out. Models that were identified
+    from this run are compared without being named. Works while the run goes on; the page then says so.
     """
     from bench.model_file import load_model
-    from bench.results.report import report_run
+    from bench.results.report import PAGE_NAME, report_run
+    from bench.studies import published_of
 
-    result = report_run(run, [load_model(path) for path in models or []], out, console)
+    files = [load_model(path) for path in models or []]
+    published = published_of(run)
+    page = (out or (run if run.is_dir() else run.parent)) / PAGE_NAME
+    result = report_run(run, files, out, console, page=page, figure_format=figures.value, published=published)
     write_json(json_file, result)
 
 
@@ -44,6 +63,7 @@ class ExportFormat(StrEnum):
 
     CSV = "csv"
     PARQUET = "parquet"
+    BLUESKY = "bluesky"
     RRD = "rrd"
     PNG = "png"
 
@@ -60,10 +80,11 @@ def export(
 ) -> None:
     """Write a run's readings and telemetry for other programs, or rebuild its recording for the viewer.
 
-    csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers. rrd: the
-    recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
+    csv and parquet: `readings` (one row a step), `telemetry` (one row a tick) and `events`, units in the headers;
+    metadata in `metadata.json` or the schema. bluesky: `documents.jsonl`, documents of event-model as JSON lines.
+    rrd: the recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
     """
-    from bench.results.report import export_run
+    from bench.results.export import export_run
 
     paths = export_run(run, format_.value, out)
     for path in paths:

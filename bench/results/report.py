@@ -1,8 +1,7 @@
-"""Tables, figures and exports of a run, made from its journal."""
+"""Tables, figures and the page of a run, made from its journal."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,12 @@ from rich.console import Console
 from rich.table import Table as Columns
 
 from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
-from bench.extras import needed_for
-from bench.hysteresis import MemoryCurve, Operator
-from bench.identification import measure_errors
+from bench.hysteresis import MemoryCurve
 from bench.journal import Record, Table, expected_steps, run_card
-from bench.model_file import ModelFile, parse_model
+from bench.lateness import lateness_lines
+from bench.model_file import ModelFile
 from bench.printing import print_plain
-from bench.results.data import write_csv
+from bench.results.export import make_folder
 from bench.results.figures import (
     check_matplotlib,
     plot_coverage,
@@ -29,16 +26,30 @@ from bench.results.figures import (
     plot_signals,
 )
 from bench.results.models import ComparedModels, IdentifiedFile, errors_json
+from bench.results.models_on_run import ModelOnRun, apply_models, models_of
+from bench.results.page.render import write_page
+from bench.results.page.run_page import run_page
 from bench.results.prediction_figures import draw_predictions
 from bench.results.predictions import Predictions
-from bench.results.starting_state import StartingState, starting_state
+from bench.results.published import Published
 from bench.results.tracking import results_json
-from bench.runs import RECORDING_NAME
-from bench.units import format_numbers, header_with_unit, with_unit
+from bench.units import format_numbers, with_unit
+
+PAGE_NAME = "report.html"
+"""Usual file name of the page of a run."""
 
 
-def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console: Console) -> dict[str, Any]:
-    """Print a run's tables, draw its figures, and compare models on it; return the same for programs.
+def report_run(
+    run: Path,
+    models: Sequence[ModelFile],
+    out: Path | None,
+    console: Console,
+    *,
+    page: Path | None = None,
+    figure_format: str = "png",
+    published: Sequence[Published] = (),
+) -> dict[str, Any]:
+    """Print a run's tables, draw its figures, write its page, and compare models on it; return the same for programs.
 
     Parameters
     ----------
@@ -50,20 +61,26 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         Folder of the figures; `report` beside the journal if None.
     console : Console
         Console to print on.
+    page : Path or None
+        HTML file to write; none if None.
+    figure_format : {"png", "pdf", "svg"}
+        Format of the figures.
+    published : sequence of Published
+        Numbers of papers, for the page.
 
     Raises
     ------
     DataError
         If the run or a model cannot be read.
     MissingExtraError
-        If matplotlib is not installed.
+        If matplotlib or jinja2 is not installed.
     """
     # A Markdown parser is dear to import, and each study imports this module.
     from rich.markdown import Markdown
 
     check_matplotlib()
     with Record(run) as record:
-        folder = _make_folder(out or record.path.parent / "report")
+        folder = make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
         if remark := record.remark():
@@ -72,15 +89,25 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
         _print_events(record, console)
-        figures = _draw_run(record, steps, folder)
-        models = [*_models_of(record), *models]
-        comparison, more = _compare(record, steps, models, folder)
+        for line in lateness_lines(record.meta.get("lateness", {})):
+            print_plain(console, line)
+        figures = _draw_run(record, steps, folder, figure_format)
+        applied = apply_models(record, steps, [*models_of(record), *models]) if len(steps) else []
+        comparison = {
+            each.file.name: {**errors_json(each.errors), "unit": each.unit, "skipped": each.skip} for each in applied
+        }
+        more = _draw_errors(applied, folder, figure_format)
         controlled = str(record.meta.get("controls", ""))
         control = results_json(record, controlled) if controlled else {}
         _print_control(control, record, controlled, console)
-        _print_comparison(comparison, models, record, console)
+        _print_comparison(comparison, applied, record, console)
+        found = {"extremes": extremes, "models": comparison, **control}
+        if page is not None:
+            write_page(page, run_page(record, steps, applied, found, published))
     for path in [*figures, *more]:
         print_plain(console, f"figure: {path}")
+    if page is not None:
+        print_plain(console, f"page: {page}")
     return {
         "run": record.meta["run"],
         "status": record.status,
@@ -90,52 +117,16 @@ def report_run(run: Path, models: Sequence[ModelFile], out: Path | None, console
         "safe_state": record.meta.get("safe_state", {}),
         "extremes": extremes,
         "models": comparison,
+        "lateness": record.meta.get("lateness", {}),
         **control,
         "figures": [str(path) for path in [*figures, *more]],
+        "page": None if page is None else str(page),
     }
-
-
-def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
-    """Write a run's readings and telemetry as `csv` or `parquet`, its `rrd` or a `png`; return the files.
-
-    Raises
-    ------
-    DataError
-        If the run cannot be read or a file cannot be written.
-    ConfigurationError
-        If the format is unknown, a recording exists already, or a library that the format needs is not installed.
-    """
-    with Record(run) as record:
-        folder = _make_folder(out or record.path.parent)
-        if format_ == "rrd":
-            with needed_for("an .rrd file", "dashboard"):
-                from bench.dashboard import rebuild
-
-            path = folder / RECORDING_NAME
-            if path.exists():
-                raise ConfigurationError(f"{path} exists already; choose another folder by --out")
-            rebuild(record, path)
-            return [path]
-        if format_ == "png":
-            return [_picture(record, folder)]
-        tables = {"readings": record.steps(), "telemetry": record.telemetry()}
-        headers = {name: _headers(record, table) for name, table in tables.items()}
-    if format_ not in ("csv", "parquet"):
-        raise ConfigurationError(f"format {format_!r} is unknown; allowed are csv, parquet, rrd and png")
-    paths = []
-    for name, table in tables.items():
-        path = folder / f"{name}.{format_}"
-        if format_ == "csv":
-            write_csv(path, headers[name], list(table.columns.values()))
-        else:
-            _write_parquet(path, headers[name], table)
-        paths.append(path)
-    return paths
 
 
 def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
     """Draw the residuals of compared models, their outputs and loops; return the files."""
-    folder = _make_folder(out)
+    folder = make_folder(out)
     path = folder / "residuals.png"
     plot_errors(
         path,
@@ -148,26 +139,12 @@ def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
 
 def draw_predicted(found: Predictions, out: Path) -> list[Path]:
     """Draw the outputs of one model; return the files."""
-    return draw_predictions(found, _make_folder(out), next(iter(found.predicted)))
-
-
-def _picture(record: Record, folder: Path) -> Path:
-    with needed_for("a picture of the dashboard", "dashboard"):
-        from bench.dashboard import picture, rebuild
-
-    path = folder / "dashboard.png"
-    with tempfile.TemporaryDirectory() as scratch:
-        recording = Path(scratch) / RECORDING_NAME
-        rebuild(record, recording)
-        complaints = picture(recording, path)
-    if complaints:
-        raise DataError(f"{path}: the viewer reports: {'; '.join(complaints)}")
-    return path
+    return draw_predictions(found, make_folder(out), next(iter(found.predicted)))
 
 
 def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     """Draw loops, errors and density of an identified model; return the files."""
-    folder = _make_folder(out)
+    folder = make_folder(out)
     operator = found.file.response
     name = found.file.name
     paths = draw_predictions(found.predictions(), folder, name)
@@ -223,16 +200,16 @@ def _print_events(record: Record, console: Console) -> None:
             console.print(f"{event.t:10.1f} s  {event.kind}: {event.text}", highlight=False, markup=False)
 
 
-def _draw_run(record: Record, steps: Table, folder: Path) -> list[Path]:
+def _draw_run(record: Record, steps: Table, folder: Path, figure_format: str) -> list[Path]:
     if len(steps) == 0:
         return []
     names = [signal.name for signal in record.signals if np.any(np.isfinite(steps[signal.name]))]
     labels = [with_unit(name, record.unit(name)).replace(" / ", "\n/ ") for name in names]
-    paths = [folder / "signals.png"]
+    paths = [folder / f"signals.{figure_format}"]
     plot_signals(paths[0], steps["finished"] / 3600.0, {name: steps[name] for name in names}, labels)
     layout = record.meta.get("dashboard")
     if layout:
-        paths.append(folder / "loop.png")
+        paths.append(folder / f"loop.{figure_format}")
         plot_loops(
             paths[1],
             steps[layout["input"]],
@@ -244,47 +221,24 @@ def _draw_run(record: Record, steps: Table, folder: Path) -> list[Path]:
     return paths
 
 
-def _compare(
-    record: Record, steps: Table, models: Sequence[ModelFile], folder: Path
-) -> tuple[dict[str, dict[str, Any]], list[Path]]:
-    comparison: dict[str, dict[str, Any]] = {}
-    residuals: dict[str, Any] = {}
-    pairs: list[tuple[ModelFile, StartingState, list[str]]] = []
-    for model in models:
-        columns = [str(model.provenance.get(end, "")) for end in ("input", "output")]
-        missing = [name for name in columns if name not in steps.columns]
-        if missing:
-            raise DataError(
-                f"model {model.name} was identified with {' and '.join(missing)}, which {record.path} lacks"
-            )
-        pairs.append((model, starting_state(model, steps[columns[0]]), columns))
-    # Errors of the same rows for all.
-    skip = max((start.skip for _, start, _ in pairs), default=0)
-    for model, start, (driven, response) in pairs:
-        measured, predicted = steps[response], model.operator.evaluate(steps[driven], start.state)
-        comparison[model.name] = {
-            **errors_json(measure_errors(measured[skip:], predicted[skip:])),
-            "unit": model.operator.output_unit or record.unit(response),
-            "skipped": skip,
-        }
-        residuals[model.name] = measured - predicted
-    if not residuals:
-        return comparison, []
-    unit = next(iter(comparison.values()))["unit"]
-    path = folder / "errors.png"
-    plot_errors(path, residuals, error_label=with_unit("error", unit), skip=skip)
-    return comparison, [path]
+def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str) -> list[Path]:
+    if not models:
+        return []
+    path = folder / f"errors.{figure_format}"
+    residuals = {each.file.name: each.residuals for each in models}
+    plot_errors(path, residuals, error_label=with_unit("error", models[0].unit), skip=models[0].skip)
+    return [path]
 
 
 def _print_comparison(
-    comparison: Mapping[str, Mapping[str, Any]], models: Sequence[ModelFile], record: Record, console: Console
+    comparison: Mapping[str, Mapping[str, Any]], models: Sequence[ModelOnRun], record: Record, console: Console
 ) -> None:
     if not comparison:
         return
     table = Columns(
         "model", "max", "RMS", "unit", "RMS / % of range", title="models on this run", title_justify="left"
     )
-    outputs = {model.name: str(model.provenance["output"]) for model in models}
+    outputs = {each.file.name: each.measured.name for each in models}
     for name, entry in comparison.items():
         cells = format_numbers([entry["max"], entry["rms"]], entry["unit"], _precision(record, outputs[name]))
         table.add_row(name, *cells, f"{entry['rms_percent']:.2f}")
@@ -306,35 +260,3 @@ def _print_control(
 
 def _precision(record: Record, name: str) -> int:
     return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)
-
-
-def _models_of(record: Record) -> list[ModelFile]:
-    files = [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
-    # A model of several inputs is not compared: its errors are those of several runs together.
-    return [file for file in files if isinstance(file.model, Operator)]
-
-
-def _headers(record: Record, table: Table) -> list[str]:
-    units = {"step": "", "settled": "", "t": "s", "started": "s", "finished": "s"}
-    units |= {signal.name: signal.unit for signal in record.signals}
-    return [header_with_unit(name, units[name]) for name in table.columns]
-
-
-def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
-    # Takes a fifth of a second to import.
-    with needed_for("a parquet file", "report"):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-    try:
-        pq.write_table(pa.table(dict(zip(header, table.columns.values(), strict=True))), path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error}") from None
-
-
-def _make_folder(path: Path) -> Path:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"folder {path} cannot be made: {error.strerror}") from None
-    return path

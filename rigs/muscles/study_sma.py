@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.hysteresis import Density
 from bench.identification.two_stage import predict_series
 from bench.results.figures import (
     Curve,
@@ -20,9 +21,12 @@ from bench.results.figures import (
     plot_sequence_and_errors,
     plot_tracking,
 )
+from bench.results.published import Published
 from bench.results.tracking import TargetResults
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
 from rigs.muscles.characterization import (
+    KINDS,
+    PAPER,
     TITLES,
     Characterization,
     characterize,
@@ -36,6 +40,13 @@ from rigs.muscles.identification import FORCE, LENGTH
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
 LOAD_CHANGE = 1.96
 """What is hung on and taken off again in the session with a changing load, N."""
+_PROTOCOLS = {
+    "fv": "force-voltage",
+    "lv": "length-voltage",
+    "lf": "length-force",
+    "verification": "length-verification",
+}
+"""Protocols by the keys of `KINDS`."""
 _SHOWN = ("two-stage", "summed", "linear")
 """The paper's models, which are drawn."""
 
@@ -137,6 +148,18 @@ def carry_out(campaign: Campaign) -> StudyResult:
     )
 
 
+PUBLISHED = tuple(
+    Published(
+        _PROTOCOLS[kind],
+        f"{KINDS[kind][0]}: {TITLES[model]}, average / RMS error",
+        value,
+        "% of the range",
+        KINDS[kind][1],
+    )
+    for (kind, model), value in PAPER.items()
+)
+"""What the paper states: errors of all runs of a characterization together."""
+
 STUDY = Study(
     "sma",
     "SMA wire: three-dimensional hysteresis, its models, and control of length and force by the complete inverse.",
@@ -144,6 +167,7 @@ STUDY = Study(
     "brings length and force to 40 targets with each controller. Zhang and Yip, Three-dimensional hysteresis "
     "modeling of robotic artificial muscles with application to shape memory alloy actuators, 2017.",
     carry_out,
+    PUBLISHED,
 )
 
 
@@ -155,6 +179,7 @@ def _errors(results: TargetResults, scale: float) -> dict[str, float]:
 def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
     voltages, forces, _ = measured.resting
     models = {name: found for name, found in measured.models.items() if name in _SHOWN}
+    names = {title: name for name, title in TITLES.items()}
     fitted = {TITLES[name]: forces - models[name].residuals["force-voltage"] for name in ("two-stage", "linear")}
     paths = [
         campaign.draw(
@@ -164,6 +189,8 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             horizontal_label="voltage / V",
             vertical_label="force / N",
             columns=3,
+            measured=("measured",),
+            names=names,
         )
     ]
     for name, kind in (("figure-07-length-voltage", "length-voltage"), ("figure-08-length-force", "length-force")):
@@ -173,11 +200,20 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
         }
         lengths = {"measured": [s.lengths for s in chosen], **modelled}
         paths.append(campaign.draw(name, plot_lengths, kind, chosen, lengths))
-    paths.append(campaign.draw("figure-09-densities", plot_densities, models["two-stage"].model.densities()))
+    two_stage = models["two-stage"]
+    densities = two_stage.model.densities()
+    # The columns of each fit begin with the cells of its density.
+    swept = [
+        two_stage.certificates[stage].swept[: _cells(density)]
+        for stage, density in zip(("first", "second"), densities, strict=True)
+    ]
+    paths.append(campaign.draw("figure-09-densities", plot_densities, densities, swept))
     for panel, kind in (("a", "length-voltage"), ("b", "length-force")):
         residuals = {TITLES[which]: found.residuals[kind] * 1e3 for which, found in models.items()}
         paths.append(
-            campaign.draw(f"figure-10{panel}-errors-{kind}", plot_errors, residuals, error_label="error / mm")
+            campaign.draw(
+                f"figure-10{panel}-errors-{kind}", plot_errors, residuals, error_label="error / mm", names=names
+            )
         )
     paths.append(
         campaign.draw(
@@ -193,9 +229,14 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             },
             input_label="voltage / V",
             error_label="error / mm",
+            names=names,
         )
     )
     return paths
+
+
+def _cells(density: Density) -> int:
+    return int(np.count_nonzero(np.isfinite(density.values)))
 
 
 def _draw_control(campaign: Campaign, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:

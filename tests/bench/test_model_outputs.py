@@ -151,14 +151,14 @@ class TestFigures:
         assert drawn[f"{model}-loops.png"][1].get_xlabel() == "voltage / V"
         assert drawn[f"{model}-errors.png"][1].get_xlabel() == "row"
 
-    def test_cells_that_the_samples_of_the_fit_leave_out_are_grey(self, tmp_path, loop, drawn):
+    def test_cells_that_the_samples_of_the_fit_leave_out_are_hatched(self, tmp_path, loop, drawn):
         found = identify_file(loop, **NAMES, model="preisach", skip=60)
         # The memory has swept them, the fit has not seen it.
         assert found.coverage.fraction == 1.0
         draw_identification(found, tmp_path)
         share = 1.0 - found.identification.certificate.coverage
         title = drawn["preisach-density.png"][0].get_title(loc="left")
-        assert title == f"grey: never swept ({share:.0%} of the cells)"
+        assert title == f"light grey: zero; hatched: never swept ({share:.0%})"
         assert share > 0.1
 
     def test_a_prediction_is_drawn_over_time_where_it_is_known(self, tmp_path, drawn):
@@ -173,7 +173,11 @@ class TestFigures:
     def test_compared_models_share_their_figures(self, tmp_path, loop, models, drawn):
         compared = compare_models(list(models.values()), loop, None, None, skip=30)
         draw_comparison(compared, tmp_path)
-        assert len(texts_of(drawn["models-errors.png"][1])) == 2
+        _, *residuals = drawn["models-errors.png"]
+        assert [texts_of(axes)[0].partition(":")[0] for axes in residuals] == list(models)
+        # Errors are compared on one scale.
+        assert len({axes.get_ylim() for axes in residuals}) == 1
+        assert len({axes.get_ylim() for axes in drawn["residuals.png"]}) == 1
         for axes, name in zip(drawn["residuals.png"], models, strict=True):
             shown = float(re.search(r"max (\S+),", axes.get_title(loc="left")).group(1))
             assert shown == pytest.approx(compared.comparisons[name].raw.maximum, rel=6e-3)

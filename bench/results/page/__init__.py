@@ -1,0 +1,1 @@
+"""Pages of runs as self-contained HTML files, for a log book."""

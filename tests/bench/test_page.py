@@ -1,0 +1,164 @@
+"""The page of a run, opened in a browser: it holds all that the record says, and asks for nothing from anywhere."""
+
+import io
+import shutil
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from written_run import HOSTILE, META, write_run
+
+from bench.face import identify
+from bench.journal import add_model
+from bench.results.published import Published
+from bench.results.report import PAGE_NAME, report_run
+
+sync_api = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    assert CHROMIUM, "no Chromium is installed: apt-get install chromium"
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def opened(browser):
+    """Open a page without a network; return the text of its sections by title, the requests, and the page."""
+
+    def open_(path):
+        page = browser.new_page()
+        asked = []
+
+        def answer(route):
+            asked.append(route.request.url)
+            route.continue_() if route.request.url == path.as_uri() else route.abort()
+
+        page.route("**/*", answer)
+        problems = []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("dialog", lambda dialog: problems.append(dialog.message))
+        page.goto(path.as_uri())
+        page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true })")
+        assert asked == [path.as_uri()]
+        assert problems == []
+        sections = {each.get_attribute("id"): each.inner_text() for each in page.query_selector_all("section")}
+        return sections, page
+
+    return open_
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    folder = write_run(tmp_path_factory.mktemp("runs") / "run")
+    found = identify(folder, input="plate", output="tip", model="preisach", levels=8, band=True)
+    add_model(folder, "preisach", 1.0, found.file.to_json())
+    published = Published("loops", "largest error", "1.5", "µm", "Fig. 3", ("models", "preisach", "max"), scale=1e6)
+    other = Published("tracking", "of another protocol", "1", "", "Fig. 9")
+    result = report_run(
+        folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME, published=(published, other)
+    )
+    return folder, result
+
+
+class TestPageOfARun:
+    @pytest.fixture(scope="class")
+    def page(self, reported, opened):
+        sections, page = opened(reported[0] / PAGE_NAME)
+        yield sections, page
+        page.close()
+
+    def test_it_is_small(self, reported):
+        assert Path(reported[1]["page"]).stat().st_size < 2_000_000
+
+    def test_it_says_in_words_what_happened(self, page):
+        text = page[0]["summary"]
+        assert "Drive the plate through loops" in text
+        assert "completed after 4000 of 4000 steps" in text
+        assert "confirmed the safe state" in text
+        assert "Interlocks acted 1 times" in text
+        assert "Model preisach is off by at most" in text
+
+    @pytest.mark.parametrize(
+        ("section", "words"),
+        [
+            ("parameters", ["high", "80", "set", "emulation.noise", "drive"]),
+            ("devices-and-calibration", ["TEC-1", "15 to 95", "2025-03-01", "2026-03-01: overdue", "gain", "2.5"]),
+            ("interlocks-and-margins", ["≤ 100 °C, for 2 s", "20.", "safe", "equal readings for 60 s", "warn", "1"]),
+            ("phases", ["rise", "decay", "4:26:40", "4:26:40", "2000"]),
+            ("signals", ["plate_setpoint", "least margin", "µm"]),
+            ("loops-and-models", ["RMS / % of range", "prediction band of preisach", "90 %", "covers"]),
+            ("loops-and-models", ["coefficients of preisach", "σ from the residuals", "bias", "density at β"]),
+            ("loops-and-models", ["standard uncertainty", "cells swept"]),
+            ("numbers-of-the-paper", ["largest error", "1.5", "µm", "Fig. 3"]),
+            ("real-time", ["4000 recorded samples", "greatest", "0.600"]),
+            ("events", ["rise", "stands still", "WARN"]),
+            ("how-to-repeat-it", ["bench repeat", "bench run loops --set", "0123456789ab", "numpy"]),
+        ],
+    )
+    def test_a_section_holds_what_is_listed(self, page, section, words):
+        for word in words:
+            assert word in page[0][section]
+
+    def test_numbers_of_another_protocol_are_left_out(self, page):
+        assert "of another protocol" not in "".join(page[0].values())
+
+    def test_figures_are_drawn_with_their_texts(self, page):
+        figures = page[1].query_selector_all("figure svg")
+        texts = [figure.text_content() for figure in figures]
+        assert any("measured" in text and "residual" in text and "prediction band" in text for text in texts)
+        assert any("density" in text and "σ of the density" in text for text in texts)
+        assert any("memory curve at the end" in text for text in texts)
+        assert any("lateness / ms" in text for text in texts)
+        assert all(figure.bounding_box()["height"] > 100 for figure in figures)
+
+    def test_names_are_escaped(self, page):
+        assert "taken" not in page[1].title()[:10]
+        assert page[1].query_selector_all("script, img") == []
+        assert HOSTILE in page[1].query_selector("h1").inner_text()
+        assert HOSTILE in page[0]["phases"]
+
+
+def test_an_unfinished_run_is_what_there_is_and_marked(tmp_path, opened):
+    folder = write_run(tmp_path / "run", steps=20, finished=False)
+    console = Console(file=io.StringIO(), width=200)
+    result = report_run(folder, (), None, console, page=folder / PAGE_NAME)
+    assert result["status"] == "unfinished"
+    sections, page = opened(folder / PAGE_NAME)
+    assert page.query_selector(".badge").inner_text() == "unfinished"
+    assert "UNFINISHED" in sections["summary"]
+    assert "20 of 4000 steps" in sections["summary"]
+    page.close()
+
+
+def test_a_run_without_a_step_has_a_page(tmp_path):
+    folder = write_run(tmp_path / "run", steps=0, finished=False)
+    report_run(folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME)
+    assert "0 of 4000 steps" in (folder / PAGE_NAME).read_text()
+
+
+def test_two_runs_have_a_page(tmp_path, opened, bench):
+    folders = [
+        write_run(tmp_path / "first", steps=30),
+        write_run(tmp_path / "second", steps=40, meta={**META, "parameters": {"high": 81.0}}),
+    ]
+    code, out, _ = bench("compare", *folders, "--html", tmp_path / "both.html")
+    assert code == 0
+    assert "page:" in out
+    sections, page = opened(tmp_path / "both.html")
+    assert "parameters.high" in sections["what-differs"]
+    assert "30 common steps" in sections["signals"]
+    assert len(page.query_selector_all("figure svg")) == 2
+    page.close()
+
+
+@pytest.mark.parametrize("format_", ["pdf", "svg"])
+def test_figures_for_papers(tmp_path, bench, format_):
+    folder = write_run(tmp_path / "run", steps=20)
+    code, _, _ = bench("report", folder, "--figures", format_)
+    assert code == 0
+    assert sorted(path.name for path in (folder / "report").iterdir()) == [f"loop.{format_}", f"signals.{format_}"]

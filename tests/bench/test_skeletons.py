@@ -1,0 +1,69 @@
+"""`bench new` writes packages whose tests pass, and refuses what could not work."""
+
+import os
+import sys
+
+import pytest
+
+from bench.cli import main
+from bench.skeletons import PARTS
+
+
+def new(*arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(["new", *arguments])
+    return ended.value.code
+
+
+@pytest.mark.timeout(600)
+def test_the_tests_of_all_skeletons_pass(tmp_path, monkeypatch, capsys, finished_process):
+    monkeypatch.chdir(tmp_path)
+    for part in PARTS:
+        assert new(part, f"my-own-{part}") == 0
+        assert f"python -m pytest my-own-{part}" in capsys.readouterr().out
+        assert "$" not in (tmp_path / f"my-own-{part}" / "pyproject.toml").read_text()
+    site = tmp_path / "site"
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(site),
+        "PIP_TARGET": str(site),
+        "PIP_NO_INDEX": "1",
+        "PIP_NO_DEPS": "1",
+        # This is how pip spells --no-build-isolation in its environment.
+        "PIP_NO_BUILD_ISOLATION": "0",
+    }
+    folders = [f"./my-own-{part}" for part in PARTS]
+    installed = finished_process([sys.executable, "-m", "pip", "install", "-q", *folders], tmp_path, environment)
+    assert installed.returncode == 0, installed.stderr
+    tested = finished_process(
+        [sys.executable, "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", *folders],
+        tmp_path,
+        environment,
+    )
+    assert tested.returncode == 0, tested.stdout
+    assert " passed" in tested.stdout
+    listed = finished_process([sys.executable, "-m", "bench", "list"], tmp_path, environment)
+    assert all(f"my-own-{part}" in listed.stdout for part in ("protocol", "model", "rig"))
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "expected"),
+    [
+        ("device", "Balance", "lower-case letters"),
+        ("model", "my_model", "lower-case letters"),
+        ("protocol", "class", "lower-case letters"),
+        ("model", "preisach", "of the package actuator-bench"),
+    ],
+)
+def test_a_name_that_could_not_work_is_refused(tmp_path, monkeypatch, capsys, part, name, expected):
+    monkeypatch.chdir(tmp_path)
+    assert new(part, name) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_exists_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    assert new("rig", "mine", "--out", str(tmp_path)) == 2
+    assert "exists already" in " ".join(capsys.readouterr().err.split())
+    assert not list((tmp_path / "mine").iterdir())
