@@ -6,7 +6,7 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -352,7 +352,7 @@ def _draw_models(
                 {MODELS[key].title: residuals[key]},
                 error_label=error,
                 names=names,
-                published={MODELS[key].title: MODELS[key].identification},
+                published=_published([key], "identification"),
             )
         )
         if density_figure is not None:
@@ -378,10 +378,16 @@ def _draw_models(
             input_label=temperature,
             error_label=error,
             names=names,
-            published={model.title: model.validation for model in MODELS.values()},
+            published=_published(MODELS, "validation"),
         )
     )
     return paths
+
+
+def _published(keys: Iterable[str], kind: str) -> dict[str, float]:
+    """Return the paper's largest errors of its models by their titles, 1/m."""
+    found = {MODELS[key].title: getattr(MODELS[key], kind) for key in keys}
+    return {title: value for title, value in found.items() if value is not None}
 
 
 def _draw_control(
