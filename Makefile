@@ -45,12 +45,15 @@ lint: $(SETUP)
 types: lint
 	$(BIN)/mypy
 
-# Compiled once, before the workers of the tests would each do it.
+# Compiled once, before the workers of the tests would each do it; so are the modules of the tests, with what pytest
+# makes of their assertions.
 kernels: lint
 	$(BIN)/python -P tests/compile_kernels.py
+	$(BIN)/python -m pytest --collect-only -qq > /dev/null
 
+# A third of the examples of each property.
 tests: kernels
-	$(PYTEST)
+	$(PYTEST) --hypothesis-profile=brief
 
 all-tests: kernels
 	$(PYTEST) -m 'not benchmark'

@@ -426,6 +426,8 @@ def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     if parents in (["telemetry"], ["safety"]):
         # Tables with defaults for every key, which a file may leave out.
         content.setdefault(parents[0], {})
+    if parents == ["emulation", "plant"] and isinstance(content.get("emulation"), dict):
+        content["emulation"].setdefault("plant", {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")

@@ -57,7 +57,12 @@ class SweepParameters(LoadedParameters):
     low: float = parameter(from_slot("drive", "low"), unit=DRIVE, help="lowest set-point, where the memory is reset")
     high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point")
     dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+        from_slot("drive", "dwell"),
+        unit="s",
+        low=0.01,
+        high=3600,
+        help="hold at each set-point before the reading",
+        changeable=True,
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
 
 from bench.hysteresis import Density
 from bench.hysteresis.documents import Model
@@ -36,10 +36,11 @@ def densities_of(models: Iterable[ModelFile]) -> list[ModelDensity]:
 
 @dataclass(frozen=True)
 class End:
-    """How the run ended: `completed`, `aborted` or `failed`, and why."""
+    """How a run ended: `completed`, `aborted` or `failed`, and why; how late its loops were (`bench.lateness`)."""
 
     status: str
     reason: str
+    lateness: Mapping[str, Any] = field(default_factory=dict)
 
 
 Entry: TypeAlias = Tick | StepRecord | Event | ModelDensity | End

@@ -162,4 +162,5 @@ def _end_of(record: Record) -> list[End]:
     """Return how the run ended; nothing if it goes on or its process died."""
     if "status" not in record.meta:
         return []
-    return [End(str(record.meta["status"]), str(record.meta.get("reason", "")))]
+    meta = record.meta
+    return [End(str(meta["status"]), str(meta.get("reason", "")), meta.get("lateness", {}))]

@@ -6,7 +6,7 @@ import queue
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from bench.clock import WallClock
@@ -115,9 +115,9 @@ class Dashboard:
         """Write no more into the .rrd file, as the journal needs the space; the live view goes on."""
         self._recording_stops = True
 
-    def finish(self, status: str, reason: str) -> None:
-        """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
-        self._put(End(status, reason), QUEUED_ENTRIES)
+    def finish(self, status: str, reason: str, lateness: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Show how the run ended: `completed`, `aborted` or `failed`, and why; and how late its loops were."""
+        self._put(End(status, reason, lateness), QUEUED_ENTRIES)
 
     def close(self) -> None:
         """Hand over what is queued and let go of file and viewers; waits a bounded time.

@@ -27,6 +27,7 @@ from bench.dashboard.xy_plots import Point, XYPlots
 from bench.devices import Signal
 from bench.errors import ConfigurationError
 from bench.journal import StepRecord, run_card
+from bench.lateness import lateness_lines
 from bench.layout import DashboardLayout
 
 
@@ -99,6 +100,10 @@ class Writer:
                 self._planes.draw_density(self.recording, entry)
             elif isinstance(entry, End):
                 self.recording.set_property("outcome", {"status": entry.status, "reason": entry.reason})
+                if entry.lateness:
+                    lines = "\n".join(lateness_lines(entry.lateness))
+                    text = f"{self._card}\n\n```text\n{lines}\n```\n"
+                    self.recording.log("card", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
             if self._errors is not None:
                 self._errors.see(entry)
             self._numbers.see(entry)

@@ -140,6 +140,12 @@ class Record:
                 raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
             yield record
 
+    def newest_ticks(self, count: int) -> list[tuple[float, ...]]:
+        """Return the newest ticks, oldest first, unchecked: laboratory time in s, and one value a signal."""
+        columns = ", ".join(quoted(name) for name in ("t", *(signal.name for signal in self.signals)))
+        rows = self._query(f"SELECT {columns} FROM telemetry ORDER BY tick DESC LIMIT {count:d}")  # noqa: S608 - own names
+        return [tuple(math.nan if value is None else float(value) for value in row) for row in reversed(rows)]
+
     def telemetry(self, after: int = 0) -> Table:
         """Return the ticks, those with numbers beyond `after`: columns `t`, `step`, and one a signal."""
         names = ("tick", "t", "step", *(signal.name for signal in self.signals))

@@ -13,6 +13,7 @@ from pydantic_core import PydanticUndefined
 from bench.binding import RoleTable, Slots, rate_unit
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
+from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
 from bench.protocol.vocabulary import Messages
 
@@ -75,6 +76,7 @@ def parameter(
     high: float | None = None,
     choices: Callable[[], Sequence[str]] | None = None,
     file: bool = False,
+    changeable: bool = False,
 ) -> Any:  # noqa: ANN401 - stands for a field's default
     """Declare a parameter of a protocol.
 
@@ -93,8 +95,10 @@ def parameter(
     file : bool
         Whether it is the path of a file that the protocol reads; the content is then kept with the run. An empty text
         stands for no file.
+    changeable : bool
+        Whether the operator may change it at a pause. The protocol has to read it from its parameters each time.
     """
-    extra: dict[str, Any] = {"unit": unit, "choices": choices, "file": file}
+    extra: dict[str, Any] = {"unit": unit, "choices": choices, "file": file, "changeable": changeable}
     if isinstance(default, FromSlot):
         extra["default"] = default
         default = ...
@@ -172,6 +176,43 @@ class ProtocolDefinition:
     def file_parameters(self) -> tuple[str, ...]:
         """The names of the parameters that name files."""
         return tuple(name for name in self.parameters.model_fields if self._extra(name).get("file"))
+
+    @property
+    def changeable(self) -> tuple[str, ...]:
+        """The names of the parameters that may be changed at a pause."""
+        return tuple(name for name in self.parameters.model_fields if self._extra(name).get("changeable"))
+
+    def change(self, parameters: ProtocolParameters, name: str, value: Any) -> Any:  # noqa: ANN401
+        """Change a parameter of a protocol that goes on, which sees it when it reads it next.
+
+        Parameters
+        ----------
+        parameters : ProtocolParameters
+            Those that the protocol was started with.
+        name : str
+            The parameter.
+        value
+            Its new value, also as a text.
+
+        Returns
+        -------
+        any
+            The value as JSON holds it.
+
+        Raises
+        ------
+        ConfigurationError
+            If it may not be changed at a pause, or not to this value; nothing is changed then.
+        """
+        if name not in self.changeable:
+            known = ", ".join(self.changeable) or "none"
+            raise ConfigurationError(
+                f"protocol {self.name}: {name!r} cannot be changed at a pause; parameters that can: {known}"
+            )
+        changed = self.parse({**parameters.model_dump(), name: value})
+        # Of the object that the protocol has; no other way is open to it, as values are frozen.
+        parameters.__dict__[name] = getattr(changed, name)
+        return changed.model_dump(mode="json")[name]
 
     def files(self, parameters: ProtocolParameters) -> dict[str, str]:
         """Return the paths of the files that the parameters name, by the name of the parameter."""
@@ -329,6 +370,40 @@ class ProtocolDefinition:
                 )
             else:
                 yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
+
+
+@dataclass(frozen=True)
+class OpenParameters:
+    """The parameters of a protocol that goes on, as they may be changed at a pause.
+
+    Attributes
+    ----------
+    definition : ProtocolDefinition
+        The protocol.
+    parameters : ProtocolParameters
+        Those that it was started with.
+    roles : mapping of str to RoleTable
+        The roles that its rig file binds, for units.
+    """
+
+    definition: ProtocolDefinition
+    parameters: ProtocolParameters
+    roles: Mapping[str, RoleTable]
+
+    def changeable(self) -> dict[str, str]:
+        """Return those that may be changed, with value, unit and what is allowed."""
+        found: dict[str, str] = {}
+        for entry in self.definition.help(self.roles):
+            if entry.name in self.definition.changeable:
+                unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
+                value = getattr(self.parameters, entry.name)
+                found[entry.name] = f"{value}{unit}, {entry.text} ({entry.allowed})"
+        return found
+
+    def change(self, step: int, name: str, value: str) -> ParameterChange:
+        """Change one from the reading of a step on; raises ConfigurationError if that is not allowed."""
+        former = self.parameters.model_dump(mode="json").get(name)
+        return ParameterChange(step, name, self.definition.change(self.parameters, name, value), former)
 
 
 def protocol(

@@ -123,7 +123,9 @@ class ThermomechanicalParameters(ProtocolParameters):
     coldest: float = parameter(-0.15, unit="A", low=-1, high=0, help="lowest current, which cools most")
     hottest: float = parameter(0.1, unit="A", low=0, high=1, help="highest current")
     levels: int = parameter(9, unit="1", low=2, high=1000, help="currents on each way")
-    dwell: float = parameter(240.0, unit="s", low=1, high=36000, help="hold at each before the reading")
+    dwell: float = parameter(
+        240.0, unit="s", low=1, high=36000, help="hold at each before the reading", changeable=True
+    )
 
 
 @protocol(needs=THERMAL, views=HEATING)

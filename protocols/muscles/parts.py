@@ -57,7 +57,12 @@ class ResetParameters(ProtocolParameters):
         from_slot("drive", "high"), unit=unit_of("drive"), help="highest set-point, where the memory is reset"
     )
     dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.5, high=3600, help="hold at each set-point before the reading"
+        from_slot("drive", "dwell"),
+        unit="s",
+        low=0.5,
+        high=3600,
+        help="hold at each set-point before the reading",
+        changeable=True,
     )
     pretension: float = parameter(0.3, unit="N", low=0.05, high=10, help="force under which the memory is reset")
 

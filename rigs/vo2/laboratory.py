@@ -17,6 +17,7 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
+from sim_devices.plants.grid import changed
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
@@ -37,6 +38,10 @@ class VO2LaboratorySettings(LaboratorySettings):
     disturbances: bool = Field(default=True, description="whether the film's temperature wanders and drifts")
     ambient_temperature: float = Field(default=22.0, ge=0, le=40, description="temperature of the room, °C")
     psd_noise: float = Field(default=5e-3, ge=0, le=1, description="noise of the PSD in one conversion, V rms")
+    plant: dict[str, float] = Field(
+        default={},
+        description="numbers of plate and film in place of their own, by the names in `sim_devices.plants.vo2`",
+    )
     volts_per_metre: float = Field(
         default=1e5, gt=0, description="sensitivity of laser, beam and PSD together, V per m of tip deflection"
     )
@@ -67,6 +72,7 @@ class VO2Laboratory(EmulatedLaboratory):
         )
         if not settings.disturbances:
             specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
+        specimen = changed(specimen, settings.plant)
         self.plant = VO2Cantilever(specimen, plant_stream)
         compile_loops(self.plant, lambda plant: plant.advance(plant.parameters.step))
         self.world = World(self.plant, clock)
