@@ -191,8 +191,8 @@ def test_bounds_are_drawn_once_the_data_are_near(tmp_path: Path) -> None:
         return {row[0] for path in paths for row in values[path]}
 
     assert drawn("far.rrd", [50.0, 51.0]) == set()
-    assert drawn("near.rrd", [50.0, 80.0]) == {90.0, 100.0}
-    assert drawn("all.rrd", [20.0, 80.0]) == {10.0, 15.0, 90.0, 100.0}
+    assert drawn("near.rrd", [50.0, 80.0]) == {90.0, 95.0, 100.0}
+    assert drawn("all.rrd", [20.0, 80.0]) == {10.0, 10.5, 15.0, 90.0, 95.0, 100.0}
     bounds = bounds_of(META, SIGNALS)
     assert [bound.kind for bound in bounds].count("limit") == 2
     found = nearest(bounds, (95.0, 80.0, 0.0, *NOTHING))
