@@ -37,7 +37,19 @@ from bench.past import Resumption, reprime
 from bench.protocol.changes import PARAMETER, ParameterChange
 from bench.protocol.parameters import OpenParameters, ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
-from bench.protocol.vocabulary import PROMPT, ByHand, Control, FixedRate, Message, Note, Phase, Prompt, Reading, Step
+from bench.protocol.vocabulary import (
+    PROMPT,
+    ByHand,
+    Control,
+    FixedRate,
+    KeptModel,
+    Message,
+    Note,
+    Phase,
+    Prompt,
+    Reading,
+    Step,
+)
 from bench.questions import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.rig import Look
 from bench.running import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
@@ -191,6 +203,8 @@ class Engine:
                     run.event("INFO", "phase", message.name)
                 elif isinstance(message, Note):
                     run.event("INFO", "note", message.text)
+                    if isinstance(message, KeptModel):
+                        run.keep_model(message.name, message.content)
                 elif type(message) in self._work:
                     run.pause_if_asked()
                     run.expect_ticks("a step is carried out")

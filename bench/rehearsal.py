@@ -366,6 +366,9 @@ class _Kept:
         if self._others > LONGEST:
             raise ConfigurationError(self._endless.format(f"{LONGEST} notes"))
 
+    def keep_model(self, name: str, t: float, content: Mapping[str, Any]) -> None:
+        pass
+
     def take_notices(self) -> list[str]:
         return []
 

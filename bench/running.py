@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
-from typing import Protocol
+from typing import Any, Protocol
 
 from bench.control.tracking import Trace
 from bench.devices import Signal
@@ -42,6 +42,9 @@ class RunRecord(Protocol):
 
     def event(self, event: Event) -> None:
         """Keep something that happened."""
+
+    def keep_model(self, name: str, t: float, content: Mapping[str, Any]) -> None:
+        """Keep a model (the content of a model file) whose data reach to a time from the start of the run in s."""
 
     def take_notices(self) -> list[str]:
         """Return what happened to the record itself since the last call."""
@@ -294,6 +297,10 @@ class RunAtHand:
         event = Event(self.clock.now() - self.zero, level, kind, text)
         self._journal.event(event)
         self._tell(lambda observer: observer.event(event))
+
+    def keep_model(self, name: str, content: Mapping[str, Any]) -> None:
+        """Keep a model with the run: a name, and the content of a model file."""
+        self._journal.keep_model(name, self.clock.now() - self.zero, content)
 
     def check_signals(self, *names: str) -> None:
         """Raise ConfigurationError if the rig lacks a signal."""

@@ -241,7 +241,7 @@ def carry_out(
             observers.append(dashboard)
             journal.when_short = dashboard.stop_recording
             if run.live:
-                console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
+                _open_view(dashboard, console)
         length = _expectation(rehearsal, planned)
         progress = ProgressDisplay(console, run.protocol.name, signals, _shown(description), length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
@@ -264,6 +264,17 @@ def carry_out(
             dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _open_view(dashboard: Dashboard, console: Console) -> None:
+    """Open the viewer of a live view where there is a display, else say how to."""
+    from bench.dashboard.viewers import has_display, open_viewer
+
+    if dashboard.uri is not None and has_display():
+        open_viewer(dashboard.uri)
+        print_plain(console, f"live view: {dashboard.uri}; bench watch opens it again")
+    else:
+        console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
 
 
 def _checked(

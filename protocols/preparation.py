@@ -19,6 +19,7 @@ from bench.protocol import (
     Slot,
     Slots,
     Step,
+    Views,
     from_slot,
     parameter,
     unit_of,
@@ -28,6 +29,9 @@ DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actu
 """What a characterization needs of a rig."""
 LOAD: Mapping[str, type[Signal]] = {"load": Signal}
 """What it uses if the rig has it: a load that an operator hangs on the specimen."""
+
+LOOP = Views(loops=(("drive", "response"),))
+"""What is worth seeing of it."""
 
 R = TypeVar("R")
 Part: TypeAlias = Generator[Message, Reading, R]

@@ -9,7 +9,7 @@ import numpy as np
 from bench.errors import DataError
 from bench.protocol import Dwell, Messages, Phase, Slot, Slots, Step, parameter, protocol
 from bench.results.data import read_columns
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, SweepParameters, reset
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, reset
 
 _LONGEST_DWELL = 86400.0
 
@@ -24,7 +24,7 @@ class Parameters(SweepParameters):
     )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def sequence(parameters: Parameters, slots: Slots) -> Messages:
     """Measure along a sequence of set-points from a file, such as one of `bench design`.
 

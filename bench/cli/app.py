@@ -35,6 +35,7 @@ from bench.cli import (
     runs,
     twin,
     upkeep,
+    watch,
 )
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
@@ -63,6 +64,7 @@ _PARTS = (
     designs.app,
     comparisons.app,
     records.app,
+    watch.app,
     journals.app,
     twin.app,
     new.app,

@@ -23,7 +23,9 @@ error_console = Console(stderr=True)
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
 ]
-LiveOption = Annotated[bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")]
+LiveOption = Annotated[
+    bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
+]
 NotifyOption = Annotated[
     list[str] | None,
     typer.Option(

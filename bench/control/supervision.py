@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
 from bench.control.loops import Reaching
+from bench.control.model_filters import ModelFilter
 from bench.control.tracking import Command, Trace
 from bench.errors import ConvergenceError
 from bench.hysteresis import Reach
@@ -42,6 +43,9 @@ class Supervised:
     fallback : callable or None
         Makes the controller that goes on, from the memory of the one that is given up. Without it a
         `ConvergenceError` ends the run in the safe state.
+    compares : bool
+        Whether errors are compared with those of the model. Not of a controller that corrects its model: what that
+        errs by at present is the same.
     """
 
     def __init__(
@@ -50,12 +54,15 @@ class Supervised:
         limits: tuple[float, float],
         span: float,
         fallback: Callable[[Any], Reaching] | None = None,
+        *,
+        compares: bool = True,
     ) -> None:
         self._controller: Any = controller
         self._watch = LimitCycleWatch(*limits)
         self._limits = limits
         self._tolerance = _TOLERANCE * span
         self._fallback = fallback
+        self._compares = compares
         self._judged: deque[tuple[float, float]] = deque(maxlen=TARGETS)
         self._target = self._output = math.nan
         self._finished = False
@@ -90,6 +97,12 @@ class Supervised:
         return self._controller.state
 
     @property
+    def adaptation(self) -> ModelFilter | None:
+        """What corrects the model of the controller at work; None if nothing does."""
+        found: ModelFilter | None = getattr(self._controller, "adaptation", None)
+        return found
+
+    @property
     def reach(self) -> Reach:
         """Whether the present target can be met."""
         reach: Reach = self._controller.reach
@@ -119,7 +132,7 @@ class Supervised:
 
     def _judge(self) -> str:
         """Judge how the last target was met; return why the controller does not converge, or nothing."""
-        if self.gave_up or not self._finished or self.reach is not Reach.MET:
+        if not self._compares or self.gave_up or not self._finished or self.reach is not Reach.MET:
             return ""
         error, without = self._output - self._target, self.trace.disturbance
         if not math.isfinite(without):

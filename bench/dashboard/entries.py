@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 from bench.hysteresis import Density
+from bench.hysteresis.documents import Model
 from bench.journal import Event, StepRecord
 from bench.model_file import ModelFile
 
@@ -21,15 +22,16 @@ class Tick(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelDensity:
-    """A density to draw, and the name of its model."""
+    """A density to draw, the name of its model, and the model."""
 
     name: str
     density: Density
+    model: Model
 
 
 def densities_of(models: Iterable[ModelFile]) -> list[ModelDensity]:
     """Return the densities of models, in their order; a model without a plane has none."""
-    return [ModelDensity(file.name, density) for file in models for density in file.model.densities()]
+    return [ModelDensity(file.name, density, file.model) for file in models for density in file.model.densities()]
 
 
 @dataclass(frozen=True)

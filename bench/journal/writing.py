@@ -18,6 +18,7 @@ from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
+from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
 from bench.journal.store import Store
@@ -196,6 +197,10 @@ class Journal:
     def event(self, event: Event) -> None:
         """Record something that happened."""
         self._write([entry("events", (self._number("events"), event.t, event.level, event.kind, event.text))])
+
+    def keep_model(self, name: str, t: float, content: Mapping[str, Any]) -> None:
+        """Keep a model beside the journal; see `add_model`."""
+        add_model(self.path, name, t, content)
 
     def take_notices(self) -> list[str]:
         """Return what happened to the journal itself since the last call."""

@@ -168,7 +168,7 @@ class RunInProgress:
         If there is no journal, or it is damaged.
     """
 
-    keys = (PAUSE,)
+    keys: tuple[str, ...] = (PAUSE,)
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder if folder.is_dir() else folder.parent

@@ -48,7 +48,9 @@ _LAST_PART = 0.1
 _FEWEST_TICKS = 5
 """Periods of the telemetry that a place is held where the run held none."""
 
-_REMARKS = {Phase: "phase", Note: "note"}
+
+_REMARKS = ("phase", "note")
+"""Kinds of the events that a protocol's own messages leave."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Past:
         times = [step.finished for step in steps] + [event.t for event in events] + ticks["t"].tolist()
         return cls(
             steps=steps,
-            remarks=tuple((event.kind, event.text) for event in events if event.kind in _REMARKS.values()),
+            remarks=tuple((event.kind, event.text) for event in events if event.kind in _REMARKS),
             changes=ParameterChange.among((event.kind, event.text) for event in events),
             names=tuple(signal.name for signal in record.signals),
             units={signal.name: signal.unit for signal in record.signals},
@@ -261,7 +263,7 @@ def _feed(
                 _differs(definition, f"it ends, where the record has step {steps[0].step} ({steps[0].label})")
             return fed
         if isinstance(message, Phase | Note):
-            text = message.name if isinstance(message, Phase) else message.text
+            kind, text = ("phase", message.name) if isinstance(message, Phase) else ("note", message.text)
             if isinstance(message, Phase):
                 fed.phase = text
             if not remarks:
@@ -269,7 +271,7 @@ def _feed(
                     _differs(definition, f"it yields {message!r} before step {steps[0].step}, which is not recorded")
                 fed.message = message
                 return fed
-            if remarks.popleft() != (_REMARKS[type(message)], text):
+            if remarks.popleft() != (kind, text):
                 _differs(definition, f"it yields {message!r}, which the record does not have there")
             continue
         if steps and not isinstance(message, Message):

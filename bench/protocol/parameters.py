@@ -14,6 +14,7 @@ from bench.binding import RoleTable, Slots, rate_unit
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
 from bench.protocol.changes import ParameterChange
+from bench.protocol.views import Views
 from bench.protocol.vocabulary import Messages
 
 Needs = Mapping[str, type[Device] | type[Signal]] | Sequence[str]
@@ -141,6 +142,8 @@ class ProtocolDefinition:
         What can be set.
     generator : callable
         Takes the parameters, and the slots where it asks for some.
+    views : Views or None
+        What the dashboard shows of it; None for all that the rig file lays out.
     """
 
     name: str
@@ -151,6 +154,7 @@ class ProtocolDefinition:
     parameters: type[ProtocolParameters]
     generator: Callable[..., Messages]
     may_use: Mapping[str, type[Device] | type[Signal]] = field(default_factory=dict)
+    views: Views | None = None
 
     @property
     def slots(self) -> Mapping[str, type[Device] | type[Signal]]:
@@ -403,7 +407,11 @@ class OpenParameters:
 
 
 def protocol(
-    *, needs: Needs, may_use: Mapping[str, type[Device] | type[Signal]] | None = None, controls: str = ""
+    *,
+    needs: Needs,
+    may_use: Mapping[str, type[Device] | type[Signal]] | None = None,
+    controls: str = "",
+    views: Views | None = None,
 ) -> Callable[[Callable[..., Messages]], ProtocolDefinition]:
     """Make a generator function a protocol.
 
@@ -420,6 +428,8 @@ def protocol(
     controls : str
         Slot (or signal) that the protocol's controllers control, if it has any: what they think of it (`TRACES`) is
         then recorded beside the rig's signals.
+    views : Views, optional
+        What the dashboard shows of it, by its slots; all that the rig file lays out if not given.
 
     Raises
     ------
@@ -454,6 +464,7 @@ def protocol(
             parameters=hints[0],
             generator=function,
             may_use=dict(may_use or {}),
+            views=views,
         )
 
     return define

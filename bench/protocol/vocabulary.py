@@ -26,6 +26,7 @@ import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from bench.control.loops import BlockController, ControlTask, DelayedController, SampledController
 from bench.desk import Desk
@@ -327,6 +328,24 @@ class Note(Message):
     def plan(self) -> Planned:
         """Return that nothing moves."""
         return Planned(settled=None)
+
+
+@dataclass(frozen=True)
+class KeptModel(Note):
+    """A model that is kept with the run, in place of an earlier one of this name; the text goes to the log.
+
+    Parameters
+    ----------
+    text : str
+        A sentence for the log.
+    name : str
+        Name of the model among those of the run.
+    content : mapping
+        The model file's content.
+    """
+
+    name: str
+    content: Mapping[str, Any]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from bench.controllers import ControllerSetup, make_controller
 from bench.model_file import load_model
 from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
 from bench.protocol.number_list import NumberList
-from protocols.hybrid import FINE, SENSORS, THERMAL, WITNESS
+from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -47,7 +47,7 @@ class Parameters(ProtocolParameters):
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response")
+@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response", views=BOTH_LOOPS)
 def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     """Make the tip follow a reference by the thermal and the piezo part together.
 
@@ -85,7 +85,7 @@ class StepParameters(ProtocolParameters):
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=FINE, may_use=WITNESS, controls="response")
+@protocol(needs=FINE, may_use=WITNESS, controls="response", views=FINE_OVER_TIME)
 def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 

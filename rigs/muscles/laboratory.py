@@ -28,7 +28,7 @@ from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import GRID_TOLERANCE, changed
+from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -82,9 +82,16 @@ class MusclePlant(Protocol):
     def clamp(self, length_metre: float) -> None:
         """Hold the end at a position, m from rest."""
 
+    def since_point(self) -> float:
+        """Return the time for which it has stood at the last point of its time grid, s."""
+
     @property
     def parameters(self) -> MuscleParameters:
         """Its numbers."""
+
+    @property
+    def forces(self) -> Floats:
+        """The force (N) at the last points of its time grid, in a ring; see `Muscle`."""
 
     @property
     def current(self) -> float:
@@ -210,7 +217,7 @@ class ForceCourse:
     ----------
     frame : Frame
         The muscle's frame.
-    muscle : SMAWire
+    muscle : MusclePlant
         The muscle, which keeps its force.
     sensor : FaultySensor
         What the load cell sees of the force.
@@ -218,7 +225,7 @@ class ForceCourse:
 
     tolerance = GRID_TOLERANCE
 
-    def __init__(self, frame: Frame, muscle: SMAWire, sensor: FaultySensor) -> None:
+    def __init__(self, frame: Frame, muscle: MusclePlant, sensor: FaultySensor) -> None:
         self._frame = frame
         self._muscle = muscle
         self._sensor = sensor
@@ -295,10 +302,7 @@ class MuscleLaboratory(EmulatedLaboratory):
             weight_limits=(-5.0, 50.0),
             zero_tracking=0,
             noise=settings.force_noise,
-            # Of the other muscles it sees the force at each of its own instants.
-            course=ForceCourse(self.frame, self.muscle, self._force_sensor)
-            if isinstance(self.muscle, SMAWire)
-            else None,
+            course=ForceCourse(self.frame, self.muscle, self._force_sensor),
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
