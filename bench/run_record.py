@@ -126,7 +126,7 @@ def metadata(
             **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
         },
         "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
-        "operator": _operator(),
+        "operator": current_user(),
         "command": sys.argv,
         "packages": _versions(),
         "git": _git_state(),
@@ -187,7 +187,8 @@ def make_folder(parent: Path, name: str) -> Path:
     raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
 
 
-def _operator() -> str:
+def current_user() -> str:
+    """Return the name of the user of this process, or `unknown`."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):
