@@ -18,7 +18,7 @@ from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
 from bench.readables import ReadableSignal
 from bench.rig_file import Laboratory, RigFile
-from bench.roles import BlockPlayer, Floats, JointReader
+from bench.roles import BlockPlayer, Floats, JointReader, LoadCell
 from bench.safety import SAFE, make_safe
 
 T = TypeVar("T")
@@ -163,6 +163,14 @@ class Rig:
             if own & sources:
                 readings[device_name] = device.measure()
         return self.assembled(readings)[name]
+
+    def load_cell(self, name: str) -> LoadCell:
+        """Return a load cell; raises ConfigurationError if there is none of that name."""
+        device = self.devices.get(name)
+        if not isinstance(device, LoadCell):
+            known = ", ".join(name for name, each in self.devices.items() if isinstance(each, LoadCell)) or "none"
+            raise ConfigurationError(f"{name} is not a load cell; there are: {known}")
+        return device
 
     @property
     def setpoints(self) -> dict[str, float]:

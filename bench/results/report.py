@@ -13,6 +13,7 @@ from rich.table import Table as Columns
 from bench.devices import Signal
 from bench.hysteresis import MemoryCurve
 from bench.journal import Record, Table, expected_steps, run_card
+from bench.lateness import lateness_lines
 from bench.model_file import ModelFile
 from bench.printing import print_plain
 from bench.results.export import make_folder
@@ -88,6 +89,8 @@ def report_run(
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
         _print_events(record, console)
+        for line in lateness_lines(record.meta.get("lateness", {})):
+            print_plain(console, line)
         figures = _draw_run(record, steps, folder, figure_format)
         applied = apply_models(record, steps, [*models_of(record), *models]) if len(steps) else []
         comparison = {
@@ -114,6 +117,7 @@ def report_run(
         "safe_state": record.meta.get("safe_state", {}),
         "extremes": extremes,
         "models": comparison,
+        "lateness": record.meta.get("lateness", {}),
         **control,
         "figures": [str(path) for path in [*figures, *more]],
         "page": None if page is None else str(page),
