@@ -29,7 +29,9 @@ from bench.dashboard import rebuild
 from bench.dashboard.from_journal import JournalView
 from bench.dashboard.screenshot import Camera
 from bench.dashboard.viewers import web_viewer
+from bench.errors import DataError
 from bench.journal import FILE_NAME, Record
+from bench.model_file import load_model
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
 
@@ -49,10 +51,21 @@ SHORT: dict[str, dict[str, Any]] = {
     "covering": {"levels": 8},
     "first-order-reversals": {"levels": 8},
     "random-validation": {"count": 60},
+    "length-control": {"count": 12},
+    "force-control": {"count": 12},
+    "hybrid-control": {"hold": 10.0},
     "tracking": {"count": 12, "controller": "closed-loop-inverse"},
     "following": {"duration": 200.0, "period": 100.0, "controller": "open-loop-inverse"},
 }
 """Parameters of the protocols that no study carries out on a rig."""
+
+KINDS = {
+    "length-control": "two-stage",
+    "force-control": "two-stage",
+    "hybrid-control": "hybrid",
+    "fine-step": "hybrid",
+}
+"""Models of the protocols that take one of their own kind."""
 
 PATIENCE = 120.0
 
@@ -75,11 +88,24 @@ def choose(runs: list[Path], wanted: dict[str, Any]) -> Path:
     return runs[0]
 
 
-def short_run(rig: str, protocol: str, out: Path, models: dict[str, Path]) -> Path:
+def study_model(runs: dict[tuple[str, str], list[Path]], rig: str, kind: str) -> Path:
+    """Return a model file of a kind that a study has identified from runs of a rig."""
+    folders = {run.parent for (of_rig, _), found in runs.items() if of_rig == rig for run in found}
+    for path in (path for folder in sorted(folders) for path in sorted(folder.glob("*.json"))):
+        if load_model(path).model.kind == kind:
+            return path
+    raise DataError(f"the studies have no model {kind} of {rig}")
+
+
+def short_run(
+    rig: str, protocol: str, out: Path, models: dict[str, Path], runs: dict[tuple[str, str], list[Path]]
+) -> Path:
     """Carry a protocol out on a rig, on the virtual clock; return its folder."""
     settings = dict(SHORT.get(protocol, {}))
     definition = find_protocol(protocol)
-    if definition.needs_model:
+    if protocol in KINDS:
+        settings["model"] = str(study_model(runs, rig, KINDS[protocol]))
+    elif definition.needs_model:
         if rig not in models:
             models[rig] = identified(rig, out)
         settings["model"] = str(models[rig])
@@ -217,7 +243,7 @@ def main() -> int:
         for name, (rig, protocol, parameters) in wanted.items():
             try:
                 found = runs.get((rig, protocol))
-                run = choose(found, parameters) if found else short_run(rig, protocol, options.out, models)
+                run = choose(found, parameters) if found else short_run(rig, protocol, options.out, models, runs)
                 rrd, png = scratch / f"{name}.rrd", options.out / f"{name}-dark.png"
                 with Record(run) as record:
                     rebuild(record, rrd)

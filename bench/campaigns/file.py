@@ -284,5 +284,7 @@ def dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def as_override(value: object) -> str:
-    """Return a value of an override as the text of `--override`."""
+    """Return a value of an override as the text of `--override`: TOML, whose scalars and arrays are as in JSON."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(key)} = {as_override(inner)}' for key, inner in value.items())}}}"
     return json.dumps(value, ensure_ascii=False)

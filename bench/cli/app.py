@@ -20,6 +20,7 @@ from typer.models import CommandInfo
 
 from bench import registry
 from bench.cli import (
+    calibrations,
     campaign,
     comparisons,
     designs,
@@ -63,6 +64,7 @@ _PARTS = (
     models.app,
     designs.app,
     comparisons.app,
+    calibrations.app,
     records.app,
     watch.app,
     journals.app,

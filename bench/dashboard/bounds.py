@@ -70,6 +70,7 @@ def bounds_of(meta: Mapping[str, Any], signals: Sequence[Signal]) -> tuple[Bound
             continue
         kind, colour = ("warning", CAUTION) if interlock.level is Level.WARN else ("interlock", ALARM)
         found += _pair(column, signals[column], interlock.low, interlock.high, kind, colour)
+        found += _pair(column, signals[column], *interlock.unwarned, "warning", CAUTION)
     return tuple(found)
 
 

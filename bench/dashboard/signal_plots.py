@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -27,6 +28,8 @@ _PALETTE: tuple[Colour, ...] = (
     (226, 88, 136),
     (128, 146, 44),
 )
+_READING = 1.25
+"""Size of the point of a reading; in a hold that is shorter than a tick there is nothing else."""
 _QUANTITIES = {
     "°C": "temperature",
     "K": "temperature difference",
@@ -45,22 +48,23 @@ _QUANTITIES = {
 
 @dataclass(frozen=True)
 class SignalPlot:
-    """The signals of one unit: their columns, the factor to the unit shown, and how the lines look."""
+    """The signals of one unit: their columns, the factor to the unit shown, and how ticks and readings look."""
 
     path: str
     title: str
     columns: list[int]
     factor: float
-    height: int
-    style: rr.SeriesLines
+    styles: Mapping[str, rr.SeriesLines | rr.SeriesPoints]
 
     def series(self, values: Floats) -> Floats:
         """Return what is plotted of values, one row a time, one column a signal."""
         return values[:, self.columns] * self.factor
 
     def view(self) -> rrb.TimeSeriesView:
-        """Return the view of the ticks."""
-        return time_view(f"/signals/{self.path}", self.title, rrb.Corner2D.LeftBottom)
+        """Return the view of the ticks, as lines, and of the readings, as points."""
+        view = time_view(f"/signals/{self.path}", self.title, rrb.Corner2D.LeftBottom)
+        view.contents = ["$origin/**", f"/readings/{self.path}"]
+        return view
 
 
 def plots_by_unit(
@@ -78,14 +82,19 @@ def plots_by_unit(
         factor, shown = fitting_prefix(unit, *(extents[0] if extents else [likely_magnitude(members[0])]))
         quantity = _QUANTITIES.get(unit, unit)
         title = quantity if len(members) > 1 else members[0].description
-        style = rr.SeriesLines(
-            names=[f"{signal.name} [{shown}]" for signal in members],
-            colors=[_colour(signals, i) for i in columns],
-            widths=[4.0 if signal.name.endswith(SETPOINT) else 1.5 for signal in members],
-        )
+        look: dict[str, Any] = {
+            "names": [f"{signal.name} [{shown}]" for signal in members],
+            "colors": [_colour(signals, i) for i in columns],
+        }
+        styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
+            "readings": rr.SeriesPoints(**look, marker_sizes=[_READING] * len(members), markers="circle"),
+            "signals": rr.SeriesLines(
+                **look, widths=[4.0 if signal.name.endswith(SETPOINT) else 1.5 for signal in members]
+            ),
+        }
         path = rr.escape_entity_path_part(quantity)
         headline = f"{title[:1].upper()}{title[1:]} [{shown}]"
-        plots.append(SignalPlot(path, headline, columns, factor, 2 if extents else 1, style))
+        plots.append(SignalPlot(path, headline, columns, factor, styles))
     return plots
 
 

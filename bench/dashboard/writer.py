@@ -80,11 +80,11 @@ class Writer:
         self.recording.set_property("bench", self._properties)
         self.recording.log("card", rr.TextDocument(self._card, media_type=rr.MediaType.MARKDOWN))
         for plot in self._signals:
-            for kind in ("signals", "readings"):
-                self.recording.log(f"{kind}/{plot.path}", plot.style)
+            for kind, style in plot.styles.items():
+                self.recording.log(f"{kind}/{plot.path}", style)
         if self._control is not None:
-            for name, style in self._control.styles().items():
-                self.recording.log(f"control/{name}", style)
+            for name, look in self._control.styles().items():
+                self.recording.log(f"control/{name}", look)
         self._timeline.draw(self.recording)
         if self._plots is not None and self._planes is not None:
             self._plots.draw(self.recording)
@@ -170,7 +170,7 @@ class Writer:
         over_time: list[rrb.TimeSeriesView] = []
         others: list[rrb.TimeSeriesView] = []
         for plot in self._signals:
-            if filled and f"signals/{plot.path}" not in filled:
+            if filled and not {f"signals/{plot.path}", f"readings/{plot.path}"} & filled:
                 continue
             always = not self._over_time or self._over_time & set(plot.columns)
             (over_time if always else others).append(plot.view())
