@@ -47,8 +47,8 @@ _SETTINGS = "_hypothesis_internal_use_settings"
 
 
 def _take_fewer_examples(items):
-    """Divide the examples of each property: the default of a profile would not reach those that say their number."""
-    tests = (getattr(item, "obj", None) for item in items)
+    """Divide the examples of each costly property: a profile would not reach those that say their number."""
+    tests = (getattr(item, "obj", None) for item in items if item.get_closest_marker("costly"))
     for test in {getattr(test, "__func__", test) for test in tests if hasattr(test, "hypothesis")}:
         own = getattr(test, _SETTINGS, settings.default)
         fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))
