@@ -30,7 +30,7 @@ _LATE = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """Time constants of late parts that are tried, s."""
 
 
-_ROWS_OF_HOLD = 6
+_ROWS_OF_HOLD = 4
 """A hold of fewer rows says nothing of a lag once it has an offset and a factor of its own."""
 _FACTOR = 0.7
 """How far the shape of the transients may move a lag, as a natural logarithm."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from bench.control.loops import Reaching, ReachTarget
-from bench.controllers import ControllerSetup, controller_names, make_controller
+from bench.control.loops import ReachTarget
+from bench.control.supervision import Supervised
+from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
 from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
 from bench.model_file import ModelFile, load_model
@@ -21,11 +22,13 @@ from bench.protocol import (
     ProtocolParameters,
     Slots,
     Step,
+    Views,
     parameter,
     protocol,
 )
 from bench.results.tracking import REACH, READING
 from protocols.muscles.parts import (
+    LENGTH_LOOPS,
     ON_STAGE,
     ON_WEIGHTS,
     ResetParameters,
@@ -55,6 +58,14 @@ class Controlled(ProtocolParameters):
     )
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
+    tuning: dict[str, dict[str, Any]] = parameter(
+        {},
+        unit="",
+        help="numbers of a controller in place of those from the model, a table for each",
+    )
+    fallback: Fallback = parameter(
+        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+    )
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
     readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
 
@@ -74,7 +85,7 @@ class ForceParameters(Controlled, StageParameters):
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
 
-@protocol(needs=ON_WEIGHTS, controls="response")
+@protocol(needs=ON_WEIGHTS, controls="response", views=LENGTH_LOOPS)
 def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     """Bring the length of a muscle under a weight to one target after another.
 
@@ -83,7 +94,8 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     target is the error that counts. With `change` the operator hangs more on after every five targets, and takes it
     off again after the next five; the controller learns of it by the load cell alone.
     """
-    model = _load_model(parameters.model)
+    file = _load_model(parameters.model)
+    model: TwoStage = file.model
     state = model.initial_state()
     ranges = [
         _range(model, _hung(model, state, load), parameters.highest, "length")
@@ -92,9 +104,10 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
     if not low < high:
         raise ValueError("change: under the two weights the model has no length in common; choose a smaller one")
+    # Before anything moves: it may refuse the model.
+    controller = _make_controller(parameters, file, _hung(model, state, parameters.load), "length", high - low)
     yield from reset_under_weights(parameters, slots)
     yield from hang(slots, parameters.load)
-    controller = _make_controller(parameters, model, state, "length")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for i, target in enumerate(_targets(parameters, low, high)):
@@ -105,18 +118,19 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
 
 
-@protocol(needs=ON_STAGE, controls="force")
+@protocol(needs=ON_STAGE, controls="force", views=Views((("drive", "force"),)))
 def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     """Bring the force of a muscle between fixed ends to one target after another.
 
     The muscle is fastened to the stage, reset, conditioned by cycles of the voltage and stretched to the
     pretension; then the stage stands still. Targets and errors are as in `length-control`.
     """
-    model = _load_model(parameters.model)
+    file = _load_model(parameters.model)
+    model: TwoStage = file.model
     state = model.initial_state()
     low, high = _range(model, state, parameters.highest, "force")
+    controller = _make_controller(parameters, file, state, "force", high - low)
     yield from prepare_on_stage(parameters, slots, parameters.conditioning)
-    controller = _make_controller(parameters, model, state, "force")
     yield Phase(parameters.controller)
     errors: list[float] = []
     for target in _targets(parameters, low, high):
@@ -124,26 +138,34 @@ def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     yield _summary(parameters.controller, np.array(errors), "N")
 
 
-def _load_model(path: str) -> TwoStage:
+def _load_model(path: str) -> ModelFile:
     """Read the two-stage model of a muscle, in V, N and m."""
-    model: TwoStage = load_model(Path(path), "two-stage").model
+    file = load_model(Path(path), "two-stage")
+    model: TwoStage = file.model
     units = (model.voltage_unit, model.force_unit, model.length_unit)
     if units != ("V", "N", "m"):
         raise DataError(f"model file {path}: expected a model in V, N and m, got {', '.join(map(repr, units))}")
-    return model
+    return file
 
 
 def _make_controller(
-    parameters: LengthParameters | ForceParameters, model: TwoStage, state: TwoStageState, output: Output
-) -> Reaching:
+    parameters: LengthParameters | ForceParameters,
+    model: ModelFile,
+    state: TwoStageState,
+    output: Output,
+    span: float,
+) -> Supervised:
+    common = {"duration": parameters.duration}
     setup = ControllerSetup(
-        model=ModelFile("two-stage", model),
+        model=model,
         limits=(0.0, parameters.highest),
         state=state,
-        options={"duration": parameters.duration},
+        options=common | parameters.tuning.get(parameters.controller, {}),
     )
-    controller: Reaching = make_controller(f"coupled-{output}", parameters.controller, setup)
-    return controller
+    opened = common | parameters.tuning.get("open-loop-inverse", {})
+    return make_supervised(
+        f"coupled-{output}", parameters.controller, setup, span=span, fallback=parameters.fallback, **opened
+    )
 
 
 def _hung(model: TwoStage, state: TwoStageState, load: float) -> TwoStageState:
@@ -175,7 +197,7 @@ def _targets(parameters: Controlled, low: float, high: float) -> list[float]:
 def _reach(
     parameters: LengthParameters | ForceParameters,
     slots: Slots,
-    controller: Reaching,
+    controller: Supervised,
     target: float,
     controlled: str,
     others: tuple[str, ...],
@@ -192,6 +214,8 @@ def _reach(
         label=REACH,
         others=tuple(slots[name].signal for name in others),
     )
+    if notice := controller.take_notice():
+        yield Note(notice)
     outputs = []
     for _ in range(parameters.readings):
         reading = yield Step({}, Dwell(0.1), label=READING)

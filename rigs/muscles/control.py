@@ -12,6 +12,8 @@ set-point, a missing force by the last force. Without an output the estimate of 
 model goes on, as a wire that is driven ahead of its lag must not be left at that voltage; the controller without a
 model holds its set-point.
 
+What a controller knows of a muscle comes from the model and from the dynamics in its file.
+
 Model and thermal lag: Zhang and Yip, "Three-Dimensional Hysteresis Modeling of Robotic Artificial Muscles with
 Application to Shape Memory Alloy Actuators", Robotics: Science and Systems, 2017; here "Zhang and Yip 2017".
 """
@@ -21,231 +23,67 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 from bench.control.baselines import saturation
+from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.loops import SHORTEST_WAIT
-from bench.control.tracking import Command, ControllerBase, check_positive, widened
-from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
+from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
+from bench.control.tuning import tuned
+from bench.control.two_stage_inverse import TwoStageInverse
 from bench.controllers import ControllerSetup, ControllerSpec
-from bench.errors import DataError
+from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Reach, TwoStageState, _checks
+from rigs.muscles.lag import Lag, LagSearch
+from rigs.muscles.tasks import ForceTask, LengthTask, Task
 
-
-@dataclass(frozen=True, slots=True)
-class ThermalLag:
-    """How the temperature of a wire follows its voltage, in terms of the voltage that would hold it.
-
-    With the voltage v that would hold the present temperature, w = v² follows the square of the applied voltage
-    V with one time constant, dw/dt = (V² - w) / tau (Zhang and Yip 2017, eqs. 1 and 2, where
-    v² = d1 (T - T0) / d2), so that neither heating gain nor ambient temperature needs to be known.
-
-    Parameters
-    ----------
-    time_constant : float
-        tau, s.
-    level : float
-        w, V², at least 0.
-
-    Raises
-    ------
-    ValueError
-        If the time constant is not positive, the level negative, or either not finite.
-    """
-
-    time_constant: float = 5.0
-    level: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, "time_constant")
-        if not 0.0 <= self.level < math.inf:
-            raise ValueError(f"level: expected a finite number of V², at least 0, got {self.level}")
-
-    @property
-    def voltage(self) -> float:
-        """The constant voltage that would hold the present temperature, V."""
-        return math.sqrt(self.level)
-
-    def advance(self, duration: float, voltage: float) -> ThermalLag:
-        """Return the lag after a time (s, at least 0) at a constant voltage, exactly.
-
-        Raises ValueError if the duration is negative or a number is not finite.
-        """
-        if not 0.0 <= duration < math.inf:
-            raise ValueError(f"duration: expected a finite number of s, at least 0, got {duration}")
-        final = _checks.number("voltage", voltage) ** 2
-        return replace(self, level=final + (self.level - final) * math.exp(-duration / self.time_constant))
-
-    def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> tuple[float, bool]:
-        """Return the constant voltage that leads to a target within a time, and whether it had to be clipped.
-
-        Parameters
-        ----------
-        target : float
-            Wanted `voltage` at the end, V, at least 0.
-        horizon : float
-            Time until then, s; the voltage exceeds its steady value the more, the shorter it is.
-        limits : tuple of float
-            Least and greatest voltage, V, at least 0.
-
-        Raises
-        ------
-        ValueError
-            If the target is negative, the horizon not positive, the limits are not in order or negative, or a
-            number is not finite.
-        """
-        if not 0.0 <= target < math.inf:
-            raise ValueError(f"target: expected a finite number of V, at least 0, got {target}")
-        if not 0.0 < horizon < math.inf:
-            raise ValueError(f"horizon: expected a positive number of s, got {horizon}")
-        low, high = limits
-        if not 0.0 <= low <= high < math.inf:
-            raise ValueError(f"limits: expected two finite numbers of V, at least 0 and in order, got {limits}")
-        square = self.level + (target**2 - self.level) / -math.expm1(-horizon / self.time_constant)
-        clipped = min(max(square, low**2), high**2)
-        if clipped != square:
-            return (low if square < low**2 else high), True
-        return math.sqrt(square), False
-
-
-@dataclass(frozen=True, eq=False)
-class Task(ABC):
-    """What is controlled, how the model sees it, and how good model and sensor are.
-
-    Parameters
-    ----------
-    inverse : TwoStageInverse
-        The model and its inverse.
-    walk_variance, reading_variance : float
-        As in `DisturbanceEstimator`, output units squared: the change of the model's error in one period, and the
-        noise of one reading.
-    slopes : tuple of float
-        Range of slopes of the output over the voltage that are believed, see `MuscleClosedLoop`; output units per V,
-        of one sign.
-
-    Raises
-    ------
-    ValueError
-        If a variance is not positive, or the slopes are not in order or of the wrong sign.
-    """
-
-    inverse: TwoStageInverse
-    walk_variance: float
-    reading_variance: float
-    slopes: tuple[float, float]
-    _sign: ClassVar[float]
-
-    def __post_init__(self) -> None:
-        check_positive(self, "walk_variance", "reading_variance")
-        if min(self._sign * slope for slope in _checks.increasing("slopes", self.slopes).tolist()) <= 0.0:
-            raise ValueError(
-                f"slopes: expected {'positive' if self._sign > 0 else 'negative'} numbers, got {self.slopes}"
-            )
-
-    @abstractmethod
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after it has come to a voltage, with further signals."""
-
-    @abstractmethod
-    def output(self, state: TwoStageState) -> float:
-        """Return the model's output."""
-
-    @abstractmethod
-    def output_range(self) -> tuple[float, float]:
-        """Return the range of the model's output."""
-
-    @abstractmethod
-    def invert(self, state: TwoStageState, target: float) -> TwoStageInversion:
-        """Return what leads the model's output to a target."""
-
-
-@dataclass(frozen=True, eq=False)
-class LengthTask(Task):
-    """The length at a measured force, which may change; the one further signal is that force.
-
-    Noise of a load cell of some 0.02 N needs no dead band: the effect of its small reversals on the memory is
-    estimated as disturbance, and the errors are the same without it. The default variances are 2e-2 mm² for each
-    period, as the error of the model dominates, and noise of 0.01 mm beside rounding to 0.04 mm.
-    """
-
-    walk_variance: float = 2e-8
-    reading_variance: float = 0.04e-3**2 / 12 + 0.01e-3**2
-    slopes: tuple[float, float] = (-2e-3, -1e-3)
-    _sign = -1.0
-
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after force and voltage have come to new values, the force first.
-
-        A missing force is replaced by the last one. Raises ValueError if there is not one further signal.
-        """
-        if len(others) != 1:
-            raise ValueError(f"length task: expected the force as one further signal, got {len(others)}")
-        low, high = widened(*self.inverse.model.second.input_range)
-        force = others[0] if low <= others[0] <= high else state.force
-        return self.inverse.model.step(state, voltage, force)[0]
-
-    def output(self, state: TwoStageState) -> float:
-        """Return the model's length."""
-        return state.length
-
-    def output_range(self) -> tuple[float, float]:
-        """Return the range of the model's length."""
-        return self.inverse.model.second.output_range()
-
-    def invert(self, state: TwoStageState, target: float) -> TwoStageInversion:
-        """Return what leads the model's length to a target at the present force."""
-        return self.inverse.voltage_for_length(state, target)
-
-
-@dataclass(frozen=True, eq=False)
-class ForceTask(Task):
-    """The force between fixed ends, without further signals; the default reading variance is for noise of 0.02 N."""
-
-    walk_variance: float = 2e-2
-    reading_variance: float = 4e-4
-    slopes: tuple[float, float] = (5.0, 10.0)
-    _sign = 1.0
-
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after the voltage has come to a new value; the argument of H2 stays.
-
-        Raises ValueError if there are further signals.
-        """
-        if others:
-            raise ValueError(f"force task: expected no further signals, got {len(others)}")
-        return self.inverse.model.move(state, voltage, state.argument)[0]
-
-    def output(self, state: TwoStageState) -> float:
-        """Return the model's force."""
-        return state.force
-
-    def output_range(self) -> tuple[float, float]:
-        """Return the range of the model's force at the resting length."""
-        return self.inverse.model.first.output_range()
-
-    def invert(self, state: TwoStageState, target: float) -> TwoStageInversion:
-        """Return what leads the model's force to a target."""
-        return self.inverse.voltage_for_force(state, target)
+_READINGS_A_LAG = 5.0
+"""Readings in one time constant of the muscle."""
+_UNSEEN = 1.5
+"""Periods between readings, in time constants that would not have been seen: the muscle then follows within one."""
+_LEAD = 2.0
+"""Periods within which the closed loop would bring the muscle to its new state. Twice the period makes up for more
+than half of the way in each, and leaves room for a time constant that is not quite right."""
+_NOISES = 5.0
+"""Errors of so many standard deviations of a reading are no noise."""
+_OVERSHOOT = 0.7
+"""Part of an error that has overshot as far as this on the other side; further moves are then half as long."""
+_LEAST_PART = 0.25
+"""Part of a move to which overshoots reduce it at most."""
+_SHORTEST_PERIOD = 0.2
+"""Time between two readings where nothing slower is known, s: what a reading of all signals takes."""
 
 
 @dataclass(frozen=True)
 class InverseControlParameters:
     """Parameters of the controllers with a model."""
 
-    time_constant: float = 5.0
-    """Thermal time constant of the wire, s (Zhang and Yip 2017: about 5 s)."""
-    horizon: float = 2.0
-    """Time within which the closed loop would bring the wire to its new temperature, s. Twice the period makes up for
-    more than half of the way in each, and leaves room for a time constant that is not quite right."""
-    period: float = 1.0
+    time_constant: float
+    """Of the muscle behind its voltage, s; 0 for one that follows at once."""
+    period: float
     """Time between two readings, s."""
+    horizon: float
+    """Time within which the closed loop would bring the muscle to its new state, s."""
+    power: float = 2.0
+    """Power of the voltage that is lagged: 2 for heat, 1 for a pressure."""
     duration: float = 20.0
     """Time for each target, s."""
+    search: LagSearch = field(default_factory=LagSearch)
+    """How other time constants are tried in closed loop."""
 
     def __post_init__(self) -> None:
-        check_positive(self)
+        check_positive(self, "period", "horizon", "duration")
+        Lag(self.time_constant)
+        if self.power not in (1.0, 2.0):
+            raise ValueError(f"power: expected 1 or 2, got {self.power}")
+
+    @classmethod
+    def of_dynamics(cls, dynamics: IdentifiedDynamics, duration: float = 20.0) -> InverseControlParameters:
+        """Return parameters for a muscle whose dynamics were identified."""
+        lag = dynamics.response.lag
+        period = max(lag / _READINGS_A_LAG, _UNSEEN * dynamics.fastest, _SHORTEST_PERIOD)
+        return cls(lag, period, _LEAD * period, dynamics.response.power, duration)
 
 
 class MuscleController(ControllerBase, ABC):
@@ -298,47 +136,94 @@ class MuscleController(ControllerBase, ABC):
         """Return the voltage for the coming period, perhaps beyond the limits; `first` after a new target."""
 
 
+@dataclass
+class _Hypothesis:
+    """A time constant, and what the model and its error are if it is the muscle's."""
+
+    lag: Lag
+    state: TwoStageState
+    estimator: DisturbanceEstimator
+    error: float = math.nan
+    """The model's error at the last reading, output units."""
+    score: float = 0.0
+    """Squares of its changes, with forgetting, output units squared."""
+
+
 class _Modelled(MuscleController):
-    """Base of the controllers with a model: its memory, which follows the measured voltage, and the thermal lag."""
+    """Base of the controllers with a model: its memory, which follows the measured voltage, and the lag."""
+
+    _searches = False
 
     def __init__(
         self,
         task: Task,
+        parameters: InverseControlParameters,
         state: TwoStageState | None = None,
         limits: tuple[float, float] | None = None,
-        parameters: InverseControlParameters | None = None,
     ) -> None:
-        self._parameters = p = parameters or InverseControlParameters()
+        self._parameters = p = parameters
         model = task.inverse.model
         super().__init__(model.first.input_range, limits, p.period, p.duration)
         self._task = task
-        self._state = model.initial_state() if state is None else state
-        self._lag = ThermalLag(p.time_constant, self._state.voltage**2)
-        self._setpoint = self._clip(self._state.voltage)
+        start: TwoStageState = model.initial_state() if state is None else state
+        factors = p.search.factors() if self._searches and p.time_constant > 0.0 else [1.0]
+        self._hypotheses = [
+            _Hypothesis(
+                Lag(factor * p.time_constant, start.voltage**p.power, p.power),
+                start,
+                DisturbanceEstimator(walk_variance=task.walk_variance, reading_variance=task.reading_variance),
+            )
+            for factor in factors
+        ]
+        self._likeliest = len(factors) // 2
+        self._setpoint = self._clip(start.voltage)
         self._plausible_input = widened(*model.first.input_range)
         self._plausible_output = widened(*task.output_range())
         self._time: float | None = None
 
     @property
     def state(self) -> TwoStageState:
-        """Memory of the wire as the controller knows it; its voltage is the one that would hold the temperature."""
-        state: TwoStageState = self._state
-        return state
+        """Memory of the muscle as the controller knows it; its voltage is the one that would hold what it has."""
+        return self._believed.state
 
-    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:  # noqa: ARG002
+    @property
+    def time_constant(self) -> float:
+        """Time constant that agrees best with the readings so far, s."""
+        return self._hypotheses[self._likeliest].lag.time_constant
+
+    @property
+    def _believed(self) -> _Hypothesis:
+        """The time constant by which the muscle is led."""
+        return self._hypotheses[min(self._likeliest + self._parameters.search.margin, len(self._hypotheses) - 1)]
+
+    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
         low, high = self._plausible_input
         applied = measured_input if low <= measured_input <= high else self._setpoint
-        if self._time is not None:
-            self._lag = self._lag.advance(t - self._time, applied)
+        passed = 0.0 if self._time is None else t - self._time
         self._time = t
-        self._state = self._task.advance(self._state, self._lag.voltage, others)
+        search = self._parameters.search
+        least, greatest = self._plausible_output
+        for each in self._hypotheses:
+            each.lag = each.lag.advance(passed, applied)
+            each.state = self._task.advance(each.state, each.lag.voltage, others)
+            if least <= output <= greatest:
+                error = output - self._task.output(each.state)
+                each.estimator.update(error)
+                if passed > 0.0 and not math.isnan(each.error):
+                    kept = math.exp(-passed / (search.memory * self._parameters.period))
+                    each.score = kept * each.score + (error - each.error) ** 2
+                each.error = error
+        scores = [each.score for each in self._hypotheses]
+        best = scores.index(min(scores))
+        if scores[best] < search.advantage * scores[self._likeliest]:
+            self._likeliest = best
 
     def _modelled(self) -> float:
-        return self._task.output(self._state)
+        return self._task.output(self._believed.state)
 
     def _steady(self, target: float) -> float:
         """Return the steady voltage for a target of the model within the limits; note whether it meets the target."""
-        found = self._task.invert(self._state, target)
+        found = self._task.invert(self._believed.state, target)
         voltage = self._clip(found.voltage)
         self._reach = found.reach
         if voltage != found.voltage:
@@ -350,19 +235,18 @@ class _Modelled(MuscleController):
 class MuscleOpenLoop(_Modelled):
     """Set once for each target the steady voltage of the inverse, without feedback of the output.
 
-    The memory follows the thermal lag, and in the length task the measured force.
+    The memory follows the lag, and in the length task the measured force.
 
     Parameters
     ----------
     task : LengthTask or ForceTask
         What is controlled.
+    parameters : InverseControlParameters
+        Of the controller; horizon and search are not used.
     state : TwoStageState or None
-        State of the wire at the first reading, whose voltage holds the temperature that it then has; default
-        that after a reset.
+        State of the muscle at the first reading, whose voltage holds what it then has; default that after a reset.
     limits : tuple of float or None
         Least and greatest voltage, V, at least 0; default the range of the model.
-    parameters : InverseControlParameters or None
-        Of the controller; the horizon is not used.
 
     Raises
     ------
@@ -375,50 +259,53 @@ class MuscleOpenLoop(_Modelled):
 
 
 class MuscleClosedLoop(_Modelled):
-    """Feedforward by the inverse, ahead of the thermal lag; feedback by an estimate of the disturbance.
+    """Feedforward by the inverse, ahead of the lag; feedback by an estimate of the disturbance.
 
-    At each reading: from the measured voltage the thermal lag gives the steady voltage v of the present temperature,
+    At each reading: from the measured voltage the lag gives the steady voltage v of what the muscle has at present,
     with which the model moves on. The disturbance, the measured output less the model's, goes through a Kalman
-    filter. The inverse at target less disturbance gives the next v, and the lag the voltage that leads there. As
-    temperature and disturbance are computed from measurements and nothing is summed up, nothing winds up while the
-    voltage is at a limit.
+    filter. The inverse at target less disturbance gives the next v, and the lag the voltage that leads there. As v
+    and disturbance are computed from measurements and nothing is summed up, nothing winds up while the voltage is at
+    a limit.
 
     Each move of v is that of the inverse, but no more and no less than a slope of the output over v within
     `Task.slopes` would take for the present error. After a reversal a model with cells is flat over part of a cell
-    where the wire is not, and elsewhere too steep. There the inverse alone would go to and fro across the flat part
-    without end, or hardly correct at all.
+    where the muscle is not, and elsewhere too steep. There the inverse alone would go to and fro across the flat part
+    without end, or hardly correct at all. Where a move overshoots far, the muscle is steeper than that: further moves
+    to the same target are half as long.
+
+    The time constant is that of the parameters at first, and then the one of `LagSearch` that agrees best with the
+    readings.
 
     Parameters
     ----------
-    task, state, limits, parameters
+    task, parameters, state, limits
         As in `MuscleOpenLoop`.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        state: TwoStageState | None = None,
-        limits: tuple[float, float] | None = None,
-        parameters: InverseControlParameters | None = None,
-    ) -> None:
-        super().__init__(task, state, limits, parameters)
-        self._estimator: DisturbanceEstimator = DisturbanceEstimator(
-            walk_variance=task.walk_variance, reading_variance=task.reading_variance
-        )
+    _searches = True
+    _part = 1.0
+    _error = 0.0
 
-    def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
-        super()._take_in(t, measured_input, output, others)
-        low, high = self._plausible_output
-        if low <= output <= high:
-            self._estimator.update(output - self._modelled())
+    @property
+    def trace(self) -> Trace:
+        """Internal values at present."""
+        modelled, estimator = self._modelled(), self._believed.estimator
+        return Trace(self._reference, modelled + estimator.value, estimator.value, estimator.uncertainty)
 
     def _decide(self, output: float, *, first: bool) -> float:  # noqa: ARG002
-        wanted = self._reference - self._estimator.value
-        present = self._lag.voltage
+        wanted = self._reference - self._believed.estimator.value
+        lag = self._believed.lag
+        present = lag.voltage
         error = wanted - self._modelled()
         least, greatest = sorted(error / slope for slope in self._task.slopes)
         move = min(max(self._steady(wanted) - present, least), greatest)
-        return self._lag.lead(self._clip(present + move), self._parameters.horizon, self.limits)[0]
+        noise = _NOISES * math.sqrt(self._task.reading_variance)
+        if first:
+            self._part = 1.0
+        elif error * self._error < 0.0 and abs(error) > max(_OVERSHOOT * abs(self._error), noise):
+            self._part = max(_LEAST_PART, 0.5 * self._part)
+        self._error = error
+        return lag.lead(self._clip(present + self._part * move), self._parameters.horizon, self.limits)[0]
 
 
 @dataclass(frozen=True)
@@ -428,30 +315,46 @@ class ProportionalIntegralParameters:
     Parameters
     ----------
     gain : float
-        V² for one output unit of error; negative where the output falls with the voltage.
+        V^power for one output unit of error; negative where the output falls with the voltage.
     integral_time : float
         Time in which a constant error adds as much as the proportional part gives, s.
     period : float
         Time between two readings, s.
+    power : {1, 2}
+        Power of the voltage in which the muscle is about linear: 2 for heat, 1 for a pressure.
     duration : float
         Time for each target, s.
     """
 
     gain: float
-    integral_time: float = 4.0
-    period: float = 1.0
+    integral_time: float
+    period: float
+    power: float = 2.0
     duration: float = 20.0
 
     def __post_init__(self) -> None:
         check_positive(self, "integral_time", "period", "duration")
         if not math.isfinite(self.gain) or self.gain == 0.0:
             raise ValueError(f"gain: expected a number other than 0, got {self.gain}")
+        if self.power not in (1.0, 2.0):
+            raise ValueError(f"power: expected 1 or 2, got {self.power}")
+
+    @classmethod
+    def of_lag(cls, rise: float, timing: InverseControlParameters) -> ProportionalIntegralParameters:
+        """Return parameters that cancel the lag of a muscle and leave a time constant as long as it.
+
+        `rise` is the output units for each V^power, of the sign of the muscle, over the whole range. What follows at
+        once has half of its error taken away in each period.
+        """
+        integral = max(timing.time_constant, 0.5 * timing.period)
+        closed = max(timing.time_constant, 2.0 * timing.period)
+        return cls(integral / (rise * closed), integral, timing.period, timing.power, timing.duration)
 
 
 class MuscleProportionalIntegral(MuscleController):
     """Proportional-integral control without a model, for comparison.
 
-    It sets the square of the voltage, in which the temperature is linear, and moves that on from its present
+    It sets that power of the voltage in which the muscle is about linear, and moves it on from its present
     value, which is within the limits: so it leaves a limit at once when the error turns, and cannot wind up.
     Further signals are ignored.
 
@@ -486,38 +389,62 @@ class MuscleProportionalIntegral(MuscleController):
         error = self._reference - output
         change = 0.0 if self._error is None else error - self._error
         self._error = error
-        square = self._setpoint**2 + p.gain * (change + error * p.period / p.integral_time)
-        self._reach = saturation(square, self._low**2, self._high**2, error)
-        return math.sqrt(max(square, 0.0))
+        level = self._setpoint**p.power + p.gain * (change + error * p.period / p.integral_time)
+        self._reach = saturation(level, self._low**p.power, self._high**p.power, error)
+        return float(max(level, 0.0) ** (1.0 / p.power))
 
 
-LENGTH_GAIN, FORCE_GAIN = -2500.0, 1.0
-"""Gains of the proportional-integral control, V²/m and V²/N: the best that were found on the emulated SMA wire.
+def _timing(setup: ControllerSetup) -> InverseControlParameters:
+    """Return the parameters of a setup: from the dynamics in the model file, with the rig's numbers in their place.
 
-Its time constant is 5 s, and over 0 to 3 V it moves by 1.5 mm/V and pulls 3.8 N/V. The paper has no control.
-"""
+    Raises ConfigurationError if nothing says how fast the muscle is, or a target's time is too short for it.
+    """
+    options = dict(setup.options)
+    duration = float(options.pop("duration"))
+    dynamics = setup.model.dynamics
+    if dynamics is None and "time_constant" not in options:
+        raise ConfigurationError(
+            f"controller {setup.name}: the model file does not say how fast the muscle follows its voltage; identify "
+            "it from runs with telemetry, or give the time constant (s) and the power of the voltage (2 for heat, 1 "
+            f"for a pressure) in the rig file: [protocols.NAME.tuning.{setup.name}] time_constant = ..., power = ..."
+        )
+    if dynamics is None:
+        given = ResponseDynamics(float(options["time_constant"]), float(options.get("power", 2.0)))
+        dynamics = IdentifiedDynamics(response=given)
+    try:
+        found = tuned(InverseControlParameters.of_dynamics(dynamics, duration), options)
+    except ValueError as error:
+        raise ConfigurationError(f"controller {setup.name}: {error}") from None
+    if duration < found.time_constant + 2.0 * found.period:
+        raise ConfigurationError(
+            f"duration = {duration:g} s is too short for a muscle of the time constant {found.time_constant:.3g} s; "
+            f"give each target {2.0 * found.time_constant + 2.0 * found.period:.2g} s at least"
+        )
+    return found
 
 
-def _with_inverse(
-    summary: str, controller: Callable[..., MuscleController], task: Callable[[TwoStageInverse], Task]
-) -> ControllerSpec:
+def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
+    try:
+        inverse = TwoStageInverse(setup.model.model)
+    except ValueError as error:
+        raise DataError(f"the two-stage model has no inverse: {error}") from error
+    noise = {} if setup.model.dynamics is None else setup.model.dynamics.noise
+    state: TwoStageState = setup.start if setup.start is not None else inverse.model.initial_state()
+    return kind.of_model(inverse, state, setup.limits, noise)
+
+
+def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:
+    return ControllerSpec(summary, lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits))
+
+
+def _without_inverse(kind: type[Task]) -> ControllerSpec:
     def make(setup: ControllerSetup) -> MuscleController:
-        try:
-            inverse = TwoStageInverse(setup.model.model)
-        except ValueError as error:
-            raise DataError(f"the two-stage model has no inverse: {error}") from error
-        parameters = InverseControlParameters(duration=setup.options["duration"])
-        return controller(task(inverse), setup.state, setup.limits, parameters)
+        timing, task = _timing(setup), _task(setup, kind)
+        low, high = setup.limits
+        rise = task.rise / (high**timing.power - low**timing.power)
+        return MuscleProportionalIntegral(setup.limits, ProportionalIntegralParameters.of_lag(rise, timing))
 
-    return ControllerSpec(summary, make)
-
-
-def _with_gain(gain: float) -> ControllerSpec:
-    def make(setup: ControllerSetup) -> MuscleController:
-        parameters = ProportionalIntegralParameters(gain, duration=setup.options["duration"])
-        return MuscleProportionalIntegral(setup.limits, parameters)
-
-    return ControllerSpec("proportional-integral control without a model, for comparison", make)
+    return ControllerSpec("proportional-integral control without the inverse of a model, for comparison", make)
 
 
 _OPEN_LOOP = "inverse of the two-stage model, without feedback"
@@ -525,7 +452,7 @@ _CLOSED_LOOP = "inverse of the two-stage model, with the disturbance estimated f
 
 LENGTH_OPEN_LOOP = _with_inverse(_OPEN_LOOP, MuscleOpenLoop, LengthTask)
 LENGTH_CLOSED_LOOP = _with_inverse(_CLOSED_LOOP, MuscleClosedLoop, LengthTask)
-LENGTH_PROPORTIONAL_INTEGRAL = _with_gain(LENGTH_GAIN)
+LENGTH_PROPORTIONAL_INTEGRAL = _without_inverse(LengthTask)
 FORCE_OPEN_LOOP = _with_inverse(_OPEN_LOOP, MuscleOpenLoop, ForceTask)
 FORCE_CLOSED_LOOP = _with_inverse(_CLOSED_LOOP, MuscleClosedLoop, ForceTask)
-FORCE_PROPORTIONAL_INTEGRAL = _with_gain(FORCE_GAIN)
+FORCE_PROPORTIONAL_INTEGRAL = _without_inverse(ForceTask)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bench.errors import ConfigurationError
 
 # A grid point counts as reached this early (s), so that rounding in the caller's clock, even one that counts from
 # 1970, does not decide on which side of a call a step falls.
@@ -53,6 +56,25 @@ class Numbers:
                     raise ValueError(f"{name} must be finite, not {value}")
                 if (sign == "zero or positive" and value < 0) or (sign == "positive" and value <= 0):
                     raise ValueError(f"{name} must be {sign}, not {value}")
+
+
+N = TypeVar("N", bound=Numbers)
+
+
+def changed(numbers: N, changes: Mapping[str, float]) -> N:
+    """Return numbers with some of them replaced by their names, such as those of a perturbed plant.
+
+    Raises ConfigurationError if there is no such number, or a value is not allowed.
+    """
+    known = [field.name for field in fields(numbers)]
+    for name in changes:
+        if name not in known:
+            raise ConfigurationError(f"plant.{name}: there is no such number; there are: {', '.join(known)}")
+    kinds = {field.name: type(getattr(numbers, field.name)) for field in fields(numbers)}
+    try:
+        return replace(numbers, **{name: kinds[name](value) for name, value in changes.items()})
+    except ValueError as error:
+        raise ConfigurationError(f"plant: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,28 +1,31 @@
 """Controllers of the wire's length and force: the thermal lag, the bookkeeping, and how well they do on the plant."""
 
 import math
+from dataclasses import MISSING, fields, replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
 from bench.control.loops import ReachTarget
 from bench.control.two_stage_inverse import TwoStageInverse
-from bench.hysteresis import Reach
+from bench.controllers import ControllerSetup
+from bench.errors import ConfigurationError, DataError
+from bench.hysteresis import Preisach, Reach, TwoStage, uniform_levels
 from bench.identification import Series, identify_two_stage, voltage_steps
+from bench.model_file import ModelFile
 from rigs.muscles.control import (
-    FORCE_GAIN,
-    LENGTH_GAIN,
-    ForceTask,
+    LENGTH_CLOSED_LOOP,
     InverseControlParameters,
-    LengthTask,
     MuscleClosedLoop,
     MuscleOpenLoop,
     MuscleProportionalIntegral,
     ProportionalIntegralParameters,
-    ThermalLag,
 )
+from rigs.muscles.lag import Lag, LagSearch
+from rigs.muscles.tasks import ForceTask, LengthTask
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 MILLIMETRE = 1e-3
@@ -74,8 +77,8 @@ class Wire:
 class Bench:
     """A wire at one task: the length under a load, or the force between fixed ends if there is none."""
 
-    def __init__(self, seed, load=None):
-        self.wire = Wire(100 + seed, ambient_sd=0.3)
+    def __init__(self, seed, load=None, **parameters):
+        self.wire = Wire(100 + seed, ambient_sd=0.3, **parameters)
         self.is_length = load is not None
         if self.is_length:
             self.wire.reset()
@@ -155,16 +158,27 @@ def output_range(load=None):
     return sorted([*ends, bench.truth])
 
 
+TIMING = InverseControlParameters(5.0, 1.0, 2.0)
+"""What transients of the wire tell, and a search for other time constants; then without."""
+KNOWN = InverseControlParameters(5.0, 1.0, 2.0, search=LagSearch(steps=0))
+NOISE = {"length": 0.02 * MILLIMETRE, "force": 0.02}
+
+
 def task(inverse, load):
-    return ForceTask(inverse) if load is None else LengthTask(inverse)
+    model = inverse.model
+    start = model.initial_state()
+    if load is None:
+        return ForceTask.of_model(inverse, start, LIMITS, NOISE)
+    return LengthTask.of_model(inverse, model.step(start, 0.0, load)[0], LIMITS, NOISE)
 
 
 def controllers(inverse, load):
-    gain = FORCE_GAIN if load is None else LENGTH_GAIN
+    what = task(inverse, load)
+    gains = ProportionalIntegralParameters.of_lag(what.rise / LIMITS[1] ** 2, TIMING)
     return {
-        "open-loop-inverse": lambda: MuscleOpenLoop(task(inverse, load)),
-        "proportional-integral": lambda: MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(gain)),
-        "closed-loop-inverse": lambda: MuscleClosedLoop(task(inverse, load)),
+        "open-loop-inverse": lambda: MuscleOpenLoop(what, TIMING),
+        "proportional-integral": lambda: MuscleProportionalIntegral(LIMITS, gains),
+        "closed-loop-inverse": lambda: MuscleClosedLoop(what, TIMING),
     }
 
 
@@ -183,7 +197,7 @@ def rms(errors):
     st.floats(0.0, 1.0),
 )
 def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage, duration, part):
-    lag = ThermalLag(time_constant, level)
+    lag = Lag(time_constant, level)
     first = part * duration
     parts = lag.advance(first, voltage).advance(duration - first, voltage)
     whole = lag.advance(duration, voltage)
@@ -195,16 +209,16 @@ def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage,
 
 
 def test_lag_settles_and_holds():
-    lag = ThermalLag(5.0, 4.0)
+    lag = Lag(5.0, 4.0)
     assert lag.advance(1000.0, 2.0).level == 4.0
     assert lag.advance(0.0, 3.0) == lag
-    assert ThermalLag().advance(5.0, 3.0).level == pytest.approx(9.0 * (1.0 - math.exp(-1.0)))
-    assert ThermalLag().advance(1e4, 1.5).voltage == pytest.approx(1.5)
+    assert Lag(5.0).advance(5.0, 3.0).level == pytest.approx(9.0 * (1.0 - math.exp(-1.0)))
+    assert Lag(5.0).advance(1e4, 1.5).voltage == pytest.approx(1.5)
 
 
 @given(st.floats(0.0, 9.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
 def test_lead_meets_its_target_unless_clipped(level, time_constant, target, horizon):
-    lag = ThermalLag(time_constant, level)
+    lag = Lag(time_constant, level)
     voltage, clipped = lag.lead(target, horizon, LIMITS)
     arrived = lag.advance(horizon, voltage).voltage
     if clipped:
@@ -218,11 +232,11 @@ def test_lead_meets_its_target_unless_clipped(level, time_constant, target, hori
 
 def test_lead_of_a_cold_and_of_a_hot_wire():
     share = 1.0 - math.exp(-0.4)
-    assert ThermalLag().lead(1.0, 2.0, LIMITS) == (pytest.approx(1.0 / math.sqrt(share)), False)
-    assert ThermalLag().lead(2.5, 2.0, LIMITS) == (3.0, True)
-    assert ThermalLag(5.0, 9.0).lead(1.0, 2.0, LIMITS) == (0.0, True)
-    assert ThermalLag(5.0, 9.0).lead(1.0, 2.0, (0.5, 3.0)) == (0.5, True)
-    assert ThermalLag(5.0, 4.0).lead(2.0, 2.0, LIMITS) == (2.0, False)
+    assert Lag(5.0).lead(1.0, 2.0, LIMITS) == (pytest.approx(1.0 / math.sqrt(share)), False)
+    assert Lag(5.0).lead(2.5, 2.0, LIMITS) == (3.0, True)
+    assert Lag(5.0, 9.0).lead(1.0, 2.0, LIMITS) == (0.0, True)
+    assert Lag(5.0, 9.0).lead(1.0, 2.0, (0.5, 3.0)) == (0.5, True)
+    assert Lag(5.0, 4.0).lead(2.0, 2.0, LIMITS) == (2.0, False)
 
 
 # On the plant.
@@ -282,7 +296,9 @@ def test_length_while_the_load_changes(inverse):
     errors = []
     for seed in SEEDS:
         bench = Bench(seed, loads[-1])
-        controller = MuscleClosedLoop(LengthTask(inverse), parameters=InverseControlParameters(duration=30.0))
+        controller = MuscleClosedLoop(
+            task(inverse, loads[-1]), InverseControlParameters(5.0, 1.0, 2.0, duration=30.0)
+        )
         targets = low + (high - low) * np.random.default_rng([seed, 6]).uniform(0.05, 0.95, 12)
         for n, target in enumerate(targets.tolist()):
             # The force is all that tells the controller.
@@ -322,12 +338,12 @@ def test_narrower_limits_are_kept_and_flagged(inverse):
     bench = Bench(4, 4.9)
     low, high = output_range(4.9)
     for make in (MuscleClosedLoop, MuscleOpenLoop):
-        controller = make(LengthTask(inverse), limits=(0.5, 2.0))
+        controller = make(task(inverse, 4.9), TIMING, limits=(0.5, 2.0))
         assert controller.limits == (0.5, 2.0)
         command = controller.aim(low + 0.05 * (high - low), *bench.read())
         assert command.setpoint == 2.0
         assert controller.reach is Reach.TOO_LOW
-    controller = MuscleOpenLoop(ForceTask(inverse), limits=(0.0, 2.0))
+    controller = MuscleOpenLoop(task(inverse, None), TIMING, limits=(0.0, 2.0))
     assert controller.aim(10.5, 0.0, 0.0, 0.3).setpoint == 2.0
     assert controller.reach is Reach.TOO_HIGH
 
@@ -337,8 +353,8 @@ def test_narrower_limits_are_kept_and_flagged(inverse):
 
 def test_memory_follows_what_the_supply_put_out_and_the_force_first(inverse):
     model, rng = inverse.model, np.random.default_rng(8)
-    controller = MuscleClosedLoop(LengthTask(inverse))
-    state, lag = model.initial_state(), ThermalLag()
+    controller = MuscleClosedLoop(task(inverse, 4.9), KNOWN)
+    state, lag = model.initial_state(), Lag(5.0)
     times = np.cumsum(rng.uniform(0.5, 2.0, 30)).tolist()
     for n, t in enumerate(times):
         voltage, force = rng.uniform(0.0, 3.0), rng.uniform(1.0, 9.0)
@@ -354,14 +370,14 @@ def test_memory_follows_what_the_supply_put_out_and_the_force_first(inverse):
 def test_the_argument_stays_between_fixed_ends(inverse):
     model = inverse.model
     state = model.advance([1.5, 1.0], [3.0, 4.0])
-    controller = MuscleOpenLoop(ForceTask(inverse), state)
+    controller = MuscleOpenLoop(task(inverse, None), KNOWN, state)
     command = controller.aim(5.0, 0.0, 1.0, 4.0)
     expected = inverse.voltage_for_force(state, 5.0)
     assert command.setpoint == expected.voltage
     for n in range(1, 20):
         held = controller.update(float(n), command.setpoint, 9.9)
         assert (held.setpoint, held.done) == (command.setpoint, False)
-    lag = ThermalLag(5.0, 1.0)
+    lag = Lag(5.0, 1.0)
     for _ in range(19):
         lag = lag.advance(1.0, command.setpoint)
     assert controller.state == model.move(state, lag.voltage, state.argument)[0]
@@ -371,7 +387,7 @@ def test_the_argument_stays_between_fixed_ends(inverse):
 
 
 def test_trace_of_the_closed_loop(inverse):
-    controller = MuscleClosedLoop(LengthTask(inverse))
+    controller = MuscleClosedLoop(task(inverse, 4.9), KNOWN)
     controller.aim(1e-3, 0.0, 0.0, 2e-3, 4.9)
     model = inverse.model.step(inverse.model.initial_state(), 0.0, 4.9)[1]
     trace = controller.trace
@@ -387,8 +403,8 @@ def test_trace_of_the_closed_loop(inverse):
 def test_an_exact_model_is_led_to_the_target(inverse):
     model = inverse.model
     # Slopes of any size are believed: the model is the wire.
-    controller = MuscleClosedLoop(ForceTask(inverse, slopes=(1e-3, 1e3)))
-    state, lag, t, voltage = model.initial_state(), ThermalLag(), 0.0, 0.0
+    controller = MuscleClosedLoop(replace(task(inverse, None), slopes=(1e-3, 1e3)), KNOWN)
+    state, lag, t, voltage = model.initial_state(), Lag(5.0), 0.0, 0.0
     for target in (4.0, 6.0, 5.0, 8.0, 7.0):
         command = controller.aim(target, t, voltage, state.force)
         while not command.done:
@@ -402,12 +418,12 @@ def test_an_exact_model_is_led_to_the_target(inverse):
 
 def test_missing_readings(inverse):
     nan = math.nan
-    controller = MuscleClosedLoop(LengthTask(inverse))
+    controller = MuscleClosedLoop(task(inverse, 4.9), KNOWN)
     command = controller.aim(1e-3, 0.0, 0.0, 2e-3, 4.9)
     before = controller.trace.disturbance, controller.trace.uncertainty
     after = controller.update(1.0, nan, nan, nan)
     # The supply is taken to have done what it was told, the load to be the same; the wire is not left to overheat.
-    lag = ThermalLag().advance(1.0, command.setpoint)
+    lag = Lag(5.0).advance(1.0, command.setpoint)
     assert controller.state.voltage == lag.voltage
     assert controller.state.force == 4.9
     assert (controller.trace.disturbance, controller.trace.uncertainty) == before
@@ -417,7 +433,7 @@ def test_missing_readings(inverse):
     assert controller.state.force == 4.9
     assert controller.state.voltage == lag.advance(1.0, after.setpoint).voltage
     assert (controller.trace.disturbance, controller.trace.uncertainty) == before
-    plain = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(1.0))
+    plain = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(1.0, 4.0, 1.0))
     assert plain.aim(5.0, 0.0, 1.5, nan).setpoint == 1.5
     # The integral begins with the first reading: no proportional part comes of it.
     assert plain.update(1.0, nan, 3.0).setpoint == pytest.approx(math.sqrt(1.5**2 + 2.0 / 4.0))
@@ -425,7 +441,7 @@ def test_missing_readings(inverse):
 
 
 def test_proportional_integral_steps():
-    controller = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(0.5, 5.0))
+    controller = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(0.5, 5.0, 1.0))
     first = controller.aim(4.0, 0.0, 1.0, 3.0)
     assert first.setpoint == pytest.approx(math.sqrt(1.0 + 0.5 * 1.0 / 5.0))
     second = controller.update(1.0, first.setpoint, 3.5)
@@ -465,20 +481,26 @@ def test_lasts_its_time_and_then_holds(inverse, name):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ThermalLag(0.0), "time_constant: expected a positive"),
-        (lambda: ThermalLag(5.0, -1.0), "level: expected a finite"),
-        (lambda: ThermalLag(5.0, math.nan), "level: expected a finite"),
-        (lambda: ThermalLag().advance(-1.0, 1.0), "duration: expected a finite number"),
-        (lambda: ThermalLag().advance(1.0, math.nan), "voltage: expected a finite"),
-        (lambda: ThermalLag().lead(-1.0, 2.0, LIMITS), "target: expected a finite number of V"),
-        (lambda: ThermalLag().lead(1.0, 0.0, LIMITS), "horizon: expected a positive"),
-        (lambda: ThermalLag().lead(1.0, 2.0, (3.0, 0.0)), "limits: expected two finite"),
-        (lambda: ThermalLag().lead(1.0, 2.0, (-1.0, 3.0)), "limits: expected two finite"),
-        (lambda: InverseControlParameters(horizon=0.0), "horizon: expected a positive"),
-        (lambda: InverseControlParameters(duration=math.inf), "duration: expected a positive"),
-        (lambda: ProportionalIntegralParameters(0.0), "gain: expected a number other than 0"),
-        (lambda: ProportionalIntegralParameters(1.0, 0.0), "integral_time: expected a positive"),
-        (lambda: MuscleProportionalIntegral((-1.0, 3.0), ProportionalIntegralParameters(1.0)), "limits: expected"),
+        (lambda: Lag(-1.0), "time_constant: expected a finite"),
+        (lambda: Lag(5.0, -1.0), "level: expected a finite"),
+        (lambda: Lag(5.0, math.nan), "level: expected a finite"),
+        (lambda: Lag(5.0).advance(-1.0, 1.0), "duration: expected a finite number"),
+        (lambda: Lag(5.0).advance(1.0, math.nan), "voltage: expected a finite"),
+        (lambda: Lag(5.0).lead(-1.0, 2.0, LIMITS), "target: expected a finite number of V"),
+        (lambda: Lag(5.0).lead(1.0, 0.0, LIMITS), "horizon: expected a positive"),
+        (lambda: Lag(5.0).lead(1.0, 2.0, (3.0, 0.0)), "limits: expected two finite"),
+        (lambda: Lag(5.0).lead(1.0, 2.0, (-1.0, 3.0)), "limits: expected two finite"),
+        (lambda: InverseControlParameters(5.0, 1.0, 0.0), "horizon: expected a positive"),
+        (lambda: InverseControlParameters(5.0, 1.0, 2.0, duration=math.inf), "duration: expected a positive"),
+        (lambda: InverseControlParameters(5.0, 1.0, 2.0, 3.0), "power: expected 1 or 2"),
+        (lambda: LagSearch(factor=1.0), "factor: expected a number above 1"),
+        (lambda: LagSearch(steps=-1), "steps, margin: expected at least 0"),
+        (lambda: ProportionalIntegralParameters(0.0, 4.0, 1.0), "gain: expected a number other than 0"),
+        (lambda: ProportionalIntegralParameters(1.0, 0.0, 1.0), "integral_time: expected a positive"),
+        (
+            lambda: MuscleProportionalIntegral((-1.0, 3.0), ProportionalIntegralParameters(1.0, 4.0, 1.0)),
+            "limits: expected",
+        ),
     ],
 )
 def test_wrong_input_is_named(make, message):
@@ -489,15 +511,18 @@ def test_wrong_input_is_named(make, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda i: LengthTask(i, walk_variance=0.0), "walk_variance: expected a positive"),
-        (lambda i: LengthTask(i, slopes=(1e-3, 2e-3)), "slopes: expected negative"),
-        (lambda i: ForceTask(i, reading_variance=math.nan), "reading_variance: expected a positive"),
-        (lambda i: ForceTask(i, slopes=(-1.0, 2.0)), "slopes: expected positive"),
-        (lambda i: ForceTask(i, slopes=(2.0, 1.0)), "slopes: expected"),
-        (lambda i: MuscleOpenLoop(LengthTask(i), limits=(4.0, 5.0)), "limits: expected an overlap"),
-        (lambda i: MuscleClosedLoop(ForceTask(i)).aim(math.nan, 0.0, 0.0, 0.3), "target: expected a finite"),
-        (lambda i: MuscleClosedLoop(ForceTask(i)).aim(5.0, 0.0, 0.0, 0.3, 1.0), "force task: expected no further"),
-        (lambda i: MuscleClosedLoop(LengthTask(i)).aim(0.0, 0.0, 0.0, 0.0), "length task: expected the force"),
+        (lambda i: replace(task(i, 4.9), walk_variance=0.0), "walk_variance: expected a positive"),
+        (lambda i: replace(task(i, 4.9), slopes=(1e-3, 2e-3)), "slopes: expected negative"),
+        (lambda i: replace(task(i, None), reading_variance=math.nan), "reading_variance: expected a positive"),
+        (lambda i: replace(task(i, None), slopes=(-1.0, 2.0)), "slopes: expected positive"),
+        (lambda i: replace(task(i, None), slopes=(2.0, 1.0)), "slopes: expected"),
+        (lambda i: MuscleOpenLoop(task(i, 4.9), TIMING, limits=(4.0, 5.0)), "limits: expected an overlap"),
+        (lambda i: MuscleClosedLoop(task(i, None), TIMING).aim(math.nan, 0.0, 0.0, 0.3), "target: expected a finite"),
+        (
+            lambda i: MuscleClosedLoop(task(i, None), TIMING).aim(5.0, 0.0, 0.0, 0.3, 1.0),
+            "force task: expected no further",
+        ),
+        (lambda i: MuscleClosedLoop(task(i, 4.9), TIMING).aim(0.0, 0.0, 0.0, 0.0), "length task: expected the force"),
     ],
 )
 def test_wrong_input_of_a_controller_is_named(inverse, make, message):
@@ -506,9 +531,98 @@ def test_wrong_input_of_a_controller_is_named(inverse, make, message):
 
 
 def test_time_does_not_go_back_and_targets_come_first(inverse):
-    controller = MuscleClosedLoop(ForceTask(inverse))
+    controller = MuscleClosedLoop(task(inverse, None), KNOWN)
     with pytest.raises(RuntimeError, match="expected a target first"):
         controller.update(0.0, 0.0, 0.3)
     controller.aim(5.0, 10.0, 0.0, 0.3)
     with pytest.raises(ValueError, match="duration: expected a finite number"):
         controller.update(9.0, 0.0, 0.3)
+
+
+# Another specimen than the one that was identified.
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+@pytest.mark.parametrize("load", [4.9, None])
+def test_another_time_constant_is_found_while_the_wire_is_controlled(inverse, factor, load):
+    low, high = output_range(load)
+    bench = Bench(11, load, time_constant=factor * SMAParameters().time_constant)
+    controller = MuscleClosedLoop(task(inverse, load), TIMING)
+    targets = low + (high - low) * np.random.default_rng(12).uniform(0.05, 0.95, 20)
+    errors = [bench.reach(controller, target)[1] for target in targets.tolist()]
+    assert controller.time_constant == pytest.approx(factor * 5.0, rel=0.2)
+    assert rms(errors) <= (0.05 if load is None else 0.02 * MILLIMETRE)
+
+
+def test_slopes_are_about_the_mean_one_of_the_major_loop_of_the_model(inverse):
+    model = inverse.model
+    low, high = output_range(4.9)
+    found = task(inverse, 4.9)
+    # The mean slope lies within, and it falls.
+    assert found.rise == pytest.approx(low - high, rel=0.1)
+    assert found.slopes[0] < found.rise / 3.0 < found.slopes[1] < 0.0
+    assert math.sqrt(found.reading_variance) == NOISE["length"]
+    with pytest.raises(DataError, match="does not rise with the voltage between 0 and 1e-09 V"):
+        ForceTask.of_model(inverse, model.initial_state(), (0.0, 1e-9), NOISE)
+
+
+# What a controller knows comes from the model and its dynamics.
+
+
+def test_no_number_of_a_specimen_stands_in_the_controllers():
+    """Another muscle, k times as long, strong and slow, gets numbers k times as large, all of them."""
+    stage = Preisach(uniform_levels(0.0, 3.0, 6), np.linspace(0.5, 1.0, 21), 0.0, None, (0.0, 3.0))
+
+    def muscle(scale):
+        first = replace(stage, density=scale * stage.density, input_unit="V", output_unit="N")
+        reach = 2.0 * scale * float(stage.evaluate([3.0])[0])
+        second = Preisach(
+            uniform_levels(-reach, reach, 6), stage.density * 1e-3 / scale, 0.0, None, (-reach, reach), "N", "m"
+        )
+        return TwoStageInverse(TwoStage(first, second, pretension=0.1 * scale))
+
+    def numbers(scale):
+        inverse = muscle(scale)
+        state = inverse.model.initial_state()
+        found = {}
+        for kind in (ForceTask, LengthTask):
+            known = kind.of_model(inverse, state, LIMITS, {"force": 0.02 * scale, "length": 1e-5 * scale})
+            found[kind.quantity] = (
+                [known.rise, *known.slopes],
+                [known.walk_variance, known.reading_variance],
+            )
+        return found
+
+    one, ten = numbers(1.0), numbers(10.0)
+    for quantity in one:
+        for power, (few, many) in enumerate(zip(one[quantity], ten[quantity], strict=True), 1):
+            np.testing.assert_allclose(many, 10.0**power * np.array(few), rtol=1e-6)
+    fast, slow = (
+        InverseControlParameters.of_dynamics(
+            IdentifiedDynamics(response=ResponseDynamics(lag, 2.0), fastest=0.1 * lag), duration=10.0 * lag
+        )
+        for lag in (2.0, 20.0)
+    )
+    assert (slow.period, slow.horizon) == pytest.approx((10.0 * fast.period, 10.0 * fast.horizon))
+    gains = [ProportionalIntegralParameters.of_lag(-1e-3, each) for each in (fast, slow)]
+    assert gains[1].integral_time == pytest.approx(10.0 * gains[0].integral_time)
+    assert gains[1].gain == pytest.approx(gains[0].gain)
+
+
+def test_what_nothing_says_has_no_default():
+    for kind in (InverseControlParameters, ProportionalIntegralParameters, ForceTask, LengthTask):
+        defaults = {each.name for each in fields(kind) if each.default is not MISSING}
+        assert defaults <= {"power", "duration", "rise"}
+
+
+def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inverse):
+    setup = ControllerSetup(
+        name="closed-loop-inverse", model=ModelFile("two-stage", inverse.model), limits=LIMITS,
+        options={"duration": 20.0},
+    )  # fmt: skip
+    with pytest.raises(ConfigurationError, match=r"does not say how fast .* time_constant"):
+        LENGTH_CLOSED_LOOP.make(setup)
+    given = replace(setup, options={"duration": 20.0, "time_constant": 5.0, "power": 2.0})
+    assert LENGTH_CLOSED_LOOP.make(given).time_constant == 5.0
+    with pytest.raises(ConfigurationError, match=r"duration = 20 s is too short .* 30 s"):
+        LENGTH_CLOSED_LOOP.make(replace(setup, options={"duration": 20.0, "time_constant": 30.0}))

@@ -10,6 +10,7 @@ from short_runs import all_messages
 
 from bench.cli import main
 from bench.clock import VirtualClock
+from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
 from bench.journal import Record
@@ -26,6 +27,7 @@ SMA = ["--rig", "sma", "--clock", "virtual"]
 DEVICES = ("supply", "load_cell", "wire_end", "stage", "fan")
 CHARACTERIZATION = ("force-voltage", "length-voltage", "length-force", "length-verification")
 CONTROL = ("length-control", "force-control")
+DYNAMICS = IdentifiedDynamics(response=ResponseDynamics(5.0, 2.0))
 
 
 def assignments(option, values):
@@ -95,7 +97,8 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     models = made_up_models()
     for name, model in models.items():
-        ModelFile(name, model).save(folder / f"{name}.json")
+        ModelFile(name, model, dynamics=DYNAMICS).save(folder / f"{name}.json")
+    ModelFile("two-stage", models["two-stage"]).save(folder / "without-dynamics.json")
     ModelFile("two-stage", made_up_models("mm", 1e3)["two-stage"]).save(folder / "millimetres.json")
     ModelFile("preisach", models["two-stage"].first, None).save(folder / "operator.json")
     damaged = json.loads((folder / "two-stage.json").read_text())
@@ -275,6 +278,14 @@ class TestRefused:
         assert not list(tmp_path.iterdir())
         with pytest.raises(DataError):
             planned(protocol, model=files[name])
+
+    @pytest.mark.parametrize("protocol", CONTROL)
+    def test_a_model_that_does_not_say_how_fast_the_muscle_is(self, bench, tmp_path, files, protocol):
+        model = files["without-dynamics"]
+        code, _, err = bench("run", protocol, *SMA, "--set", f"model={model}", "--out", tmp_path)
+        assert code == 2
+        assert "does not say how fast the muscle follows" in re.sub(r"\s+", " ", err)
+        assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize("protocol", [*CHARACTERIZATION, *CONTROL])
     def test_a_rig_without_a_muscle(self, bench, tmp_path, files, protocol):
