@@ -39,8 +39,8 @@ for _name in ("SIGHUP", "SIGQUIT"):
         signal.signal(getattr(signal, _name), signal.SIG_DFL)
 
 
-# Chosen by `make test`; `make test-all` looks at all examples.
-settings.register_profile("brief")
+# Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, as several folders have it.
+settings.register_profile("brief", deadline=None)
 _BRIEF, _FEWEST = 3, 20
 """What examples are divided by then, and how few there are at least."""
 _SETTINGS = "_hypothesis_internal_use_settings"
