@@ -7,6 +7,7 @@ together: the covariance before the first reading says how they do.
 
 Both have in common:
 
+* How far a reading may be from any model of the family is learnt too, within bounds, by how surprising they are.
 * What was learnt long ago is forgotten: the covariance grows with each reading.
 * A reading far from what the model can explain is refused, as that of a sensor that jumped is. While readings are
   refused nothing is forgotten, so that a sensor that stays wrong is not believed after a while.
@@ -33,7 +34,9 @@ AdaptationName: TypeAlias = Literal["off", "session", "density"]
 ADAPTATIONS: tuple[AdaptationName, ...] = get_args(AdaptationName)
 
 MODEL_ERROR = 5e-3
-"""Standard deviation of what neither estimate explains in one reading, in spans of the output."""
+"""Standard deviation of what no estimate explains in one reading, in spans of the output, at the least."""
+WORST, _SHARE = 16.0, 0.03
+"""Most that its variance grows by where readings are surprising, and the weight of each reading in that."""
 INPUT_ERROR = 5e-4
 """Standard deviation of what the specimen's input differs unseen from the measured one, in spans of the input."""
 GATE = 4.0
@@ -94,6 +97,7 @@ class ModelFilter(ABC):
         self._lately: deque[tuple[float, float] | None] = deque(maxlen=_LATELY)
         self._values, self._first = self._prior()
         self._covariance = self._first
+        self._excess = 1.0
         self._start = self._values
 
     @abstractmethod
@@ -129,7 +133,10 @@ class ModelFilter(ABC):
         step = 2.0 * INPUT_ERROR * self._spans.input
         slope = (self.model.step(state, value + step)[1] - self.model.step(state, value - step)[1]) / (2.0 * step)
         noise = (MODEL_ERROR * self._spans.output) ** 2 + (INPUT_ERROR * self._spans.input * slope) ** 2
+        noise *= self._excess
         error = output - self.model.value(state)
+        surprise = min(error**2 / (explained + noise), GATE**2)
+        self._excess = min(max(self._excess * (1.0 + _SHARE * (surprise - 1.0)), 1.0), WORST)
         if abs(error) > GATE * math.sqrt(explained + noise):
             return self._refuse(error, output - self.identified.value(state))
         self._lately.append(None)
