@@ -102,6 +102,10 @@ class ControllerSpec:
 
     summary: str
     make: Callable[[ControllerSetup], Any]
+    numbers: Callable[[ControllerSetup], Any] | None = None
+    """Returns the numbers of the controller, a dataclass, for `bench tune`."""
+    tunable: tuple[str, ...] = ()
+    """Those of them that it may change, all positive; one of a table as `TABLE.NAME`."""
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -120,10 +124,19 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
     DataError
         If the model is not of the kind that the controller needs.
     """
+    return controller_spec(task, name).make(replace(setup, name=name))
+
+
+def controller_spec(task: str, name: str) -> ControllerSpec:
+    """Return the entry of a controller.
+
+    Raises ConfigurationError if there is none of this name for the task.
+    """
     if name not in controller_names(task):
         known = ", ".join(controller_names(task)) or "none"
         raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
-    return registry.load("controllers", f"{task}.{name}").make(replace(setup, name=name))
+    spec: ControllerSpec = registry.load("controllers", f"{task}.{name}")
+    return spec
 
 
 Fallback = Literal["none", "open-loop"]
@@ -214,14 +227,28 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s)),
+    lambda _: _Settling(),
+    ("wait",),
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
     lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled)),
+    lambda s: CorrectionParameters.scaled(s.spans),
+    ("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
 )
-LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
+LATCHED = ControllerSpec(
+    "backs off at the target, where the hysteresis holds the output",
+    _latched,
+    lambda s: LatchParameters.scaled(s.spans),
+    ("approach", "creep_gain", "creep_until", "fine_period"),
+)
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
-INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits, _integral(s)))
+INTEGRAL = ControllerSpec(
+    "integral action without a model",
+    lambda s: IntegralControl(s.limits, _integral(s)),
+    lambda s: _integral(replace(s, options={})),
+    ("gain", "period"),
+)
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),

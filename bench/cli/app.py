@@ -32,6 +32,7 @@ from bench.cli import (
     resume,
     run_list,
     runs,
+    tune,
     twin,
     upkeep,
 )
@@ -60,6 +61,7 @@ _PARTS = (
     records.app,
     journals.app,
     twin.app,
+    tune.app,
     new.app,
 )
 

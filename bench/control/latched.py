@@ -17,10 +17,14 @@ from bench.control.tracking import (
     check_positive,
 )
 from bench.control.tuning import Spans
+from bench.errors import ConvergenceError
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.hysteresis.inverse import PreisachInverse
 
 Direction = Literal[-1, 1]
+
+_UNLOCKED = 3
+"""Targets in a row at which no lock held, after which it is not to be expected."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,8 @@ class Latched(Correcting):
     ------
     ValueError
         If the model has no reversible part.
+    ConvergenceError
+        While it is at work, if no lock held at several targets in a row.
     """
 
     @staticmethod
@@ -174,6 +180,7 @@ class Latched(Correcting):
         self._direction: Direction = 1
         self.tries = 0
         """Number of approaches to the present target."""
+        self._unlocked = 0
         self.locked = False
         """Whether the present target is held by the lock."""
 
@@ -197,6 +204,13 @@ class Latched(Correcting):
                     break
                 self.extreme = None
                 self._direction = 1 if self._direction < 0 else -1
+            self._unlocked = 0 if self.locked else self._unlocked + 1
+            if self._unlocked == _UNLOCKED:
+                raise ConvergenceError(
+                    f"the lock of the latched controller held at none of the last {_UNLOCKED} targets after "
+                    f"{p.tries} approaches each: behind a reversal the specimen does not move as its model says; "
+                    "identify it again, or use the controller closed-loop-inverse"
+                )
         if not self.locked:
             yield from self._correct(target)
         yield from self._hold(self._poll)
