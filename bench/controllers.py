@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
+from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
 from bench.control.supervision import Supervised
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
@@ -25,6 +26,9 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Inverse, Operator, Policy
 from bench.hysteresis.falling_inverse import FallingInverse
 from bench.model_file import ModelFile, load_model
+
+if TYPE_CHECKING:
+    from bench.control.predictive import PredictiveFollower
 
 T = TypeVar("T")
 
@@ -47,6 +51,10 @@ class ControllerSetup:
         Which answer of the inverse is taken where there are several.
     options : mapping
         Numbers of the controller in place of its defaults, and others that the task has.
+    adaptation : {"off", "session", "density"}
+        How the model is corrected while it is used.
+    period : float
+        Time between two set-points of a follower, s.
     """
 
     name: str = ""
@@ -55,6 +63,8 @@ class ControllerSetup:
     state: Any = None
     policy: Policy = "nearest"
     options: Mapping[str, Any] = field(default_factory=dict)
+    adaptation: AdaptationName = "off"
+    period: float = 0.5
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -77,6 +87,16 @@ class ControllerSetup:
         inverse.invert(operator.initial_state(), 0.5 * sum(operator.output_range()))
         return inverse
 
+    def model_filter(self) -> ModelFilter | None:
+        """Return what corrects the model while it is used, None if nothing does.
+
+        Raises DataError if the model is not of the kind that this needs.
+        """
+        try:
+            return model_filter(self.adaptation, self.model.operator)
+        except ValueError as error:
+            raise DataError(f"controller {self.name}: {error}") from None
+
     @property
     def spans(self) -> Spans:
         """Widths of the model's ranges."""
@@ -97,11 +117,12 @@ class ControllerSetup:
 class ControllerSpec:
     """An entry of the group `bench.controllers`: a one-line summary, and what makes the controller of a setup.
 
-    `make` raises a DataError that says what kind of model it needs.
+    `make` raises a DataError that says what kind of model it needs. One that `adapts` can correct its model.
     """
 
     summary: str
     make: Callable[[ControllerSetup], Any]
+    adapts: bool = False
     numbers: Callable[[ControllerSetup], Any] | None = None
     """Returns the numbers of the controller, a dataclass, for `bench tune`."""
     tunable: tuple[str, ...] = ()
@@ -120,11 +141,18 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
     Raises
     ------
     ConfigurationError
-        If there is none of this name for the task.
+        If there is none of this name for the task, or it cannot adapt its model as is asked for.
     DataError
         If the model is not of the kind that the controller needs.
     """
-    return controller_spec(task, name).make(replace(setup, name=name))
+    spec = controller_spec(task, name)
+    if setup.adaptation != "off" and not spec.adapts:
+        others = [each for each in controller_names(task) if controller_spec(task, each).adapts]
+        raise ConfigurationError(
+            f"controller {name} does not adapt a model (adaptation = {setup.adaptation}); these do: "
+            f"{', '.join(others) or 'none'}"
+        )
+    return spec.make(replace(setup, name=name))
 
 
 def controller_spec(task: str, name: str) -> ControllerSpec:
@@ -172,12 +200,16 @@ def make_supervised(
     """
     controller = make_controller(task, name, setup)
     if fallback == "none":
-        return Supervised(controller, setup.limits, span)
+        return Supervised(controller, setup.limits, span, compares=setup.adaptation == "off")
     opened = replace(setup, options=options)
     # What it needs of the model is known before anything moves.
     make_controller(task, _OPEN, opened)
     return Supervised(
-        controller, setup.limits, span, lambda state: make_controller(task, _OPEN, replace(opened, state=state))
+        controller,
+        setup.limits,
+        span,
+        lambda state: make_controller(task, _OPEN, replace(opened, state=state)),
+        compares=setup.adaptation == "off",
     )
 
 
@@ -224,38 +256,63 @@ def _integral(setup: ControllerSetup) -> IntegralParameters:
     return setup.tuned(partial(IntegralParameters.scaled, falls=bool(high < low)))
 
 
+def _predictive(setup: ControllerSetup) -> PredictiveFollower:
+    # Heavy imports, for this one controller.
+    from bench.control.predictive import PredictionParameters, PredictiveFollower
+
+    parameters = setup.tuned(partial(PredictionParameters.scaled, period=setup.period))
+    inverse, dynamics = setup.inverse(), setup.model.dynamics
+    if dynamics is None:
+        raise DataError(
+            f"controller {setup.name} needs the dynamics of actuator and response, which model {setup.model.name} "
+            "lacks; identify it from a run, whose transients show them, not from a table"
+        )
+    return PredictiveFollower(inverse, dynamics, setup.start, setup.limits, parameters, setup.model_filter())
+
+
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s)),
-    lambda _: _Settling(),
-    ("wait",),
+    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
+    adapts=True,
+    numbers=lambda _: _Settling(),
+    tunable=("wait",),
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled)),
-    lambda s: CorrectionParameters.scaled(s.spans),
-    ("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
+    lambda s: ClosedLoopInverse(
+        s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled), s.model_filter()
+    ),
+    adapts=True,
+    numbers=lambda s: CorrectionParameters.scaled(s.spans),
+    tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
 )
 LATCHED = ControllerSpec(
     "backs off at the target, where the hysteresis holds the output",
     _latched,
-    lambda s: LatchParameters.scaled(s.spans),
-    ("approach", "creep_gain", "creep_until", "fine_period"),
+    numbers=lambda s: LatchParameters.scaled(s.spans),
+    tunable=("approach", "creep_gain", "creep_until", "fine_period"),
 )
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
 INTEGRAL = ControllerSpec(
     "integral action without a model",
     lambda s: IntegralControl(s.limits, _integral(s)),
-    lambda s: _integral(replace(s, options={})),
-    ("gain", "period"),
+    numbers=lambda s: _integral(replace(s, options={})),
+    tunable=("gain", "period"),
 )
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()),
+    adapts=True,
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled)),
+    lambda s: ClosedLoopFollower(
+        s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()
+    ),
+    adapts=True,
+)
+PREDICTIVE_FOLLOWER = ControllerSpec(
+    "set-points of a horizon by model, dynamics and coming reference, within the limits", _predictive, adapts=True
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
     "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))

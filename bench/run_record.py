@@ -96,6 +96,7 @@ def metadata(
         Time of day at laboratory time 0.
     """
     file = description.file
+    layout = protocol.views.layout(slots, file.dashboard) if protocol.views else file.dashboard
     return {
         "rig": file.name,
         "rig_title": file.rig.title,
@@ -125,7 +126,8 @@ def metadata(
             **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
             **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
         },
-        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
+        "dashboard": layout.model_dump(mode="json") if layout else None,
+        "over_time": protocol.views.signals_over_time(slots) if protocol.views else [],
         "operator": _operator(),
         "command": sys.argv,
         "packages": _versions(),

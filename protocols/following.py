@@ -13,8 +13,8 @@ from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
-from protocols.session import SessionParameters, begin_session, session_kinds
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
+from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _DRIVE = unit_of("drive")
 
@@ -36,7 +36,7 @@ class Parameters(SessionParameters):
     fastest: float = parameter(from_slot("drive", "rate"), unit=f"{_DRIVE}/s", help="what the drive can follow")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
 def following(parameters: Parameters, slots: Slots) -> Messages:
     """Make the response follow a reference, set-point by set-point at a fixed rate.
 
@@ -44,7 +44,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     it is straight. One that asks the drive for more than `fastest` is refused before anything moves. The memory
     of the specimen is unknown at the start, so it is reset first, by negative saturation at `reset`. With
     `recalibrate` known set-points are visited before, by which the model is corrected for what moved since it was
-    identified.
+    identified; with `adaptation` it is corrected while it is used.
     """
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
@@ -63,7 +63,14 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     reading, model = yield from begin_session(parameters, slots, model, kinds)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     options = parameters.tuning.get(parameters.controller, {})
-    setup = ControllerSetup(model=model, limits=limits, state=state, options=options)
+    setup = ControllerSetup(
+        model=model,
+        limits=limits,
+        state=state,
+        options=options,
+        adaptation=parameters.adaptation,
+        period=1.0 / parameters.rate,
+    )
     follower = make_controller("follow", parameters.controller, setup)
 
     def follow(reference: Callable[[float], float], seconds: float, timeout: float, label: str) -> Control:
@@ -82,6 +89,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     yield follow(lambda _: float(values[0]), 20.0, 60.0, "approach")
     yield Phase(f"follow, {parameters.controller}")
     yield follow(lambda t: float(np.interp(t, times, values)), duration, duration + 60.0, FOLLOW)
+    yield from keep_adapted(follower, model)
 
 
 def _reference(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:

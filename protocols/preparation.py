@@ -19,6 +19,7 @@ from bench.protocol import (
     Slot,
     Slots,
     Step,
+    Views,
     from_slot,
     parameter,
     unit_of,
@@ -29,6 +30,9 @@ DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actu
 """What a characterization needs of a rig."""
 LOAD: Mapping[str, type[Signal]] = {"load": Signal}
 """What it uses if the rig has it: a load that an operator hangs on the specimen."""
+
+LOOP = Views(loops=(("drive", "response"),))
+"""What is worth seeing of it."""
 
 R = TypeVar("R")
 Part: TypeAlias = Generator[Message, Reading, R]
@@ -54,7 +58,12 @@ class SweepParameters(LoadedParameters):
     low: float = parameter(from_slot("drive", "low"), unit=DRIVE, help="lowest set-point, where the memory is reset")
     high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point")
     dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+        from_slot("drive", "dwell"),
+        unit="s",
+        low=0.01,
+        high=3600,
+        help="hold at each set-point before the reading",
+        changeable=True,
     )
 
 

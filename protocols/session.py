@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from bench.control.model_filters import ADAPTATIONS, AdaptationName
 from bench.identification.excitation import ramps
 from bench.identification.recalibration import Kind, parse_kinds, recalibrate
 from bench.model_file import ModelFile
-from bench.protocol import Dwell, Note, Phase, Reading, Slots, Step, from_slot, parameter
+from bench.protocol import Dwell, KeptModel, Note, Phase, Reading, Slots, Step, from_slot, parameter
 from protocols.preparation import ControlledParameters, Part, reset, reset_unknown_memory
 
 SESSION = "session"
 """Label of the steps that visit known set-points."""
+
+ADAPTED = "adapted"
+"""Name of the corrected model among those of the run."""
 
 # Where the rig file has none for its drive, s: protocols that take no other readings need none.
 _DWELL = 8.0
@@ -37,6 +42,13 @@ class SessionParameters(ControlledParameters):
         low=0.01,
         high=3600,
         help="hold before each of these readings",
+    )
+    adaptation: AdaptationName = parameter(
+        "off",
+        unit="",
+        help="how the model is corrected while it is used: offset, gain, input offset and width of the loops "
+        "(session), or its density (density)",
+        choices=lambda: ADAPTATIONS,
     )
 
 
@@ -81,3 +93,20 @@ def begin_session(
     corrected = found.corrected(model.operator)
     reading = yield from reset(slots, low, 8.0)
     return reading, replace(model, model=corrected, memory=None, band=None)
+
+
+def keep_adapted(controller: Any, model: ModelFile) -> Part[None]:  # noqa: ANN401 - of a target or a reference
+    """Note what a controller has learnt, and keep its corrected model with the run; nothing if it does not adapt."""
+    adaptation = getattr(controller, "adaptation", None)
+    if adaptation is None:
+        return
+    corrected = replace(
+        model,
+        model=adaptation.model,
+        memory=controller.state,
+        initial=None,
+        band=None,
+        provenance={**model.provenance, "adapted": adaptation.to_json()},
+    )
+    text = f"adaptation by {adaptation.name}: {adaptation.summary()}; the corrected model is kept as {ADAPTED!r}"
+    yield KeptModel(text, ADAPTED, corrected.to_json())

@@ -13,8 +13,11 @@ from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
-from protocols.session import SessionParameters, begin_session, session_kinds
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
+from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
+
+_TARGETS_A_NOTE = 10
+"""Targets after which what an adaptation has learnt is noted."""
 
 
 class Parameters(SessionParameters):
@@ -33,14 +36,18 @@ class Parameters(SessionParameters):
     )
     count: int = parameter(60, unit="1", low=2, high=10000, help="number of generated targets")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
-    readings: int = parameter(10, unit="1", low=1, high=1000, help="readings at each target once it is reached")
+    readings: int = parameter(
+        10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
+    )
     fallback: Fallback = parameter(
         "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
     )
-    timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
+    timeout: float = parameter(
+        300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
+    )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
     """Bring the response to a sequence of targets.
 
@@ -48,7 +55,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     the controller has done what it can, `readings` readings are taken, 0.1 s apart: their mean less the target
     is the error that counts. The memory of the specimen is unknown at the start, so it is reset first, by
     negative saturation at `reset`. With `recalibrate` known set-points are visited before, by which the model is
-    corrected for what moved since it was identified.
+    corrected for what moved since it was identified; with `adaptation` it is corrected at each target.
     """
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
@@ -63,7 +70,14 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     reading, model = yield from begin_session(parameters, slots, model, kinds)
     state = model.operator.saturated_state(-1, reading[drive.signal])
     options = parameters.tuning.get(parameters.controller, {})
-    setup = ControllerSetup(model=model, limits=limits, policy=parameters.policy, state=state, options=options)
+    setup = ControllerSetup(
+        model=model,
+        limits=limits,
+        policy=parameters.policy,
+        state=state,
+        options=options,
+        adaptation=parameters.adaptation,
+    )
     controller = make_supervised(
         "target",
         parameters.controller,
@@ -75,7 +89,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     yield Phase(parameters.controller)
     errors: list[float] = []
     seconds: list[float] = []
-    for target in targets.tolist():
+    for number, target in enumerate(targets.tolist(), start=1):
         start = reading.time
         reading = yield Control(
             task=ReachTarget(controller, target),
@@ -94,6 +108,8 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
             reading = yield Step({}, Dwell(0.1), label=READING)
             outputs.append(reading[response.signal])
         errors.append(float(np.mean(outputs)) - target)
+        if number % _TARGETS_A_NOTE == 0 or number == targets.size:
+            yield from keep_adapted(controller, model)
     magnitudes = np.abs(errors)
     rms = float(np.sqrt(np.mean(magnitudes**2)))
     yield Note(

@@ -8,7 +8,8 @@ import numpy as np
 
 import bench
 from bench.control.adaptation import Adapter
-from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
+from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
+from bench.control.predictive import PredictiveFollower
 from bench.hysteresis import (
     BoucWen,
     Duhem,
@@ -59,6 +60,9 @@ def operators() -> None:
     stream.move(0.2)
     PrandtlIshlinskii([0.0, 0.1], [1.0, 1.0]).stream().step(0.2)
     Adapter(operator).update(0.5, 0.1).update(0.8, 0.3)
+    follower = PredictiveFollower(inverse, IdentifiedDynamics(ActuatorDynamics(frequency=2.0)))
+    for t in (0.0, 0.5):
+        follower.update(t, 0.2, 0.1, 0.2)
     identify("preisach-nonmonotonic", inputs, outputs, input_range=(0.0, 1.0), plane=(0.0, 1.0), reference=0.0)
     identify("prandtl-ishlinskii", inputs, outputs, input_range=(0.0, 1.0))
 
@@ -76,6 +80,7 @@ def element_operators() -> None:
     ):
         each.evaluate(inputs)
         each.regressor(inputs)
+        each.stream().step(0.2)
 
 
 def hybrid_estimate() -> None:

@@ -199,6 +199,10 @@ class DisturbanceEstimator:
             self._variance = (1.0 - gain) * self._variance * (1.0 - gain) + gain * self._noise * gain
         return self._value
 
+    def shift(self, difference: float) -> None:
+        """Take note that the prediction fell by a difference (output units), as that of a corrected model does."""
+        self._value += difference
+
     def reset(self) -> None:
         """Forget everything."""
         self._value, self._variance = 0.0, self._first

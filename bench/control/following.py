@@ -9,6 +9,7 @@ from typing import Any
 
 from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
+from bench.control.model_filters import ModelFilter
 from bench.control.tracking import ControllerBase, check_positive
 from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Reach, _checks
@@ -78,6 +79,8 @@ class OpenLoopFollower(_Follower):
         As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower; only `lead` is used.
+    adaptation : ModelFilter or None
+        What corrects the model by the output in each period.
     """
 
     _corrects = False
@@ -88,15 +91,21 @@ class OpenLoopFollower(_Follower):
         state: Any = None,  # noqa: ANN401 - each operator has its own
         limits: tuple[float, float] | None = None,
         parameters: FollowingParameters | None = None,
+        adaptation: ModelFilter | None = None,
     ) -> None:
-        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
-        self._answers = inverse.stream(self.state)
-        self._memory, self._move = self._answers, self._answers.move
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation)
+        self._take(inverse, self.state)
         self._parameters = p = parameters or FollowingParameters.scaled(Spans.of(inverse.operator))
         if self._corrects:
             self._estimator = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
 
-    def _answer_to(self, step: float, output: float) -> float:  # noqa: ARG002
+    def _take(self, inverse: Inverse[Any], state: Any) -> None:  # noqa: ANN401
+        self._inverse = inverse
+        self._answers = inverse.stream(state)
+        self._memory, self._move = self._answers, self._answers.move
+
+    def _answer_to(self, step: float, output: float) -> float:
+        self._learn(output)
         return self._inverted(step, 0.0)
 
     def _inverted(self, step: float, disturbance: float) -> float:
@@ -128,12 +137,15 @@ class ClosedLoopFollower(OpenLoopFollower):
         As in `OpenLoopInverse`.
     parameters : FollowingParameters
         Numbers of the follower.
+    adaptation : ModelFilter or None
+        As in `OpenLoopFollower`.
     """
 
     _corrects = True
 
     def _answer_to(self, step: float, output: float) -> float:
         assert self._estimator is not None
+        self._learn(output)
         self._estimator.update(output - self._modelled() if self._is_known(output) else None)
         return self._inverted(step, self._estimator.value)
 

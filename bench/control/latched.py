@@ -17,7 +17,6 @@ from bench.control.tracking import (
     check_positive,
 )
 from bench.control.tuning import Spans
-from bench.errors import ConvergenceError
 from bench.hysteresis import MemoryCurve, Preisach
 from bench.hysteresis.inverse import PreisachInverse
 
@@ -150,8 +149,6 @@ class Latched(Correcting):
     ------
     ValueError
         If the model has no reversible part.
-    ConvergenceError
-        While it is at work, if no lock held at several targets in a row.
     """
 
     @staticmethod
@@ -184,6 +181,16 @@ class Latched(Correcting):
         self.locked = False
         """Whether the present target is held by the lock."""
 
+    @property
+    def doubt(self) -> str:
+        """Why it does not do what it should on this specimen; empty if it does."""
+        if self._unlocked < _UNLOCKED:
+            return ""
+        return (
+            f"its lock held at none of the last {self._unlocked} targets after {self._parameters.tries} approaches "
+            "each, as behind a reversal the specimen does not move as its model says"
+        )
+
     def _observe(self, measured_input: float) -> bool:
         known = super()._observe(measured_input)
         if known and self.extreme is not None:
@@ -205,12 +212,6 @@ class Latched(Correcting):
                 self.extreme = None
                 self._direction = 1 if self._direction < 0 else -1
             self._unlocked = 0 if self.locked else self._unlocked + 1
-            if self._unlocked == _UNLOCKED:
-                raise ConvergenceError(
-                    f"the lock of the latched controller held at none of the last {_UNLOCKED} targets after "
-                    f"{p.tries} approaches each: behind a reversal the specimen does not move as its model says; "
-                    "identify it again, or use the controller closed-loop-inverse"
-                )
         if not self.locked:
             yield from self._correct(target)
         yield from self._hold(self._poll)

@@ -151,6 +151,16 @@ class ReachTarget:
         return self._controller.trace
 
 
+@runtime_checkable
+class Foreseeing(Protocol):
+    """A `Follower` that is given the reference of some coming periods before each update."""
+
+    horizon: int
+
+    def foresee(self, references: Floats) -> None:
+        """Take the reference at the end of each coming period, shape (`horizon`,), output units."""
+
+
 class FollowReference:
     """Make the output follow a reference at a fixed rate.
 
@@ -198,6 +208,9 @@ class FollowReference:
             return Command(self._setpoint, 0.0, done=True)
         self._sample += 1
         end = self._sample * self._period
+        if isinstance(self._follower, Foreseeing):
+            ahead = end + self._period * np.arange(self._follower.horizon)
+            self._follower.foresee(np.array([self._reference(each) for each in ahead.tolist()]))
         self._setpoint = self._follower.update(t, measured_input, output, self._reference(end))
         # Counted from the beginning, so that one delay does not shift all later samples.
         return Command(self._setpoint, max(SHORTEST_WAIT, self._start + end - t))

@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
 from bench.control.loops import Reaching
+from bench.control.model_filters import ModelFilter
 from bench.control.tracking import Command, Trace
 from bench.errors import ConvergenceError
 from bench.hysteresis import Reach
@@ -30,8 +31,8 @@ class Supervised:
 
     It does not if it sends the actuator to and fro between the ends of its range at one target, or if over several
     targets it leaves more than half of what its model errs by at the same places: then the model alone, without
-    feedback, would have been about as good, or better. Targets that cannot be met do not count, and a controller
-    that does not say what its model errs by is judged by the swings alone.
+    feedback, would have been about as good, or better; or if it says so itself (`doubt`). Targets that cannot be met
+    do not count, and a controller that does not say what its model errs by is judged by the swings alone.
 
     Parameters
     ----------
@@ -44,6 +45,9 @@ class Supervised:
     fallback : callable or None
         Makes the controller that goes on, from the memory of the one that is given up. Without it a
         `ConvergenceError` ends the run in the safe state.
+    compares : bool
+        Whether errors are compared with those of the model. Not of a controller that corrects its model: what that
+        errs by at present is the same.
     """
 
     def __init__(
@@ -52,12 +56,15 @@ class Supervised:
         limits: tuple[float, float],
         span: float,
         fallback: Callable[[Any], Reaching] | None = None,
+        *,
+        compares: bool = True,
     ) -> None:
         self._controller: Any = controller
         self._watch = LimitCycleWatch(*limits)
         self._limits = limits
         self._tolerance = _TOLERANCE * span
         self._fallback = fallback
+        self._compares = compares
         self._judged: deque[tuple[float, float]] = deque(maxlen=TARGETS)
         self._target = self._output = math.nan
         self._finished = False
@@ -77,13 +84,7 @@ class Supervised:
         """Go on towards the target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
         if math.isfinite(output):
             self._output = output
-        try:
-            command: Command = self._controller.update(t, measured_input, output, *others)
-        except ConvergenceError as error:
-            if self._fallback is None:
-                raise
-            self._give_up(str(error))
-            command = self._controller.aim(self._target, t, measured_input, output, *others)
+        command: Command = self._controller.update(t, measured_input, output, *others)
         return self._watched(command, t, measured_input, output, others)
 
     @property
@@ -96,6 +97,12 @@ class Supervised:
     def state(self) -> Any:  # noqa: ANN401 - each operator has its own
         """Memory of the actuator as the controller at work knows it."""
         return self._controller.state
+
+    @property
+    def adaptation(self) -> ModelFilter | None:
+        """What corrects the model of the controller at work; None if nothing does."""
+        found: ModelFilter | None = getattr(self._controller, "adaptation", None)
+        return found
 
     @property
     def reach(self) -> Reach:
@@ -127,8 +134,10 @@ class Supervised:
 
     def _judge(self) -> str:
         """Judge how the last target was met; return why the controller does not converge, or nothing."""
-        if self.gave_up or not self._finished or self.reach is not Reach.MET:
+        if not self._compares or self.gave_up or not self._finished or self.reach is not Reach.MET:
             return ""
+        if doubt := getattr(self._controller, "doubt", ""):
+            return str(doubt)
         error, without = self._output - self._target, self.trace.disturbance
         if not math.isfinite(without):
             return ""

@@ -29,6 +29,7 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
 from bench.control.estimators import DisturbanceEstimator
+from bench.control.model_filters import ModelFilter
 from bench.control.overshoot import Overshoot, Passing
 from bench.control.tuning import Spans
 from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
@@ -81,7 +82,7 @@ class Trace:
     predicted : float
         Output that it believes to have, output units: model and estimated disturbance.
     disturbance : float
-        Estimated difference of actuator and model, output units.
+        Estimated difference of actuator and identified model, output units.
     uncertainty : float
         Standard deviation of that estimate, output units.
     """
@@ -212,6 +213,8 @@ class ControllerBase:
         The model whose memory is kept.
     state : object or None
         Memory at the first reading, a state of the model; default the model's initial one.
+    adaptation : ModelFilter or None
+        What corrects the model while it is used.
 
     Raises
     ------
@@ -220,6 +223,7 @@ class ControllerBase:
     """
 
     _estimator: DisturbanceEstimator | None = None
+    _inverse: Inverse[Any]
 
     def __init__(
         self,
@@ -227,6 +231,7 @@ class ControllerBase:
         limits: tuple[float, float] | None = None,
         model: Operator[Any] | None = None,
         state: Any = None,  # noqa: ANN401 - each operator has its own
+        adaptation: ModelFilter | None = None,
     ) -> None:
         low, high = _checks.increasing("limits", input_range).tolist()
         if limits is not None:
@@ -236,6 +241,7 @@ class ControllerBase:
                 raise ValueError(f"limits: expected an overlap with the range {input_range}, got {limits}")
         self._low, self._high = float(low), float(high)
         self._model, self._state = model, state
+        self._adaptation = adaptation
         self._memory: Stream[Any] | InverseStream[Any] | None = None
         self._plausible_input = self._plausible_output = (-math.inf, math.inf)
         present = 0.5 * (low + high)
@@ -253,10 +259,20 @@ class ControllerBase:
     @property
     def trace(self) -> Trace:
         """Internal values at present."""
-        modelled, estimator = self._modelled(), self._estimator
-        if estimator is None:
+        modelled, estimator, adaptation = self._modelled(), self._estimator, self._adaptation
+        if estimator is None and adaptation is None:
             return Trace(self._reference, modelled)
-        return Trace(self._reference, modelled + estimator.value, estimator.value, estimator.uncertainty)
+        disturbance, uncertainty = (0.0, 0.0) if estimator is None else (estimator.value, estimator.uncertainty)
+        predicted = modelled + disturbance
+        if adaptation is not None:
+            disturbance = predicted - adaptation.identified.value(self.state)
+            uncertainty = math.hypot(uncertainty, adaptation.uncertainty)
+        return Trace(self._reference, predicted, disturbance, uncertainty)
+
+    @property
+    def adaptation(self) -> ModelFilter | None:
+        """What corrects the model, and the corrected model; None if nothing does."""
+        return self._adaptation
 
     @property
     def state(self) -> Any:  # noqa: ANN401
@@ -297,6 +313,25 @@ class ControllerBase:
         """Return the model's output after what the actuator did; nan without a model."""
         return math.nan if self._memory is None else self._memory.value
 
+    def _learn(self, output: float) -> None:
+        """Have the model corrected by an output that was measured where the actuator has come to."""
+        adaptation = self._adaptation
+        if adaptation is None or not self._is_known(output):
+            return
+        state, before = self.state, self._modelled()
+        if adaptation.update(state, output):
+            self._model = adaptation.model
+            self._take(adaptation.model.inverse(self._inverse.policy), state)
+            if self._estimator is not None:
+                # What the model now explains is no disturbance any more.
+                self._estimator.shift(before - self._modelled())
+
+    def _take(self, inverse: Inverse[Any], state: Any) -> None:  # noqa: ANN401
+        """Go on with another model and its inverse from a state."""
+        self._inverse = inverse
+        stream = inverse.operator.stream(state)
+        self._memory, self._move = stream, stream.step
+
     def _answer(self, found: Inversion[Any], target: float) -> tuple[float, ...]:
         """Return the set-points of an inversion within the limits, and note whether they meet the target."""
         return self._within(found.setpoints, found.reach, target)
@@ -334,8 +369,9 @@ class Scripted(ControllerBase, ABC):
         limits: tuple[float, float] | None = None,
         model: Operator[Any] | None = None,
         state: Any = None,  # noqa: ANN401
+        adaptation: ModelFilter | None = None,
     ) -> None:
-        super().__init__(input_range, limits, model, state)
+        super().__init__(input_range, limits, model, state, adaptation)
         self._overshoot = Overshoot(_SIGNIFICANT * (self._high - self._low))
 
     def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
@@ -449,6 +485,8 @@ class OpenLoopInverse(Scripted):
         Least and greatest set-point, input units; default the operating range of the model.
     wait : float
         Time for the actuator to settle after each set-point, s.
+    adaptation : ModelFilter or None
+        What corrects the model by the output after each wait.
     """
 
     _needs_output = False
@@ -460,10 +498,11 @@ class OpenLoopInverse(Scripted):
         limits: tuple[float, float] | None = None,
         *,
         wait: float = 8.0,
+        adaptation: ModelFilter | None = None,
     ) -> None:
         if not 0.0 < wait < math.inf:
             raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
-        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation)
         self._inverse = inverse
         self._wait = wait
 
@@ -477,11 +516,14 @@ class OpenLoopInverse(Scripted):
 
     def _settle(self, setpoint: float) -> Generator[Command, Sample, None]:
         """Go to a set-point and wait there; the input is read meanwhile, so that its extremes are known."""
-        started = self._time
+        started, output = self._time, math.nan
         passing = yield from self._head_for(setpoint)
         while (left := self._wait - (self._time - started)) > _ON_TIME:
-            passing.note((yield self._command(setpoint, left / max(1, round(left / _LOOK)))).input)
+            reading = yield self._command(setpoint, left / max(1, round(left / _LOOK)))
+            passing.note(reading.input)
+            output = reading.output
         passing.learn()
+        self._learn(output)
 
 
 @dataclass(frozen=True)
@@ -532,8 +574,9 @@ class Correcting(Scripted):
         state: Any = None,  # noqa: ANN401
         limits: tuple[float, float] | None = None,
         parameters: CorrectionParameters | None = None,
+        adaptation: ModelFilter | None = None,
     ) -> None:
-        super().__init__(inverse.operator.input_range, limits, inverse.operator, state)
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation)
         self._inverse = inverse
         self._correction = parameters = parameters or CorrectionParameters.scaled(Spans.of(inverse.operator))
         self._poll = parameters.arrival.poll
@@ -555,6 +598,7 @@ class Correcting(Scripted):
         """Go to the target and correct by the disturbance that is measured where the actuator has come to."""
         reading = yield from self._towards(target - self._estimator.value)
         for _ in range(self._correction.corrections):
+            self._learn(reading.output)
             self._estimator.update(reading.output - self._modelled())
             if abs(target - reading.output) <= self._correction.close_enough:
                 break
@@ -578,6 +622,8 @@ class ClosedLoopInverse(Correcting):
         As in `OpenLoopInverse`.
     parameters : CorrectionParameters
         Numbers of the loop.
+    adaptation : ModelFilter or None
+        What corrects the model by the output at each correction.
     """
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002

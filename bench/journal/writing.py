@@ -18,6 +18,7 @@ from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
+from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
 from bench.journal.store import Store
@@ -25,7 +26,7 @@ from bench.journal.store import Store
 _READERS = 10.0
 """Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
 
-_END = ("status", "reason", "finished", "safe_state", "counts")
+_END = ("status", "reason", "finished", "safe_state", "counts", "lateness")
 """Entries of the metadata that a run has once it has ended."""
 
 
@@ -197,6 +198,10 @@ class Journal:
         """Record something that happened."""
         self._write([entry("events", (self._number("events"), event.t, event.level, event.kind, event.text))])
 
+    def keep_model(self, name: str, t: float, content: Mapping[str, Any]) -> None:
+        """Keep a model beside the journal; see `add_model`."""
+        add_model(self.path, name, t, content)
+
     def take_notices(self) -> list[str]:
         """Return what happened to the journal itself since the last call."""
         taken = []
@@ -209,8 +214,16 @@ class Journal:
         self._stop_background()
         self._keeper.make_room()
 
-    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
-        """Record how the run ended: status, reason, laboratory time in s, safe state by device.
+    def finish(
+        self,
+        *,
+        status: str,
+        reason: str,
+        finished: float,
+        safe_state: Mapping[str, str],
+        lateness: Mapping[str, object] = MappingProxyType({}),
+    ) -> None:
+        """Record how the run ended: status, reason, laboratory time in s, safe state by device, lateness of loops.
 
         Raises RecordError if rows are missing or damaged; the status is `failed` then at best.
         """
@@ -227,6 +240,7 @@ class Journal:
             "finished": finished,
             "safe_state": dict(safe_state),
             "counts": self._counts,
+            **({"lateness": dict(lateness)} if lateness else {}),
         }
         self._keeper.keep([entry("meta", meta_row(key, value)) for key, value in end.items()])
         problem = problem or self._keeper.why

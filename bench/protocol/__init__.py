@@ -12,11 +12,13 @@ from bench.protocol.parameters import (
     unit_of,
 )
 from bench.protocol.plan import Plan, plan
+from bench.protocol.views import Views
 from bench.protocol.vocabulary import (
     LATENESS,
     TRACES,
     Control,
     FixedRate,
+    KeptModel,
     Message,
     Messages,
     Note,
@@ -34,6 +36,7 @@ __all__ = [
     "Control",
     "Dwell",
     "FixedRate",
+    "KeptModel",
     "Message",
     "Messages",
     "Note",
@@ -51,6 +54,7 @@ __all__ = [
     "Slots",
     "Step",
     "UntilSteady",
+    "Views",
     "digest_of",
     "find_protocol",
     "from_slot",

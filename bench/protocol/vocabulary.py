@@ -26,8 +26,10 @@ import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from bench.control.loops import BlockController, ControlTask, DelayedController, SampledController
+from bench.desk import Desk
 from bench.devices import Signal
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
 
@@ -289,6 +291,23 @@ class Prompt(Message):
         return Planned(seconds=shortest, at_most=longest, watched=watched, prompts=1, settled=_MET[type(self.settle)])
 
 
+@dataclass(frozen=True, kw_only=True)
+class ByHand(Message):
+    """Let an operator move the rig, command by command, until there are no more; then take a reading.
+
+    Attributes
+    ----------
+    desk : Desk
+        Where the commands come from.
+    """
+
+    desk: Desk
+
+    def plan(self) -> Planned:
+        """Return that nothing is known."""
+        return Planned(at_most=math.inf, settled=Settled.UNRECORDED)
+
+
 @dataclass(frozen=True)
 class Phase(Message):
     """A part of the protocol begins; shown live and kept in the record."""
@@ -309,6 +328,24 @@ class Note(Message):
     def plan(self) -> Planned:
         """Return that nothing moves."""
         return Planned(settled=None)
+
+
+@dataclass(frozen=True)
+class KeptModel(Note):
+    """A model that is kept with the run, in place of an earlier one of this name; the text goes to the log.
+
+    Parameters
+    ----------
+    text : str
+        A sentence for the log.
+    name : str
+        Name of the model among those of the run.
+    content : mapping
+        The model file's content.
+    """
+
+    name: str
+    content: Mapping[str, Any]
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,14 @@ from bench.protocol import (
     ProtocolParameters,
     Slots,
     Step,
+    Views,
     parameter,
     protocol,
 )
 from bench.results.tracking import REACH, READING
 from bench.tuning_file import Tuning
 from protocols.muscles.parts import (
+    LENGTH_LOOPS,
     ON_STAGE,
     ON_WEIGHTS,
     ResetParameters,
@@ -82,7 +84,7 @@ class ForceParameters(Controlled, StageParameters):
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
 
-@protocol(needs=ON_WEIGHTS, controls="response")
+@protocol(needs=ON_WEIGHTS, controls="response", views=LENGTH_LOOPS)
 def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     """Bring the length of a muscle under a weight to one target after another.
 
@@ -115,7 +117,7 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
 
 
-@protocol(needs=ON_STAGE, controls="force")
+@protocol(needs=ON_STAGE, controls="force", views=Views((("drive", "force"),)))
 def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     """Bring the force of a muscle between fixed ends to one target after another.
 

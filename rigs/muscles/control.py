@@ -439,8 +439,8 @@ def _with_inverse(summary: str, controller: Callable[..., MuscleController], kin
     return ControllerSpec(
         summary,
         lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
-        _timing,
-        ("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
+        numbers=_timing,
+        tunable=("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
     )
 
 

@@ -12,7 +12,7 @@ from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_le
 from bench.identification import identify
 from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
-from bench.model_file import ModelFile
+from bench.model_file import ModelFile, load_model
 from bench.results.tracking import following_result, target_results
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
@@ -68,6 +68,45 @@ def assert_refused(bench, out, code, words, protocol, *options):
     for word in words:
         assert word in re.sub(r"\s+", " ", err)
     assert not out.exists()
+
+
+class TestAdaptation:
+    @pytest.mark.parametrize("adaptation", ["session", "density"])
+    def test_the_model_that_was_corrected_at_the_targets_is_kept_with_the_run(
+        self, bench, models, operator, tmp_path, adaptation
+    ):
+        code, _, _ = bench(
+            "run", "tracking", *VO2, "--set", f"model={models['preisach']}", "--set", "controller=open-loop-inverse",
+            "--set", f"adaptation={adaptation}", "--set", "count=12", "--out", tmp_path,
+        )  # fmt: skip
+        assert code == 0
+        (folder,) = tmp_path.iterdir()
+        with Record(folder) as record:
+            notes = [event.text for event in record.events() if "adaptation by" in event.text]
+            ticks = record.telemetry()
+        assert len(notes) == 2
+        assert "±" in notes[-1]
+        assert np.nanmax(ticks["disturbance_uncertainty"]) > 0.0
+        kept = load_model(folder / "models" / "adapted.json")
+        assert kept.provenance["adapted"]["taken"] >= 10
+        assert not np.array_equal(kept.operator.coefficients, operator.coefficients)
+
+    def test_a_follower_is_corrected_while_it_follows(self, bench, models, tmp_path):
+        code, _, _ = bench(
+            "run", "following", *VO2, "--set", f"model={models['preisach']}", "--set", "adaptation=density",
+            "--set", "duration=30", "--out", tmp_path,
+        )  # fmt: skip
+        assert code == 0
+        (folder,) = tmp_path.iterdir()
+        assert load_model(folder / "models" / "adapted.json").provenance["adapted"]["taken"] > 1
+
+    def test_a_controller_without_a_model_to_correct_is_refused(self, bench, models, tmp_path):
+        code, _, err = bench(
+            "run", "tracking", *VO2, "--set", f"model={models['preisach']}", "--set", "controller=integral",
+            "--set", "adaptation=session", "--out", tmp_path,
+        )  # fmt: skip
+        assert code != 0
+        assert "does not adapt" in re.sub(r"\s+", " ", err)
 
 
 class TestTracking:
