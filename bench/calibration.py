@@ -120,9 +120,9 @@ def calibrate(
 ) -> Calibration:
     """Find a calibration from readings of a sensor and of a reference at the same instants or places.
 
-    The number of coefficients is that beyond which readings that were left out, one eighth after another, are not
-    met better. With times, how late the sensor is against the reference is found too, from how fast the
-    reference moves.
+    The number of coefficients is that beyond which readings that were left out are not met better: one eighth after
+    another, or one value after another where few were set up. With times, how late the sensor is against the
+    reference is found too, from how fast the reference moves.
 
     Parameters
     ----------
@@ -150,12 +150,16 @@ def calibrate(
     speed: Floats | None = None
     if times is not None:
         speed = np.gradient(_smooth(y), np.asarray(times, dtype=np.float64)[good])
-    most = min(MOST_COEFFICIENTS, max(1, x.size // 2))
+    # As many places as values that were set up; a sweep has as many as readings.
+    distinct = np.unique(y, return_inverse=True)
+    most = min(MOST_COEFFICIENTS, max(1, x.size // 2), max(1, distinct[0].size - 1))
     columns: Floats = np.asarray(chebyshev.chebvander(scaled, most - 1), dtype=np.float64)
     lacking = y - x
     # Short blocks in turn, so that what is left out lies between what is not.
-    few = x.size < 8 * _FOLDS**2
-    blocks = np.arange(x.size) % _FOLDS if few else np.arange(x.size) * _FOLDS**2 // x.size % _FOLDS
+    if distinct[0].size < x.size // 2 or x.size < _FOLDS**2:
+        blocks = distinct[1].reshape(-1)
+    else:
+        blocks = np.arange(x.size) * _FOLDS**2 // x.size % _FOLDS
     left_out = {count: _left_out(_design(columns, count, speed), lacking, blocks) for count in range(1, most + 1)}
     errors = {count: _binned(scaled, each) for count, each in left_out.items()}
     chosen = 1

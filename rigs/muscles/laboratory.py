@@ -41,8 +41,9 @@ from sim_devices.wire.modbus_rtu import ModbusRtuServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
-LOAD, STAGE = "load", "stage"
-"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, or fasten it to the stage."""
+LOAD, STAGE, GAUGE = "load", "stage", "gauge"
+"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, fasten it to the stage, or hold the
+magnet by gauge blocks (m from rest)."""
 
 FAN_LINE = 0
 """Digital line of the T7 that switches the fan: FIO0, on when high."""
@@ -160,6 +161,8 @@ class Frame:
     ----------
     drum : EmulatedDrum or None
         The stage's drum, once it is there.
+    gauge : float or None
+        Where gauge blocks hold the magnet of the position sensor, m from rest; None if they do not.
     is_broken : bool
         A fault: the muscle is torn, so that no current flows, nothing pulls, and its end lies at the bottom.
     """
@@ -167,6 +170,7 @@ class Frame:
     def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
+        self.gauge: float | None = None
         self.is_broken = False
         self._fastened = False
         self._voltage = 0.0
@@ -190,7 +194,9 @@ class Frame:
 
     @property
     def position(self) -> float:
-        """Position of the end, m from rest; of a broken muscle at the bottom."""
+        """Position of the magnet, m from rest: at the end of the muscle, of a broken one at the bottom."""
+        if self.gauge is not None:
+            return self.gauge
         return _BOTTOM if self.is_broken else self.muscle.position
 
     def tear(self, broken: bool = True) -> None:
@@ -359,13 +365,16 @@ class MuscleLaboratory(EmulatedLaboratory):
             self.at(settings.fault_time, partial(self.inject, settings.fault))
 
     def operate(self, task: str, value: float) -> None:
-        """Hang a load of `value` N on the muscle, or fasten its end to the stage.
+        """Hang a load of `value` N on the muscle, fasten its end to the stage, or hold the magnet at `value` m.
 
         Raises ConfigurationError if it is another task, or the muscle does not bear the load.
         """
-        if task not in (LOAD, STAGE):
-            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
+        if task not in (LOAD, STAGE, GAUGE):
+            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}, {GAUGE}")
         with self.world.at_present():
+            self.frame.gauge = value if task == GAUGE else None
+            if task == GAUGE:
+                return
             if task == STAGE:
                 self.frame.fasten()
             elif not self._load_is_forgotten:
