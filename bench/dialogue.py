@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import sys
 import threading
+from collections.abc import Mapping
 from functools import partial
 
 from rich.console import Console
@@ -74,21 +75,22 @@ class Dialogue:
         self._mailbox = mailbox
         self._lines = _Lines() if at_terminal else None
         self._since: Stopwatch | None = None
+        self._before: Question | None = None
 
     def ask(self, question: Question) -> str:
         """Ask, and return the answer as the engine takes it."""
         if self._lines is None and not (self._mailbox is not None and self._mailbox.has_panel):
             return NOBODY
         if self._since is None:
-            self._since = Stopwatch()
+            self._since, self._before = Stopwatch(), None
         self._display.stand_still(question.title)
-        self._display.ask_again = partial(self._prompt, question)
         if self._mailbox is not None:
             self._mailbox.publish(question)
         try:
             answer = self._answer(question)
         finally:
-            self._display.ask_again = lambda: None
+            self._display.ask_again = None
+            self._before = question
             if self._mailbox is not None:
                 self._mailbox.withdraw()
         if answer in (RESUME, STEP):
@@ -100,6 +102,7 @@ class Dialogue:
         with self._display.lock:
             self._introduce(question)
             self._prompt(question)
+            self._display.ask_again = partial(self._prompt, question)
         drawn = Stopwatch()
         while not self._display.is_over:
             if self._mailbox is not None and (answer := self._mailbox.answer()) is not None:
@@ -124,14 +127,25 @@ class Dialogue:
         return ABORT
 
     def _introduce(self, question: Question) -> None:
+        before = self._before
+        if before is None or question.problem or question.text != before.text:
+            self._say(question.problem or question.text)
+        if before is not None:
+            # The same pause: only what is new.
+            self._offer(
+                {name: text for name, text in question.parameters.items() if text != before.parameters.get(name)}
+            )
+            return
         self._console.bell()
-        self._say(question.problem or question.text)
         if question.commands == AT_A_PROMPT:
             self._say("r resumes, a ends the run in the safe state (then Enter)")
             return
         for shown, command in zip(question.shown, question.commands, strict=True):
             self._say(f"  {shown:<12} {MEANINGS[command]}")
-        for name, text in question.parameters.items():
+        self._offer(question.parameters)
+
+    def _offer(self, parameters: Mapping[str, str]) -> None:
+        for name, text in parameters.items():
             self._say(f"  set {name}=…  now {text}")
 
     def _say(self, text: str) -> None:

@@ -128,7 +128,7 @@ def metadata(
         },
         "dashboard": layout.model_dump(mode="json") if layout else None,
         "over_time": protocol.views.signals_over_time(slots) if protocol.views else [],
-        "operator": _operator(),
+        "operator": current_user(),
         "command": sys.argv,
         "packages": _versions(),
         "git": _git_state(),
@@ -189,7 +189,8 @@ def make_folder(parent: Path, name: str) -> Path:
     raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
 
 
-def _operator() -> str:
+def current_user() -> str:
+    """Return the name of the user of this process, or `unknown`."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

@@ -15,6 +15,7 @@ from rich.control import Control
 from rich.errors import LiveError
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.segment import ControlType
+from rich.table import Column
 
 from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
@@ -76,7 +77,7 @@ class ProgressDisplay:
         """The newest readings."""
         self.is_over = False
         """Whether nothing is shown any more."""
-        self.ask_again: Callable[[], None] = lambda: None
+        self.ask_again: Callable[[], None] | None = None
         """Called after something was printed while the bar stands still: the question has to stay the last line."""
         self._since_start = Stopwatch()
         self._since_redraw = Stopwatch()
@@ -85,7 +86,8 @@ class ProgressDisplay:
         progress = Progress(
             # Names and phases are the protocol's: no markup.
             TextColumn("{task.description}", style="bold", markup=False),
-            TextColumn("{task.fields[phase]}", markup=False),
+            # Wide enough for the word that says that the run stands still.
+            TextColumn("{task.fields[phase]}", markup=False, table_column=Column(min_width=7, no_wrap=True)),
             BarColumn(bar_width=None),
             TextColumn("{task.fields[steps]}", style="green", markup=False),
             TextColumn("{task.fields[times]}", markup=False),
@@ -160,8 +162,10 @@ class ProgressDisplay:
         elif self._is_still and event.kind in ("pause", "prompt"):
             pass  # the question says it
         elif event.level != "INFO" or event.kind in ("note", "remark", "resume"):
-            if self._is_still and self._console.is_terminal:
-                self._console.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
+            if self.ask_again is not None and self._console.is_terminal:
+                # Over the prompt, and the line above it that says for how long.
+                erased = ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)
+                self._console.control(Control(*erased, (ControlType.CURSOR_UP, 1), *erased))
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
                 f"{format_duration(event.t):>10}  {event.kind}: {event.text}",
@@ -169,7 +173,7 @@ class ProgressDisplay:
                 highlight=False,
                 markup=False,
             )
-            if self._is_still:
+            if self.ask_again is not None:
                 self.ask_again()
 
     def _show(self, t: float, steps: int, values: Sequence[float]) -> None:

@@ -20,9 +20,11 @@ from typer.models import CommandInfo
 
 from bench import registry
 from bench.cli import (
+    calibrations,
     campaign,
     comparisons,
     designs,
+    imports,
     journals,
     models,
     new,
@@ -63,7 +65,9 @@ _PARTS = (
     models.app,
     designs.app,
     comparisons.app,
+    calibrations.app,
     records.app,
+    imports.app,
     watch.app,
     journals.app,
     twin.app,

@@ -86,7 +86,7 @@ def plots_by_unit(
             "names": [f"{signal.name} [{shown}]" for signal in members],
             "colors": [_colour(signals, i) for i in columns],
         }
-        styles = {
+        styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
             "readings": rr.SeriesPoints(**look, marker_sizes=[_READING] * len(members), markers="circle"),
             "signals": rr.SeriesLines(
                 **look, widths=[4.0 if signal.name.endswith(SETPOINT) else 1.5 for signal in members]

@@ -71,6 +71,8 @@ class Panel(App[None]):
 
     def look(self) -> None:
         """Show what there is now."""
+        if not self.query("#state"):
+            return  # it is being closed
         view = self._source.view()
         self.query_one("#state", Static).update(f"{view.title}   {view.state}")
         self.query_one("#help", Static).update(view.help)

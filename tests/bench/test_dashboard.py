@@ -35,6 +35,7 @@ from bench.hysteresis import (
 from bench.hysteresis.documents import Model
 from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
 from bench.journal.rows import Entry
+from bench.lateness import Lateness
 from bench.layout import DashboardLayout, XYPlot
 from bench.model_file import ModelFile
 from bench.protocol import TRACES
@@ -651,6 +652,18 @@ def test_live_and_rebuilt_recordings_are_equal(tmp_path: Path, request: pytest.F
                     np.testing.assert_array_equal(mine[2], theirs[2], path)
                 else:
                     assert mine[2] == theirs[2], path
+
+
+def test_the_card_says_at_the_end_how_late_loops_were(tmp_path: Path) -> None:
+    late = Lateness(100.0)
+    late.add(3e-4, count=20)
+    path = tmp_path / "late.rrd"
+    with make_dashboard(path) as dashboard:
+        dashboard.finish("completed", "", {"sine": late.to_json()})
+    # The newest one is shown.
+    *_, (text,) = read(path)["/card"]["text"]
+    assert "lateness of sine: 20 samples at 100 Hz, 0 left out; mean 0.3 ms, worst 0.3 ms" in text
+    assert "≤ 0.5 ms        20" in text
 
 
 def test_a_control_run_shows_reference_error_and_disturbance(control_folder: Path) -> None:
