@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from bench.dashboard.entries import ModelDensity
 from bench.devices import Signal
@@ -73,8 +73,10 @@ def memory_of(model: ModelDensity, signals: Sequence[Signal], drive: int) -> Sig
     if model.density.measured:
         found = column(model.density.unit)
         return None if found is None else SignalMemory(found)
-    if isinstance(model.model, TwoStage):
-        voltage, force = column(model.model.voltage_unit), column(model.model.force_unit)
+    # Of a model of several stages that of the second one has no signal of its own.
+    if model.model is not None and model.model.kind == TwoStage.kind:
+        stages = cast("TwoStage", model.model)
+        voltage, force = column(stages.voltage_unit), column(stages.force_unit)
         if voltage is not None and force is not None:
-            return StageMemory(model.model, (voltage, force))
+            return StageMemory(stages, (voltage, force))
     return None
