@@ -148,6 +148,8 @@ class Slot:
         Digits after the point of the signal that are worth showing.
     table : RoleTable
         What the rig file says of it.
+    accuracy : float or None
+        Standard uncertainty of the signal against a reference; None if it was not calibrated.
     """
 
     name: str
@@ -158,6 +160,7 @@ class Slot:
     setpoint_unit: str
     precision: int
     table: RoleTable
+    accuracy: float | None = None
 
     @property
     def rate_unit(self) -> str:
@@ -247,6 +250,7 @@ def _bind(
         setpoint_unit=setpoint.unit if setpoint else "",
         precision=signal.precision,
         table=table,
+        accuracy=signal.accuracy,
     )
 
 

@@ -269,4 +269,6 @@ class Calibrated(DerivedSignal):
             return value + correction
 
         description = self.description or name.replace("_", " ")
-        return Derived(Signal(name, record.unit, description, self.precision), self.sources, compute)
+        return Derived(
+            Signal(name, record.unit, description, self.precision, record.uncertainty), self.sources, compute
+        )

@@ -66,12 +66,16 @@ class Signal:
         What it is, in a few words, for axes and column headers.
     precision : int
         Digits after the point that are worth showing.
+    accuracy : float or None
+        Standard uncertainty against a reference, in its unit, of a signal that was calibrated; None if that is not
+        known.
     """
 
     name: str
     unit: str
     description: str
     precision: int = 3
+    accuracy: float | None = None
 
 
 @dataclass(frozen=True)

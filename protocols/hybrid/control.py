@@ -9,7 +9,7 @@ from typing import Literal
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
 from bench.controllers import ControllerSetup, make_controller
 from bench.model_file import load_model
-from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
+from bench.protocol import FixedRate, Messages, Note, Phase, ProtocolParameters, Slots, parameter, protocol
 from bench.protocol.number_list import NumberList
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 
@@ -71,6 +71,11 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
         parameters.controller,
         _setup(parameters, reference, lateness=parameters.lateness, probe=parameters.probe),
     )
+    accuracy = slots["response"].accuracy
+    if accuracy is None:
+        yield Note("the response is not calibrated: how far its readings are from the true deflection is not known")
+    else:
+        yield Note(f"the response is calibrated to a standard uncertainty of {accuracy:.2g} m")
     yield Phase(parameters.controller)
     yield FixedRate(
         controller=controller,

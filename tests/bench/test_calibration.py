@@ -103,6 +103,7 @@ def bound(**units):
 def test_the_derived_signal_is_the_corrected_reading():
     derived = bound()
     assert derived.signal.unit == "m"
+    assert derived.signal.accuracy == 1e-9
     for value in (-1e-4, -3e-5, 0.0, 9e-5):
         expected = value + Calibration.model_validate(RECORD).correction(value)
         assert derived.compute({"spot_position": value}) == pytest.approx(expected, abs=1e-18)

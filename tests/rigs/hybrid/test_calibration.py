@@ -3,7 +3,10 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from bench.clock import VirtualClock
+from bench.protocol import find_protocol
 from bench.rig import Rig
 from bench.rig_file import load_rig
 
@@ -71,3 +74,12 @@ def test_a_calibration_stands_beside_its_rig_file_and_is_kept_with_the_run(tmp_p
     rig = load_rig(str(tmp_path / "calibrated.toml"))
     assert rig.content["derived"]["displacement"]["calibration"]["coefficients"] == [1e-7]
     assert rig.derived["displacement"].calibration.uncertainty == 1e-9
+
+
+@pytest.mark.parametrize(("rig", "accuracy"), [("hybrid-witness", None), ("calibrated", 1e-9)])
+def test_a_protocol_knows_how_accurate_its_response_is(tmp_path, rig, accuracy):
+    if accuracy is not None:
+        test_a_calibration_stands_beside_its_rig_file_and_is_kept_with_the_run(tmp_path)
+        rig = str(tmp_path / "calibrated.toml")
+    with Rig(load_rig(rig), VirtualClock(), 1) as connected:
+        assert connected.description.slots(find_protocol("hybrid-control"))["response"].accuracy == accuracy
