@@ -95,7 +95,7 @@ class TestPageOfARun:
             ("loops-and-models", ["coefficients of preisach", "σ from the residuals", "bias", "density at β"]),
             ("loops-and-models", ["standard uncertainty", "cells swept"]),
             ("numbers-of-the-paper", ["largest error", "1.5", "µm", "Fig. 3"]),
-            ("real-time", ["4000 recorded samples", "greatest", "0.600"]),
+            ("real-time", ["4000 recorded samples", "greatest", "0.600", "hold: 17 samples at 100 Hz, 2 left out"]),
             ("events", ["rise", "stands still", "WARN"]),
             ("how-to-repeat-it", ["bench repeat", "bench run loops --set", "0123456789ab", "numpy"]),
         ],

@@ -4,6 +4,7 @@ import numpy as np
 
 from bench.devices import Signal
 from bench.journal import FILE_NAME, Event, Journal, StepRecord
+from bench.lateness import Lateness
 from bench.settling import Settled
 
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=alert(1)>"
@@ -69,6 +70,14 @@ def write_run(folder, steps=STEPS, finished=True, meta=META, signals=SIGNALS):
         journal.telemetry(8.0 * i + 4.0, i, values)
         journal.step(StepRecord(i, 8.0 * i, 8.0 * i + 8.0, "loops", "", Settled.DWELL, {"plate": inputs[i]}, values))
     if finished:
-        journal.finish(status="completed", reason="", finished=8.0 * steps, safe_state={"plate": "safe"})
+        late = Lateness(100.0, left_out=2)
+        late.add(3e-4, 17)
+        journal.finish(
+            status="completed",
+            reason="",
+            finished=8.0 * steps,
+            safe_state={"plate": "safe"},
+            lateness={"hold": late.to_json()},
+        )
     journal.close()
     return folder

@@ -89,7 +89,7 @@ def run_page(
             parameters_section(meta),
             devices_section(meta),
         ]
-        if (late := _lateness_section(telemetry, scratch)) is not None:
+        if (late := _lateness_section(record, telemetry, scratch)) is not None:
             sections.append(late)
         sections += [events_section(events), repeat_section(record)]
     return Page(
@@ -296,25 +296,27 @@ def _signals_section(
     return PageSection("Signals", parts)
 
 
-def _lateness_section(telemetry: Table, scratch: Path) -> PageSection | None:
-    if _LATENESS not in telemetry.columns:
-        return None
-    late = telemetry[_LATENESS]
+def _lateness_section(record: Record, telemetry: Table, scratch: Path) -> PageSection | None:
+    parts: list[PageFigure | PageTable | PageText] = []
+    for label, each in record.meta.get("lateness", {}).items():
+        rate = f" at {each['rate']:g} Hz" if each["rate"] is not None else ""
+        ends = [*(f"≤ {1e3 * edge:g}" for edge in each["edges"]), f"> {1e3 * each['edges'][-1]:g}"]
+        title = f"{label or 'loop'}: {each['samples']} samples{rate}, {each['left_out']} left out"
+        note = f"mean {1e3 * each['mean']:.3g} ms, worst {1e3 * each['worst']:.3g} ms"
+        rows = [(end, str(count)) for end, count in zip(ends, each["counts"], strict=True) if count]
+        parts.append(PageTable(("late by / ms", "samples"), rows, title=title, note=note, numbers_from=0))
+    late = telemetry[_LATENESS] if _LATENESS in telemetry.columns else np.empty(0)
     late = late[np.isfinite(late)]
-    if not late.size:
-        return None
-    path = scratch / "lateness.svg"
-    plot_histogram(path, 1e3 * late, label="lateness / ms")
-    shares = np.percentile(late, [50, 95, 99, 100]) * 1e3
-    rows = [
-        (name, f"{value:.3f}")
-        for name, value in zip(("median", "95 %", "99 %", "greatest"), shares.tolist(), strict=True)
-    ]
-    caption = f"How late the {late.size} recorded samples of loops at a fixed rate were."
-    return PageSection(
-        "Real time",
-        (PageFigure(inlined(path, caption), caption), PageTable(("lateness", "ms"), rows, numbers_from=1)),
-    )
+    if late.size:
+        path = scratch / "lateness.svg"
+        plot_histogram(path, 1e3 * late, label="lateness / ms")
+        shares = np.percentile(late, [50, 95, 99, 100]) * 1e3
+        names = ("median", "95 %", "99 %", "greatest")
+        rows = [(name, f"{value:.3f}") for name, value in zip(names, shares.tolist(), strict=True)]
+        caption = f"How late the {late.size} recorded samples of loops at a fixed rate were."
+        parts.append(PageFigure(inlined(path, caption), caption))
+        parts.append(PageTable(("lateness", "ms"), rows, numbers_from=1))
+    return PageSection("Real time", parts) if parts else None
 
 
 def _precision(record: Record, name: str) -> int:
