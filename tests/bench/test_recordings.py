@@ -1,0 +1,81 @@
+"""The reference runs in `recordings/`: whole records, from which identification finds the same models as ever."""
+
+from pathlib import Path
+
+import pytest
+
+import bench
+from bench.dashboard.from_journal import rebuild
+from bench.journal import Record
+from bench.journal.recovery import recover
+from rigs.muscles.identification import identify_muscle, read_resting, read_series
+
+FOLDER = Path(__file__).parents[2] / "recordings" / "reference"
+RUNS = sorted(path.parent.name for path in FOLDER.glob("*/journal.sqlite"))
+
+
+def test_there_is_a_run_of_each_rig():
+    assert {name.partition("-")[0] for name in RUNS} == {"vo2", "sma", "hybrid"}
+    assert sum(file.stat().st_size for file in FOLDER.rglob("*")) < 2e6
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_record_is_whole(name, tmp_path):
+    found = recover(FOLDER / name / "journal.sqlite", [], tmp_path / "copy.sqlite")
+    assert found.copy is None
+    assert not any(state.missing for state in found.tables.values())
+    with Record(FOLDER / name) as record:
+        assert record.meta["status"] == "completed"
+        assert record.meta["counts"]["steps"] == len(record.steps()["step"])
+
+
+# Each number as it was found when the runs were made; the same code gives the same to rounding.
+@pytest.mark.parametrize(
+    ("rig", "signals", "model", "options", "rms", "largest", "passive", "bias"),
+    [
+        (
+            "vo2",
+            ("tec_temperature", "curvature"),
+            "preisach-nonmonotonic",
+            {"levels": 10, "plane": (30.0, 70.0)},
+            20.28340092,
+            120.6428027,
+            23,
+            1035.26292,
+        ),
+        (
+            "hybrid",
+            ("piezo_voltage", "displacement_position"),
+            "prandtl-ishlinskii",
+            {"plays": 15},
+            9.08094001e-8,
+            3.44515671e-7,
+            14,
+            -7.62609081e-7,
+        ),
+    ],
+)
+def test_the_same_model_is_found(rig, signals, model, options, rms, largest, passive, bias):
+    folder = FOLDER / f"{rig}-damped-oscillation"
+    found = bench.identify(folder, model, input=signals[0], output=signals[1], **options)
+    assert found.identification.errors.rms == pytest.approx(rms, rel=1e-6)
+    assert found.identification.errors.maximum == pytest.approx(largest, rel=1e-6)
+    assert found.identification.certificate.passive == passive
+    assert found.identification.certificate.kkt_residual < 1e-12
+    assert found.file.operator.bias == pytest.approx(bias, rel=1e-6)
+
+
+def test_the_same_muscle_is_found():
+    resting = read_resting(FOLDER / "sma-force-voltage")
+    series = [one for name in ("voltage", "force") for one in read_series(FOLDER / f"sma-length-{name}")]
+    found = identify_muscle("two-stage", resting, series)
+    rms = {kind: errors.rms_percent for kind, errors in found.errors.items()}
+    expected = {"force-voltage": 0.7519719036, "length-voltage": 4.6248990906, "length-force": 3.0569284943}
+    assert rms == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_run_can_be_shown_again(tmp_path):
+    recording = tmp_path / "run.rrd"
+    with Record(FOLDER / "hybrid-damped-oscillation") as record:
+        rebuild(record, recording)
+    assert recording.stat().st_size > 50_000
